@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hippodrome.config.config import Config
@@ -63,9 +63,9 @@ def without_a_key(config: Config) -> Remark | None:
     return Remark(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 
 
-def arrows_without_an_action(config: Config) -> Iterator[Remark]:
-    """What to say about arrows of `ui` that no action is called after, alone or together with other keys."""
-    names = [name.strip().lower() for name in config.trial.action_space]
+def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
+    """What to say about arrows of `ui` that none of these actions is called after, alone or together with others."""
+    names = [name.strip().lower() for name in actions]
     if not names or not config.game_steps:
         return
     keys = "|".join(re.escape(key) for key in sorted({*PARTS, *names}))
@@ -73,6 +73,21 @@ def arrows_without_an_action(config: Config) -> Iterator[Remark]:
         others = [name for name in names if re.fullmatch(f"(?:{keys})*{arrow}(?:{keys})*", name)]
         if getattr(config.trial.ui, arrow) and not others:
             yield Remark((*UI, arrow), f"the arrow does nothing: no action is called {arrow}")
+
+
+def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
+    """What to say about arrows of `ui` if the environment has so many actions, whose names are not known."""
+    arrows = [arrow for arrow in ARROWS if getattr(config.trial.ui, arrow)]
+    if not arrows or not config.game_steps:
+        return
+    *first, last = arrows
+    shown = f"the arrows {', '.join(first)} and {last} are" if first else f"the arrow {last} is"
+    example = ", ".join([*arrows[:count], *(["…"] if count > len(arrows) else [])])
+    yield Remark(
+        UI,
+        f"{shown} not shown: the environment has {count} actions without names; name them all, in their order: "
+        f"actionSpace: [{example}]",
+    )
 
 
 def _names_a_certificate(config: Config) -> bool:
@@ -117,7 +132,7 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     """The remarks on the project in `folder`, with the lines of its config.yml."""
     source = read_source(folder)
     arrows = [
-        remark for remark in arrows_without_an_action(config) if source.names(remark.path)
+        remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
     ]  # without ui all are on
     found = [*remarks(config), *arrows, *without_observations(source, config)]
     return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.config import Config, Diagnostic, agent_imports, layout
+from hippodrome.config import Config, Diagnostic, agent_imports, layout, remarks
 from hippodrome.config.diagnostics import Keys, printable
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
@@ -160,7 +160,7 @@ class _Reading:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Diagnostic]:
-        return self._early() + self._failures(status) + self._slow() + self._not_on_aws()
+        return self._early() + self._failures(status) + self._arrows() + self._slow() + self._not_on_aws()
 
     @property
     def played(self) -> bool:
@@ -258,6 +258,17 @@ class _Reading:
         if names > count:
             message += "; take out the names of actions that it does not have, or let step() in agent.py translate them"
         return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
+
+    def _arrows(self) -> list[Diagnostic]:
+        """Arrows of `ui` without an action, if the environment says what its actions are called, or does not."""
+        names, source = self._report.get("actions", ()), read_source(self._folder)
+        if not names:
+            return []
+        if names == [str(index) for index in range(len(names))]:
+            found = remarks.arrows_of_unnamed_actions(self._config, len(names))
+        else:
+            found = remarks.arrows_without_an_action(self._config, names)
+        return [self._in_config(*said, remark=True) for said in found if source.names(said.path)]
 
     def _call(self) -> str:
         call = self._report.get("call", "start")

@@ -78,6 +78,8 @@ def _try(report: Path) -> None:
     space = getattr(env, "action_space", None)
     count = getattr(space, "n", None)
     progress.known = {"names": len(player.action_space), "count": None if count is None else int(count)}
+    if not config.action_space:
+        progress.known["actions"] = player.action_space
     if count is not None and len(player.action_space) > int(count):
         first = int(getattr(space, "start", 0))
         progress.foreign = _foreign_actions(env, range(first, first + int(count)))

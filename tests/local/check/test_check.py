@@ -451,6 +451,39 @@ def test_an_arrow_that_no_action_is_called_after_is_remarked(folder: Path, actio
     assert looked(folder) == ([remark] if dead else [])
 
 
+@pytest.mark.parametrize(
+    ("ui", "count", "remark"),
+    [
+        ("left: true, right: true", 2, "the arrows left and right are not shown: the environment has 2 actions without "
+         "names; name them all, in their order: actionSpace: [left, right]"),
+        ("up: true", 3, "the arrow up is not shown: the environment has 3 actions without names; name them all, in "
+         "their order: actionSpace: [up, …]"),
+        ("left: false", 2, None),
+    ],
+)  # fmt: skip
+def test_arrows_of_actions_without_names_are_remarked(folder: Path, ui: str, count: int, remark: str | None) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "left: true", ui)
+    agent(folder, "class Env:", f"class Space:\n    n = {count}\n\nclass Env:\n    action_space = Space()")
+    assert tried(folder) == ([] if remark is None else [f"config.yml:13: remark: trial.ui: {remark}"])
+
+
+@pytest.mark.parametrize("action_space", ["", "  actionSpace: []\n"])
+def test_an_arrow_without_an_action_of_the_environment_is_remarked(folder: Path, action_space: str) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", action_space)
+    config(folder, "left: true", "left: true, right: true")
+    agent(folder, "class Env:", "class Env:\n    def get_action_meanings(self):\n        return ['NOOP', 'LEFT']")
+    (line,) = tried(folder)
+    assert line.endswith("remark: trial.ui.right: the arrow does nothing: no action is called right")
+
+
+def test_arrows_of_actions_without_names_are_not_remarked_where_ui_is_not(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    assert tried(folder) == []
+
+
 def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) -> None:
     config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
     assert looked(folder) == []
