@@ -7,6 +7,7 @@ A `Layout` is made once for each space. Values travel in batches, in Gymnasium's
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -308,6 +309,21 @@ def read_request(data: bytes) -> Request:
 def read_actions(request: Request, actions: Layout, num_envs: int = 1) -> Any:
     """The batch of actions of a STEP or STEP_MANY: `steps * num_envs` rows. Raises CodecError."""
     return _whole(actions, request.body, request.steps * num_envs)
+
+
+def refused(request: Request, space: Space, num_envs: int = 1) -> Any:
+    """The first action for which `read_actions` refuses a request; the size of its body if that cannot be read."""
+    unchecked, checked = layout(space), layout(space, action=True)
+    count = request.steps * num_envs
+    with contextlib.suppress(CodecError):
+        for row in unchecked.rows(_whole(unchecked, request.body, count), count):
+            parts: list[bytes] = []
+            unchecked.pack(batch_of(unchecked, [row]), 1, parts)
+            try:
+                _whole(checked, memoryview(b"".join(parts)), 1)
+            except CodecError:
+                return row
+    return f"{len(request.body)} bytes"
 
 
 def read_reset(request: Request) -> tuple[Any, dict[str, Any] | None]:

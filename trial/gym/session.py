@@ -153,7 +153,7 @@ class Session:
         try:
             batch = arrays.read_actions(request, actions, made.size)
         except CodecError as error:
-            raise WrongAction(f"{len(request.body)} bytes", str(error)) from None
+            raise WrongAction(arrays.refused(request, made.single_action_space, made.size), str(error)) from None
         steps = self._vector_steps(held, batch, count) if made.num_envs else self._single_steps(held, batch, count)
         return arrays.steps_reply(request.kind, held.handle, observations, steps)
 

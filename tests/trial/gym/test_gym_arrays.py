@@ -102,6 +102,19 @@ def test_with_disabled_the_answer_ends_with_the_episode(client: Client) -> None:
 
 
 @pytest.mark.parametrize(
+    ("request_", "shown"),
+    [
+        (b"\x02\x00\x01\x00\x03\x00\x00\x00" + bytes(8) + (7).to_bytes(8, "little") + bytes(8), "7"),
+        (b"\x01\x00\x01\x00\x01\x00\x00\x00" + bytes(3), "3 bytes"),
+        (b"\x01\x00\x01\x00\x01\x00\x00\x00" + bytes(9), "9 bytes"),
+    ],
+)
+def test_the_sentence_shows_the_action_or_how_long_what_is_none_is(client: Client, request_: bytes, shown: str) -> None:
+    Made(client, "Odd/Calm-v0").reset()
+    assert json.loads(client.say(request_))["error"]["message"].startswith(f"Action `{shown}` is wrong: The ")
+
+
+@pytest.mark.parametrize(
     ("request_", "kind"),
     [
         (b"", "InvalidMessage"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import re
 import signal
 import socket
 import threading
@@ -317,6 +318,17 @@ def test_a_wrong_action_is_a_sentence_and_the_environment_goes_on(url: str, acti
         with pytest.raises((RemoteError, CodecError), match=r"\S \S"):
             env.step(action)
         assert env.step(1)[1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("env_id", "action", "shown"),
+    [("CartPole-v1", 2, "2"), ("Pendulum-v1", np.array([np.nan], np.float32), "[nan]")],
+)
+def test_a_wrong_action_is_shown(url: str, env_id: str, action: Any, shown: str) -> None:
+    with RemoteEnv(url, env_id) as env:
+        env.reset(seed=1)
+        with pytest.raises(RemoteError, match=re.escape(f"Action `{shown}` is wrong: The action ")):
+            env.step(action)
 
 
 @pytest.mark.parametrize("action", ["raise", "exit", "shape", "text", "three", "nothing"])
