@@ -16,6 +16,8 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from testing.preloaded import interruptible
+
 ROOT = Path(__file__).resolve().parent.parent
 SECONDS = 20.0  # that an answer may take
 
@@ -48,6 +50,7 @@ def gym_server(
         cwd=cwd,
         env={**os.environ, **paths, **(env or {})},
         text=True,
+        preexec_fn=interruptible,  # noqa: PLW1509 - it sets a signal and no more
     )
     try:
         assert process.stdout is not None

@@ -90,6 +90,11 @@ class Forked:
         self.send_signal(9)
 
 
+def interruptible() -> None:
+    """Let SIGINT end this process. A shell has what it runs in the background ignore it, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(
     module: str,
     arguments: Sequence[str] = (),
@@ -116,6 +121,7 @@ def start(
             stderr=stderr,
             text=True,
             start_new_session=start_new_session,
+            preexec_fn=interruptible,  # noqa: PLW1509 - it sets a signal and no more
         )
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     reading = None

@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
     try:
-        return serve(
+        status = serve(
             host,
             given["port"],
             limits,
@@ -77,6 +77,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, UnicodeError) as error:
         print(f"Cannot listen at {host}:{given['port']}: {unusable(error)}.", file=sys.stderr)
         return 1
+    if status == 0:
+        where = f" Recordings are in {given['record']}." if given["record"] else ""
+        print(f"Ended.{where}", file=sys.stderr)  # where others of the same pipe may have ended already
+    return status
 
 
 def _is_loopback(host: str) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from testing.gym_server import ROOT, Client, GymServer, gym_server
+from testing.preloaded import interruptible
 from trial.gym import override
 from trial.gym.__main__ import main
 from trial.gym.limits import Limits
@@ -199,6 +202,35 @@ def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
         cwd=tmp_path, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"}, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (1, "broken cannot be imported: RuntimeError: no\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("recorded", [False, True])
+def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int, recorded: bool) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "trial.gym", "--port", "0", *(["--record", str(tmp_path)] if recorded else [])],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=interruptible,  # noqa: PLW1509 - it sets a signal and no more
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(number)
+        assert process.communicate(timeout=20) == (
+            "",
+            f"Ended. Recordings are in {tmp_path}.\n" if recorded else "Ended.\n",
+        )
+        assert process.returncode == 0
+
+
+def test_a_server_of_the_tests_ends_by_ctrl_c_where_their_shell_ignores_it() -> None:
+    """A shell starts what it runs in the background so, and processes inherit it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with gym_server() as found:
+            began = time.monotonic()
+        assert time.monotonic() - began < 10
+        assert not Path(f"/proc/{found.pid}").exists()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_host_that_others_can_reach_gets_a_warning() -> None:
