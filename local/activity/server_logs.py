@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from pathlib import Path
 
 from local.backend.task_record import Task
+from local.check.remedies import remedy
+
+_ERROR = re.compile(r"(?:\S+:\d+: )?(?:\w+\.)*(?P<kind>\w+): (?P<text>.*)")
 
 
 class WatchedServer:
@@ -71,8 +75,14 @@ class Errors:
             self._in_traceback = True
         elif self._in_traceback and line and not line.startswith(" "):
             self._in_traceback = False
-            return f"  {line}"
+            return f"  {line}{_advice(line)}"
         return ""
+
+
+def _advice(line: str) -> str:
+    """What `make check` says about an error of this kind, from the last line of its traceback."""
+    found = _ERROR.match(line)
+    return remedy(found["kind"], found["text"]) if found else ""
 
 
 def _anew(raw: bytes) -> str:

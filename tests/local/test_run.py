@@ -271,6 +271,15 @@ def test_a_broken_agent_is_told_in_its_own_words(local: Make) -> None:
     here.told("name 'Envy' is not defined")
 
 
+def test_an_agent_that_cannot_start_is_told_with_what_make_check_advises(local: Make) -> None:
+    here = local()
+    agent = here.folder / "agent.py"
+    agent.write_text("import cv2_of_nobody\n" + agent.read_text())
+    here.run()
+    Walker(here.url, "quick", "P1").page()
+    here.told(r"agent\.py:1: ModuleNotFoundError: No module named 'cv2_of_nobody'; install its package: \.venv/bin/pip")
+
+
 def test_fresh_moves_the_data_aside(local: Make) -> None:
     here = local().run()
     walker = Walker(here.url, "quick", "P1")
