@@ -169,10 +169,11 @@ class Trial:
     record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
     gym: str = _key(
-        values.one_of("none", "watch", "advise"),
+        values.one_of("none", "watch", "advise", "environments"),
         "none",
-        "What programs that have the server's token may do at its path /gym: nothing, see each step, or also advise.",
-        {"enum": ["none", "watch", "advise"]},
+        "What programs that have the server's token may do at its path /gym: nothing, see each step, also advise, or "
+        "make environments of their own.",
+        {"enum": ["none", "watch", "advise", "environments"]},
     )
     options: dict[str, Any] = field(
         default_factory=dict,

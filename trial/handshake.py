@@ -13,7 +13,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from trial import messages, notice, plain, watch
+from trial import environments, messages, notice, plain, watch
 from trial.connection import SUBPROTOCOLS
 from trial.inbound import RateLimit
 from trial.messages import BadMessage, CloseConnection, Hello, NotAMessage
@@ -33,15 +33,24 @@ REFUSED_MESSAGES_A_SECOND = 20
 """What a client may send that has been refused and stays."""
 
 
-def process_request(websocket: ServerConnection, request: Request, *, watched: bool = False) -> Response | None:
+def process_request(
+    websocket: ServerConnection, request: Request, *, gym: str = "none", token: str = ""
+) -> Response | None:
     """The answer to a request that is no WebSocket's; None lets the handshake go on.
 
-    The path of programs that watch is there only if the trial is `watched`.
+    The path of programs is there only if the section `trial` has another `gym` than none. A program that would make
+    environments is refused here, since its protocol has no words for it, unless it has the token.
     """
     path = urlsplit(request.path).path
     if path == "/healthz":
         return websocket.respond(http.HTTPStatus.OK, "ok\n")
-    if path == watch.PATH and watched:
+    if path == watch.PATH and gym == "environments":
+        try:
+            check_matches(token_in_address(websocket), token)
+        except CloseConnection as refused:
+            return websocket.respond(http.HTTPStatus.UNAUTHORIZED, f"{refused.words}\n")
+        return environments.prepare(websocket, request)
+    if path == watch.PATH and gym != "none":
         return None
     if path != "/":
         return websocket.respond(http.HTTPStatus.NOT_FOUND, "There is nothing here. The game's WebSocket is at /.\n")
@@ -52,8 +61,12 @@ def process_request(websocket: ServerConnection, request: Request, *, watched: b
     return None
 
 
-def select_subprotocol(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """The best of those offered; None for a client of HIPPO's."""
+def select_subprotocol(
+    websocket: ServerConnection, offered: Sequence[Subprotocol], *, gym: str = "none"
+) -> Subprotocol | None:
+    """The best of those offered; None for a client of HIPPO's, and of Gymie's."""
+    if gym == "environments" and is_program(websocket):
+        return environments.SUBPROTOCOL if environments.SUBPROTOCOL in offered else None
     return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
 
 
@@ -111,8 +124,8 @@ def _origin(websocket: ServerConnection) -> str | None:
     return sent[0] if len(sent) == 1 else None
 
 
-def is_watching(websocket: ServerConnection) -> bool:
-    """Whether the client is a program that watches."""
+def is_program(websocket: ServerConnection) -> bool:
+    """Whether the client is a program at the path /gym."""
     return websocket.request is not None and urlsplit(websocket.request.path).path == watch.PATH
 
 

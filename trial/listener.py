@@ -13,6 +13,7 @@ from websockets.typing import Subprotocol
 
 from trial.certificate import RELOAD_SECONDS, Certificate
 from trial.connection import SUBPROTOCOLS
+from trial.environments import SUBPROTOCOL
 from trial.handshake import process_request, select_subprotocol
 from trial.preauth_limit import PreauthLimitedSocket
 from trial.settings import Settings
@@ -49,9 +50,9 @@ class Listener:
             open_timeout=settings.hello_seconds,
             ssl=certificate.context if certificate is not None else None,
             ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
-            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
-            select_subprotocol=select_subprotocol,
-            process_request=partial(process_request, watched=settings.trial.gym != "none"),
+            subprotocols=[Subprotocol(name) for name in (*SUBPROTOCOLS, SUBPROTOCOL)],
+            select_subprotocol=partial(select_subprotocol, gym=settings.trial.gym),
+            process_request=partial(process_request, gym=settings.trial.gym, token=settings.token),
             server_header=None,
             compression=None,
             max_size=LARGEST_MESSAGE,

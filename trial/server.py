@@ -23,12 +23,13 @@ from protocol.keys import handover_key, recordings_folder
 from trial import messages, warm, watch
 from trial.agent import AgentAdapter, AgentTimeout
 from trial.connection import Connection
+from trial.environments import MOST, Environments
 from trial.handshake import (
     OTHER_ID,
     OTHER_STUDY,
     check_access,
     check_matches,
-    is_watching,
+    is_program,
     receive_hello,
     show_refusal,
     token_in_address,
@@ -78,6 +79,7 @@ class Server:
         self._tasks: set[asyncio.Task[None]] = set()
         self._watchers = watch.Watchers()
         self._watching = 0  # programs that are connected
+        self._environments = Environments(settings.agent_dir)
 
     async def run(self) -> int:
         """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
@@ -127,6 +129,7 @@ class Server:
         self._worker.close()
         for connection in self._connections:
             connection.abort()
+        await self._environments.close()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._listener.wait_closed(), CLOSE_SECONDS)
 
@@ -190,8 +193,11 @@ class Server:
             await websocket.close(1011)
 
     async def _serve(self, websocket: ServerConnection) -> None:
-        if is_watching(websocket):
-            await self._serve_watching(websocket)
+        if is_program(websocket):
+            if self.settings.trial.gym == "environments":
+                await self._serve_environments(websocket)
+            else:
+                await self._serve_watching(websocket)
             return
         step = await self._authenticate(websocket)
         self._listener.authenticated(websocket)
@@ -232,6 +238,19 @@ class Server:
             await watch.Watching(websocket, self._watchers, self._action_space, advise).run()
         finally:
             self._watching -= 1
+
+    async def _serve_environments(self, websocket: ServerConnection) -> None:
+        """Serve environments to a program, whose token the handshake has checked.
+
+        A close says what is wrong: a message would be taken for an answer.
+        """
+        self._listener.authenticated(websocket)
+        if self.settings.warm_server:
+            await websocket.close(1013, _NOT_ASSIGNED)
+        elif self._environments.connections >= MOST:
+            await websocket.close(1013, f"{MOST} programs are connected already; try later.")
+        else:
+            await self._environments.serve(websocket)
 
     def _action_space(self) -> tuple[str, ...]:
         return self._current().core.progress.action_space

@@ -112,8 +112,8 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     """An environment that a server plays: `RemoteEnv("ws://127.0.0.1:5000/", "CartPole-v1")`.
 
     It has a connection of its own, which ends with `close`, with a `with` block, or when the object is no longer used.
-    `render_mode` and `options` are what `gymnasium.make` takes; `token` goes into the address (`?token=`), for a proxy
-    that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is a file of certificates to
+    `render_mode` and `options` are what `gymnasium.make` takes; `token` goes into the address (`?token=`), for a
+    trial's server, or a proxy that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is a file of certificates to
     trust (PEM), for `wss://`.
     `np_random` is the client's own: the environment draws its random numbers on the server, by the seed of `reset`.
 

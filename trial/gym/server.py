@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
@@ -45,6 +46,22 @@ _WITHOUT_HANDSHAKE = 100
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
+class Listener(Protocol):
+    """What connections are accepted from: a listening socket, or what stands for one."""
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection. Raises OSError if there is none, and KeyboardInterrupt if there will be none."""
+
+    def fileno(self) -> int:
+        """What can be read when there is a connection."""
+
+    def setblocking(self, flag: bool, /) -> None:
+        """Whether `accept` waits."""
+
+    def close(self) -> None:
+        """Accept no more."""
+
+
 @dataclass(slots=True, eq=False)
 class _Connection:
     socket: socket.socket
@@ -61,7 +78,7 @@ class _Connection:
 class Server:
     """Listens until `run` is interrupted."""
 
-    def __init__(self, listener: socket.socket, control: socket.socket, limits: Limits, origins: Sequence[str]) -> None:
+    def __init__(self, listener: Listener, control: socket.socket, limits: Limits, origins: Sequence[str]) -> None:
         self._listener = listener
         self._control = control
         self._limits = limits
@@ -161,8 +178,9 @@ class Server:
             return
         connection.deadline = None
         connection.form = "arrays" if protocol.subprotocol == SUBPROTOCOL else form or FORMS[0]
-        connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        _keep_alive(connection.socket)
+        if connection.socket.family != socket.AF_UNIX:
+            connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            _keep_alive(connection.socket)
 
     def _refused(self, request: Request) -> Response | None:
         """The HTTP answer to a request that is no handshake, or whose client may not connect; None for all others."""
@@ -325,30 +343,51 @@ def serve(
     Raises OSError or UnicodeError if the address cannot be used. `modules` are imported where environments are made;
     `record` is a folder for recordings.
     """
-    limits = limits or Limits()
-    _allow_files(limits.connections + 2 * _WITHOUT_HANDSHAKE)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=512) as listener:
-        control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
-        with control:
-            if not _is_ready(control):
-                os.waitpid(spawner, 0)
-                return 1
-            server = Server(listener, control, limits, origins)
-            before = signal.signal(signal.SIGTERM, _interrupt)
-            try:
-                ready(listener.getsockname()[1])
-                server.run()
-            except KeyboardInterrupt:
-                return 0
-            except EOFError as error:
-                print(f"The server ends: {error}.", file=sys.stderr)
-                return 1
-            finally:
-                server.close()
-                control.close()
-                signal.signal(signal.SIGTERM, before)
-                os.waitpid(spawner, 0)
+        return serve_from(
+            listener,
+            limits or Limits(),
+            modules=modules,
+            origins=origins,
+            output=output,
+            record=record,
+            ready=lambda: ready(listener.getsockname()[1]),
+        )
+
+
+def serve_from(
+    listener: Listener,
+    limits: Limits,
+    *,
+    modules: Sequence[str] = (),
+    origins: Sequence[str] = (),
+    output: bool = False,
+    record: Path | None = None,
+    ready: Callable[[], None] = lambda: None,
+) -> int:
+    """As `serve`, to the connections that `listener` accepts."""
+    _allow_files(limits.connections + 2 * _WITHOUT_HANDSHAKE)
+    control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
+    with control:
+        if not _is_ready(control):
+            os.waitpid(spawner, 0)
+            return 1
+        server = Server(listener, control, limits, origins)
+        before = signal.signal(signal.SIGTERM, _interrupt)
+        try:
+            ready()
+            server.run()
+        except KeyboardInterrupt:
+            return 0
+        except EOFError as error:
+            print(f"The server ends: {error}.", file=sys.stderr)
+            return 1
+        finally:
+            server.close()
+            control.close()
+            signal.signal(signal.SIGTERM, before)
+            os.waitpid(spawner, 0)
     raise AssertionError("the server runs until it is interrupted")
 
 
@@ -367,7 +406,7 @@ def _allow_files(count: int) -> None:
 
 
 def _fork_spawner(
-    listener: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
+    listener: Listener, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
 ) -> tuple[socket.socket, int]:
     """Start the spawner; our end of its socket, and its process id."""
     ours, theirs = socket.socketpair()

@@ -27,7 +27,7 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys((trial.RIGHT, trial.MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS),
     "actionSpace": NAMES,
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
-    "gym": st.sampled_from(["none", "watch", "advise", "play"]),
+    "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
     "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
     "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
 }

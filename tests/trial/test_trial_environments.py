@@ -1,0 +1,257 @@
+"""Environments that a participant's server makes for programs that have its token (gym: environments)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from testing.gym_server import Client
+from tests.trial.conftest import grid_agent
+from tests.trial.test_trial_tls import KEYS, put
+from trial.environments import LARGEST_REQUEST, MOST, REQUESTS_A_SECOND
+from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
+
+TOKEN = "the-secret-token"
+SERVES = {"gym": "environments", "startingFrameRate": 30}
+REGISTERS = """
+import os, time
+
+class Odd(gymnasium.Env):
+    action_space = gymnasium.spaces.Discrete(4)
+    observation_space = gymnasium.spaces.Box(0, 255, (2,), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.uint8), {"environment": dict(os.environ), "nice": os.nice(0), "process": os.getpid()}
+
+    def step(self, action):
+        while action == 1:
+            pass
+        if action == 2:
+            os._exit(3)
+        return np.zeros(2, np.uint8), 0.0, False, False, {}
+
+gymnasium.register("Odd-v0", Odd)
+"""
+
+
+def agent() -> str:
+    """An agent.py that registers an environment: action 1 hangs, action 2 ends its process."""
+    return grid_agent() + REGISTERS
+
+
+def url(server: Any, query: str = f"?token={TOKEN}") -> str:
+    return f"{server.address}gym{query}"
+
+
+def processes(server: Any) -> list[int]:
+    return [pid for pid in linux.descendants(server.process.pid) if linux.runs(pid)]
+
+
+def until(true: Callable[[], bool], seconds: float = 10) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def served(server: Any, env_id: str = "CartPole-v1", **options: Any) -> Iterator[RemoteEnv]:
+    with RemoteEnv(server.address, env_id, token=TOKEN, **options) as env:
+        yield env
+
+
+def test_who_has_the_token_trains_on_environments(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    assert processes(server) == []  # none before the first program
+    with served(server) as env:
+        env.reset(seed=1)
+        assert env.step(1)[1] == 1.0
+        assert len(env.step_many([1, 0, 1])[1]) == 3
+    with RemoteVectorEnv(server.address, "CartPole-v1", num_envs=3, token=TOKEN) as envs:
+        envs.reset(seed=1)
+        assert envs.step([0, 1, 0])[1].tolist() == [1.0, 1.0, 1.0]
+
+
+def test_the_same_over_tls(launch: Any, tmp_path: Path) -> None:
+    put(tmp_path / "store" / "ssl", 1)
+    server = launch(agent(), SERVES, **KEYS)
+    address, ca = f"wss://localhost:{server.port}/", str(tmp_path / "store/ssl/fullchain.pem")
+    with RemoteEnv(address, "CartPole-v1", token=TOKEN, ca=ca) as env:
+        env.reset(seed=1)
+        assert env.step(1)[1] == 1.0
+    with pytest.raises(ConnectionLost, match="401"):
+        RemoteEnv(address, "CartPole-v1", ca=ca)
+
+
+def test_the_forms_of_make_gym_are_served(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with Client(url(server)) as gymie:
+        made = gymie.say('{"method": "make", "params": {"env_id": "CartPole-v1"}}')
+        assert "{" not in made
+        gymie.ask("reset", instance_id=made)
+        assert len(gymie.ask("step", instance_id=made, action=1)) == 4
+    with Client(url(server) + "&form=gymnasium") as client:
+        made = client.ask("make", env_id="CartPole-v1")["instance_id"]
+        client.ask("reset", instance_id=made)
+        assert len(client.ask("step", instance_id=made, action=1)) == 5
+    with pytest.raises(InvalidStatus) as refused:
+        Client(url(server) + "&form=other")
+    assert refused.value.response.status_code == 400
+
+
+def test_closes_pass_with_their_codes_and_words(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with Client(url(server)) as gymie, pytest.raises(ConnectionClosed) as closed:
+        gymie.say("[]")
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1003
+    assert closed.value.rcvd.reason
+    with served(server, "Odd-v0") as env:
+        env.reset()
+        with pytest.raises(ConnectionLost, match=r"ended its process \(exit status 3\)"):
+            env.step(2)
+
+
+def test_a_request_that_is_too_large_ends_its_connection_alone(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with served(server) as env, connect(url(server), compression=None, proxy=None) as large:
+        large.send("x" * (LARGEST_REQUEST + 1))
+        with pytest.raises(ConnectionClosed):
+            large.recv(10)
+        assert large.close_code == 1009
+        env.reset()
+
+
+def test_a_request_of_more_than_a_page_may_send_passes(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with served(server) as env:
+        env.reset(seed=1)
+        assert len(env.step_many([1] * 60_000)[1]) == 60_000
+
+
+@pytest.mark.parametrize("query", ["", "?token=", "?token=other", "?form=gymnasium"])
+def test_who_has_no_token_makes_nothing(launch: Any, query: str) -> None:
+    server = launch(agent(), SERVES)
+    with pytest.raises(InvalidStatus) as refused:
+        connect(url(server, query), proxy=None)
+    assert refused.value.response.status_code == 401
+    assert processes(server) == []
+
+
+@pytest.mark.parametrize(("gym", "words"), [("none", "404"), ("watch", "does not speak"), ("advise", "does not speak")])
+def test_unless_the_project_says_so_there_are_none(launch: Any, gym: str, words: str) -> None:
+    server = launch(agent(), {"gym": gym})
+    with pytest.raises(ConnectionLost, match=words), served(server):
+        pass
+    assert processes(server) == []
+
+
+def test_programs_are_limited(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST):
+            stack.enter_context(served(server))
+        with pytest.raises(ConnectionLost, match=f"{MOST} programs"), served(server):
+            pass
+    until(lambda: len(processes(server)) == 2)  # who listens and who starts processes
+    with served(server) as env:
+        env.reset()
+
+
+def test_requests_beyond_so_many_a_second_wait(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    count = REQUESTS_A_SECOND
+    with connect(url(server) + "&form=gymnasium", compression=None, proxy=None) as program:
+        program.send('{"method": "nothing", "params": {}}')
+        program.recv(20)
+        since = time.monotonic()
+        for _ in range(count):
+            program.send('{"method": "nothing", "params": {}}')
+        for _ in range(count):
+            assert "MethodNotFound" in program.recv(20)
+        assert time.monotonic() - since > 0.95
+
+
+def test_agents_environments_know_no_secret_and_let_the_game_go_first(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with served(server, "Odd-v0") as env:
+        _, info = env.reset()
+        score = Path(f"/proc/{info['process']}/oom_score_adj").read_text()
+    assert not {"TOKEN", "CREDENTIAL"} & info["environment"].keys()
+    assert not [name for name, value in info["environment"].items() if TOKEN in value]
+    assert info["nice"] == 19
+    assert score.strip() == "1000"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_nothing_stays_behind_when_the_server_ends(launch: Any, number: signal.Signals) -> None:
+    server = launch(agent(), SERVES, LINGER_SECONDS="0")
+    with served(server, "Odd-v0") as env:
+        env.reset()
+        threading.Thread(target=_hang, args=(env,), daemon=True).start()
+        until(lambda: len(processes(server)) == 3)
+        left = processes(server)
+        os.kill(server.process.pid, number)
+        server.wait()
+        until(lambda: not any(map(linux.runs, left)))
+
+
+def _hang(env: RemoteEnv) -> None:
+    with contextlib.suppress(RemoteError):
+        env.step(1)
+
+
+def test_a_process_that_was_killed_is_started_again(launch: Any) -> None:
+    server = launch(agent(), SERVES)
+    with served(server) as env:
+        env.reset()
+        (listens,) = linux.children(server.process.pid)
+        os.kill(listens, signal.SIGKILL)
+        until(lambda: not linux.runs(listens))
+        with pytest.raises(ConnectionLost):
+            env.step_many([1] * 10)
+    until(lambda: processes(server) == [])
+    with served(server) as env:
+        env.reset()
+
+
+def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_client: Any) -> None:
+    server = launch(agent(), SERVES)
+
+    async def play() -> list[float]:
+        async with open_client(server.address) as client:
+            await client.play()
+            with served(server, "Odd-v0") as env:
+                env.reset()
+                hanging = threading.Thread(target=_hang, args=(env,), daemon=True)
+                hanging.start()
+                since, seen = time.monotonic(), len(client.frames)
+                await client.until(lambda: time.monotonic() > since + 3)
+                assert hanging.is_alive()
+                return [since, *(when for when, _ in client.frames[seen:])]
+
+    times = asyncio.run(play())
+    assert len(times) > 60  # of 90
+    assert max(later - earlier for earlier, later in itertools.pairwise(times)) < 0.5
+
+
+def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch: Any) -> None:
+    server = launch(agent(), SERVES, IDLE_SECONDS="3")
+    with served(server) as env:
+        env.reset()
+        assert server.wait() == 0
+        with pytest.raises(ConnectionLost, match="going away"):
+            env.step(1)
