@@ -113,8 +113,8 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
 
     It has a connection of its own, which ends with `close`, with a `with` block, or when the object is no longer used.
     `render_mode` and `options` are what `gymnasium.make` takes; `token` goes into the address (`?token=`), for a
-    trial's server, or a proxy that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is a file of certificates to
-    trust (PEM), for `wss://`.
+    trial's server, or a proxy that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is
+    a file of certificates to trust (PEM), for `wss://`.
     `np_random` is the client's own: the environment draws its random numbers on the server, by the seed of `reset`.
 
     Raises `RemoteError` with the server's sentence, and `ConnectionLost`, which is one, when the connection has ended:
