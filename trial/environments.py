@@ -44,6 +44,7 @@ _LARGEST_ANSWER = 8 * LARGEST_REPLY  # bytes of a message: JSON takes several fo
 _AHEAD_SECONDS = 0.02  # so much sooner than evenly spread may requests be passed on
 _START_SECONDS = 60.0
 _CLOSE_SECONDS = 2.0
+_SEND_SECONDS = 30.0  # that a program may leave an answer unread
 _NOT_SENT = (1005, 1006, 1015)  # close codes that no message has (RFC 6455, 7.4.1)
 _GONE = "The process of the environments has ended."
 
@@ -118,19 +119,25 @@ class Environments:
         requests = asyncio.create_task(self._pass_on(websocket, process, paced=True))
         try:
             await self._pass_on(process, websocket)
+        except TimeoutError:
+            websocket.transport.abort()
         finally:
             requests.cancel()
             await asyncio.wait({requests})
             process.transport.abort()
 
     async def _pass_on(self, source: Connection, target: Connection, *, paced: bool = False) -> None:
-        """Pass on messages until one of the two is closed; then close the other with the same words."""
+        """Pass on messages until one of the two is closed; then close the other with the same words.
+
+        Raises TimeoutError if a program does not read its answers.
+        """
         with contextlib.suppress(ConnectionClosed):
             while True:
                 message = await source.recv()
                 if paced:
                     await self._turn()
-                await target.send(message)
+                async with asyncio.timeout(None if paced else _SEND_SECONDS):
+                    await target.send(message)
         if source.close_code is None:
             return  # the target is gone, which the other direction tells the source
         code, words = source.close_code, source.close_reason or ""

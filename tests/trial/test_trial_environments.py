@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import json
 import os
 import signal
 import threading
@@ -14,12 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.asyncio.server import serve
+from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
+from websockets.uri import parse_uri
 
 from testing.gym_server import Client
 from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
+from trial import environments
 from trial.environments import LARGEST_REQUEST, MOST, REQUESTS_A_SECOND
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
 
@@ -255,3 +261,47 @@ def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(lau
         assert server.wait() == 0
         with pytest.raises(ConnectionLost, match="going away"):
             env.step(1)
+
+
+def framed(request: Any) -> bytes:
+    return Frame(Opcode.TEXT, json.dumps(request).encode()).serialize(mask=True)
+
+
+def test_before_a_warm_server_has_its_participant_it_makes_none(launch: Any) -> None:
+    server = launch(agent(), SERVES, SPARE="on")
+    with connect(url(server), compression=None, proxy=None) as program:
+        with pytest.raises(ConnectionClosed):
+            program.recv(10)
+        assert program.close_code == 1013
+    assert processes(server) == []
+
+
+def test_a_program_that_does_not_read_its_answers_keeps_no_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environments, "_SEND_SECONDS", 0.5)
+    made = environments.Environments(tmp_path)
+
+    async def come() -> None:
+        async with serve(made.serve, "127.0.0.1", 0, compression=None, write_limit=(1, 0)) as server:
+            port = server.sockets[0].getsockname()[1]
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            handshake = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}/gym?form=gymnasium"))
+            handshake.send_request(handshake.connect())
+            writer.write(b"".join(handshake.data_to_send()))
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(framed({"method": "make", "params": {"env_id": "CartPole-v1"}}))
+            await reader.readexactly(2)
+            instance = json.loads(await reader.readuntil(b"}"))["instance_id"]
+            writer.write(framed({"method": "reset", "params": {"instance_id": instance}}))
+            for _ in range(10):  # each with an answer of 2 MB
+                writer.write(
+                    framed({"method": "step_many", "params": {"instance_id": instance, "actions": [1] * 20000}})
+                )
+            async with asyncio.timeout(20):
+                while made.connections:
+                    await asyncio.sleep(0.02)
+            writer.close()
+        await made.close()
+
+    asyncio.run(come())
