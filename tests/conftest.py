@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import io
+import os
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +33,12 @@ ONE_AFTER_ANOTHER = (
 
 
 gc.disable()  # until all is imported; see `pytest_collection_finish`
+# A shell's background jobs inherit SIGINT as ignored, and `make test` tells the commands of its tests that they are
+# part of it: both would change what the processes that tests start do.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):
+    os.environ.pop(_name, None)
 memoized_aws.keep()
 exploration.load_profile()
 

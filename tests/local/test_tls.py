@@ -76,7 +76,7 @@ class FrontEnd:
 
     def page(self) -> Any:
         address = f"wss://{self.user_id}.localhost:{self.port}/"
-        return hippo_page(address, self.user_id, FRONT_END, trusted=self.trusted, host="127.0.0.1")
+        return hippo_page(address, self.user_id, FRONT_END, trusted=self.trusted, host="127.0.0.1", project_id="quick")
 
 
 async def play(page: HippoPage) -> None:

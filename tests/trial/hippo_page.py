@@ -22,9 +22,10 @@ KEYS = {"ArrowLeft": ("leftArrow", "left"), "ArrowRight": ("rightArrow", "right"
 class HippoPage(TakesMessages):
     """The page's state, and what its buttons and keys send."""
 
-    def __init__(self, websocket: ClientConnection, user_id: str) -> None:
+    def __init__(self, websocket: ClientConnection, user_id: str, project_id: str) -> None:
         self.websocket = websocket
         self.user_id = user_id
+        self.project_id = project_id
         self.ui: list[str] = []
         self.instructions: list[str] = []
         self.frame_count = 0
@@ -40,7 +41,7 @@ class HippoPage(TakesMessages):
         await self.websocket.send(json.dumps(data))
 
     async def hello(self) -> None:
-        await self.send(userId=self.user_id, projectId="study")
+        await self.send(userId=self.user_id, projectId=self.project_id)
 
     async def command(self, name: str) -> None:
         """A click on a button: the ones of HIPPO and those of the project's own."""
@@ -117,6 +118,7 @@ async def hippo_page(
     headers: dict[str, str] | None = None,
     greets: bool = True,
     host: str | None = None,
+    project_id: str = "study",
 ) -> AsyncIterator[HippoPage]:
     """Open it at a server's address. It sends its hello as soon as it is connected."""
     place = {"host": host} if host else {}
@@ -130,7 +132,7 @@ async def hippo_page(
         additional_headers=headers,
         **place,
     ) as websocket:
-        page = HippoPage(websocket, user_id)
+        page = HippoPage(websocket, user_id, project_id)
         if greets:
             await page.hello()
         yield page
