@@ -1,7 +1,7 @@
 """Keys of the documents that a server reads and writes: answers, recordings and its handover.
 
-docs/architecture.md also lists the other documents of projects, participants and servers. Two folders of the bucket are
-not there: `SSL/` (`hippodrome/certificates/rules.py`) and `_builds/` (`deploy/study/image/codebuild.py`).
+docs/architecture.md lists all documents. Keys that servers do not use are elsewhere, such as those below `SSL/`
+(`hippodrome/certificates/rules.py`) and `_builds/` (`deploy/study/image/codebuild.py`).
 """
 
 from __future__ import annotations

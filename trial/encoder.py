@@ -41,7 +41,7 @@ class Encoder:
         self._jpeg_bytes = 0  # of the last JPEG
         self._unmeasured = 0  # bytes of lossless frames since then
         self._wait = 0  # JPEGs to send until the lossless codings are tried again
-        self._keys = 0  # frames for which a key frame is tried before a difference
+        self._keys = 0  # of the coming frames, for so many a key frame is tried first
         self._calm = 0  # bytes that differences would have saved since they became small
 
     @property

@@ -53,7 +53,8 @@ STORE_MARGIN = 10.0
 EXIT_MARGIN = 4.0
 """The process ends in any case this many seconds before it would be killed."""
 TELL_SECONDS = 5.0
-"""If a trial cannot begin, the process stays so long to tell the clients that connect; then it ends and is replaced."""
+"""If a trial cannot begin, the process tells it to clients that connect within so many seconds. Then it ends, and
+another server replaces it."""
 _TOLD_SECONDS = 0.3  # the same, once a client has been told
 _NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."

@@ -28,12 +28,12 @@ class Why(StrEnum):
 
 @dataclass(frozen=True)
 class Scope:
-    """What a caller may remove: by default what servers have that are closed or replaced."""
+    """What a caller may remove. By default: the resources of closed servers, and of attempts that were replaced."""
 
-    closed_by: datetime | None = None  # of servers that were closed by then; others are left to what closed them
+    closed_by: datetime | None = None  # only of servers closed until this time
     project_id: str | None = None  # of this project's servers alone
     without_record: bool = False  # also what no record owns, where only this installation's resources can be
-    labels: frozenset[str] = frozenset()  # also all that an erased participant's servers have, closed or not
+    labels: frozenset[str] = frozenset()  # servers of an erased participant: all they have
     names: frozenset[str] = frozenset()  # and the warm servers that were assigned to the participant
 
     def covers(self, owner: Server | None) -> bool:

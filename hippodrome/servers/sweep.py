@@ -1,9 +1,9 @@
 """`sweep`: delete the resources that no open record owns, and send lost messages again.
 
 Resources are listed first and records read afterwards. A record is written before its server's resources are created,
-so a listed resource without an open record is a leftover: there is no race, and no age to guess. A server closed since
-the sweep began is left to the function that closed it. A resource is never touched if its name is no server's name, or
-if its record is not in our bucket (it may be another installation's).
+so a listed resource whose record is closed is a leftover: there is no race, and no age to guess. Three kinds stay:
+those of a server that was closed since the sweep began (the function that closed it deletes them), those whose name is
+no server's name, and those without a record in our bucket (they may be another installation's).
 """
 
 from __future__ import annotations

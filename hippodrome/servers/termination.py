@@ -40,7 +40,7 @@ class ServerToClose(NamedTuple):
     stored: Versioned
     reason: Reason
     cause: Cause | None = None  # if it failed
-    deprovisioning: bool = False  # its task still occupies its own cluster, which cannot be deleted yet
+    deprovisioning: bool = False  # ECS is ending its task (DEPROVISIONING): a cluster of its own cannot be deleted yet
 
 
 class Termination:
@@ -195,7 +195,7 @@ class Termination:
     def _close_ended(self, closing: ServerToClose) -> None:
         """Delete the server's cluster and pool entry, close its record, then call `after_close`.
 
-        The timer is deleted last: if the sweep is interrupted in here, the timer leads the next sweep to `after_close`.
+        The timer is deleted last: if this is interrupted, the timer leads the next sweep to `after_close`.
         """
         record = closing.stored.server
         if record.is_closed:  # what follows may have been interrupted

@@ -41,7 +41,10 @@ def guarded(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
 
 
 class Instance:
-    """An environment. `mode` says how `step_many` begins the next episode (Gymnasium's `AutoresetMode`)."""
+    """An environment, or a vector of them.
+
+    `mode`: how `step_many` goes on after the end of an episode (Gymnasium's `AutoresetMode`).
+    """
 
     num_envs = 0
     """How many environments a vector has; 0 for a single one."""

@@ -1,4 +1,4 @@
-"""The request that the handlers of all types of steps get."""
+"""What `show` of each type of step is given."""
 
 from __future__ import annotations
 
