@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from protocol import values
 from protocol.values import Check, Keys
 
-RIGHT, MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
+RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
 """Words that a client says to the server, so no control of a project's own can be called so."""
 MAX_OWN_CONTROLS = 32
@@ -246,12 +246,12 @@ def check(section: object) -> tuple[Trial, list[Problem]]:
 
 def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
     """The section with the right spelling of a key that HIPPO's documentation spells in two ways."""
-    if MISSPELT not in section:
+    if RATE_CHANGE_MISSPELT not in section:
         return section, []
-    rest = {key: value for key, value in section.items() if key != MISSPELT}
-    if rest.get(RIGHT) not in (None, ""):
-        return rest, [Problem((MISSPELT,), f"{RIGHT} is given too; keep that one")]
-    return rest | {RIGHT: section[MISSPELT]}, []
+    rest = {key: value for key, value in section.items() if key != RATE_CHANGE_MISSPELT}
+    if rest.get(RATE_CHANGE) not in (None, ""):
+        return rest, [Problem((RATE_CHANGE_MISSPELT,), f"{RATE_CHANGE} is given too; keep that one")]
+    return rest | {RATE_CHANGE: section[RATE_CHANGE_MISSPELT]}, []
 
 
 def _section(model: type[Trial | Ui], section: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:

@@ -33,6 +33,9 @@ def main() -> int:
     """
     os.umask(0o077)  # recordings and answers, and what the agent writes, are the owner's alone
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
+    sys.dont_write_bytecode = (
+        True  # for a changed agent.py of the same size and second Python would take the older code
+    )
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:
         settings = Settings.from_env(os.environ)

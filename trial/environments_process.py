@@ -56,6 +56,7 @@ class Handed:
 
 def main() -> int:
     """Serve until the trial's server is gone; the exit status."""
+    sys.dont_write_bytecode = True  # as the trial: it imports agent.py
     linux.die_with_parent()
     os.nice(19)
     with contextlib.suppress(OSError):  # Linux alone has it; the kernel ends the highest first (proc(5))

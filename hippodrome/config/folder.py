@@ -17,7 +17,7 @@ from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_files import CLOSING, StepFileError, open_folder
 from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
-from protocol.trial import MISSPELT, RIGHT
+from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
 
 if TYPE_CHECKING:
     from hippodrome.config.yaml_file import ParsedFile
@@ -45,8 +45,12 @@ class Source:
         return self.adapted.origin(path) in self.parsed.lines
 
     def _diagnostic(self, origin: Keys, message: str, line: int | None, remark: bool) -> Diagnostic:
-        if origin == ("trial", RIGHT) and origin not in self.parsed.lines and ("trial", MISSPELT) in self.parsed.lines:
-            line = line or self.parsed.lines["trial", MISSPELT]
+        if (
+            origin == ("trial", RATE_CHANGE)
+            and origin not in self.parsed.lines
+            and ("trial", RATE_CHANGE_MISSPELT) in self.parsed.lines
+        ):
+            line = line or self.parsed.lines["trial", RATE_CHANGE_MISSPELT]
         file = self.layout.label(self.layout.config)
         return Diagnostic(file, line or self.parsed.line(origin), where_of(origin), message, remark)
 

@@ -16,7 +16,7 @@ from hippodrome.config.project_keys import MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from hippodrome.model.step_order import FINAL
-from protocol.trial import HIGHEST_RATE, MISSPELT, RIGHT, Trial
+from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial
 from protocol.values import Plain, flag, number_in, show
 
 CLOSING_PAGE = "hippodrome-the-end"
@@ -328,7 +328,7 @@ def _actions(adapted: Adapted) -> None:
 def _frame_rates(adapted: Adapted) -> None:
     """Bounds that do not matter, since participants may not change the rate."""
     trial = adapted.section(("trial",))
-    if any(_is_true(trial.get(key)) for key in (RIGHT, MISSPELT)):
+    if any(_is_true(trial.get(key)) for key in (RATE_CHANGE, RATE_CHANGE_MISSPELT)):
         return
     usual = Trial()
     low, start, high = (
@@ -343,7 +343,7 @@ def _frame_rates(adapted: Adapted) -> None:
         return
     for key in ("minFrameRate", "maxFrameRate"):
         if not _blank(trial.get(key)):
-            adapted.remark(("trial", key), f"no effect, since {RIGHT} is not true")
+            adapted.remark(("trial", key), f"no effect, since {RATE_CHANGE} is not true")
     trial |= {"minFrameRate": min(usual.min_frame_rate, start), "maxFrameRate": max(usual.max_frame_rate, start)}
 
 
@@ -355,7 +355,7 @@ def _unknown(adapted: Adapted) -> None:
     for section, known in sorted(NAMES.items(), key=lambda one: one[0] != ("trial",)):
         for key in [key for key in adapted.section(section) if key not in known]:
             path = (*section, key)
-            if path == ("trial", MISSPELT) or _is_mistake(adapted, path):
+            if path == ("trial", RATE_CHANGE_MISSPELT) or _is_mistake(adapted, path):
                 continue
             if section == ("trial", "ui"):
                 _own_control(adapted, path)

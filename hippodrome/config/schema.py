@@ -9,7 +9,7 @@ from typing import Any
 
 from hippodrome.config.project_keys import SECTIONS, Root
 from protocol import trial
-from protocol.trial import MISSPELT, RIGHT, Trial, Ui
+from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial, Ui
 
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
@@ -27,8 +27,8 @@ def config_schema() -> dict[str, Any]:
     definitions |= {section.__name__: _of_trial(section) for section in (Trial, Ui)}
     schema["properties"]["trial"] = {"$ref": "#/$defs/Trial"}
     properties = definitions["Trial"]["properties"]
-    spelt = f"HIPPO's spelling of {RIGHT}."
-    properties[MISSPELT] = {**properties[RIGHT], "description": spelt, "deprecated": True}
+    spelt = f"HIPPO's spelling of {RATE_CHANGE}."
+    properties[RATE_CHANGE_MISSPELT] = {**properties[RATE_CHANGE], "description": spelt, "deprecated": True}
     definitions["Project"]["required"] = ["id", "steps"]
     schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
     meanings = _meanings()

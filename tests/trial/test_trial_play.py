@@ -3,7 +3,9 @@
 import asyncio
 import importlib.util
 import json
+import os
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -430,3 +432,22 @@ def test_two_game_steps_on_one_server(launch, open_client, grid):
     assert server.wait() == 0
     assert server.answered("4")
     assert list(server.recordings()) == ["2-episode-0001.jsonl.gz", "4-episode-0001.jsonl.gz"]
+
+
+def test_an_agent_that_was_changed_within_a_second_is_the_new_one(launch, grid, tmp_path):
+    """Python takes stored bytecode for current if size and second of the source are the same (PEP 552)."""
+    file = tmp_path / "agent" / "agent.py"
+    file.parent.mkdir()
+    for word in ("older", "newer"):
+        file.write_text(f"import sys\nsys.stderr.write('the {word} agent\\n')\n" + grid())
+        os.utime(file, (1_000_000_000, 1_000_000_000))
+        server = launch(None, PYTHONDONTWRITEBYTECODE="")
+        until = time.monotonic() + 15
+        while "agent\n" not in server.said():
+            assert time.monotonic() < until, server.said()
+            time.sleep(0.02)
+        assert f"the {word} agent" in server.said()
+        server.process.kill()
+        server.process.wait()
+        server.log.unlink()
+    assert not [*tmp_path.rglob("__pycache__")], "the researcher's folder gets no files of ours"

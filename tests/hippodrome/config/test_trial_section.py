@@ -24,7 +24,9 @@ ODD = st.sampled_from(
 KEYS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize"), NUMBERS),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
-    **dict.fromkeys((trial.RIGHT, trial.MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS),
+    **dict.fromkeys(
+        (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS
+    ),
     "actionSpace": NAMES,
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
     "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
@@ -51,7 +53,7 @@ def started(section: dict[str, Any]) -> trial.Trial | str:
 
 
 def test_every_key_is_tried_here() -> None:
-    assert set(KEYS) | {"game"} == trial.names(trial.Trial) | {trial.MISSPELT}
+    assert set(KEYS) | {"game"} == trial.names(trial.Trial) | {trial.RATE_CHANGE_MISSPELT}
 
 
 @given(SECTIONS)
@@ -70,8 +72,8 @@ def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> No
     wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
     defaults = trial.Trial().document()
     document = found.document()
-    assert {key: document[key] for key in wrong - {trial.MISSPELT}} == {
-        key: defaults[key] for key in wrong - {trial.MISSPELT}
+    assert {key: document[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}} == {
+        key: defaults[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}
     }
 
 
@@ -82,7 +84,7 @@ def test_a_rate_beyond_a_default_is_refused_at_both_ends() -> None:
 
 
 def test_both_spellings_at_once_are_refused_at_both_ends() -> None:
-    section = {"game": "x/Y-v0", trial.RIGHT: True, trial.MISSPELT: False}
+    section = {"game": "x/Y-v0", trial.RATE_CHANGE: True, trial.RATE_CHANGE_MISSPELT: False}
     said = "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"
     assert registered(section) == [said]
     assert started(section) == said
