@@ -430,10 +430,11 @@ class Interrupting:
         now = self.calls == self.at
         if now and self.before:
             raise KeyboardInterrupt
-        answer = act()
-        if now:
-            raise KeyboardInterrupt
-        return answer
+        try:
+            return act()
+        finally:
+            if now:  # whether the answer is a result or an error
+                raise KeyboardInterrupt
 
 
 @pytest.mark.explores
