@@ -152,7 +152,7 @@ def _serve(people: int) -> None:
 
 def _recording() -> bytes:
     """The lines of a recording, as long and as large as those of the example project's game."""
-    from trial import recording
+    from trial.recordings import recording
 
     stamp = {"v": 1, "session": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}
     lines = [recording.line("header", **stamp, actionSpace=["noop"] * 9, episode=1, seed=5)]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from trial.frames import Frame, as_frame
+from trial.pictures.frames import Frame, as_frame
 
 ROOT = Path(__file__).parents[1]
 GAME = "ALE/MsPacman-v5"

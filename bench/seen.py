@@ -21,7 +21,7 @@ from PIL import Image
 from bench.bare import PAGE
 from bench.pictures import GAME, ROOT, ms_pacman, texture
 from testing.browser import game_page, html_page
-from trial.frames import Frame
+from trial.pictures.frames import Frame
 
 SECONDS = 6.0
 PRESSES = 60  # of a key; each goes down and comes up again

@@ -17,8 +17,8 @@ import numpy as np
 from bench import pictures, seen
 from bench.table import Row, each, row
 from testing.browser import chromium
-from trial.encoder import Encoder
-from trial.frames import DIFFERENCE, JPEG, KEY, Decoder, Frame, jpeg_message
+from trial.pictures.encoder import Encoder
+from trial.pictures.frames import DIFFERENCE, JPEG, KEY, Decoder, Frame, jpeg_message
 
 ROUNDS = 3  # of each measurement of processor time; the quickest counts
 IDLE_SECONDS = 5.0

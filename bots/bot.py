@@ -25,7 +25,7 @@ from bots.game import Game
 from bots.http import Reply, ask
 from bots.links import with_user
 from bots.page import Page
-from trial.frames import FrameError
+from trial.pictures.frames import FrameError
 
 SUBPROTOCOLS = [Subprotocol("hippodrome.2"), Subprotocol("hippodrome.1")]
 LARGEST_FRAME = 64 * 1024 * 1024

@@ -15,7 +15,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from bots.account import Account, Play
-from trial.frames import Decoder
+from trial.pictures.frames import Decoder
 
 QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
 

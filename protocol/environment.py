@@ -17,7 +17,8 @@ TOKEN = "TOKEN"  # noqa: S105 - a variable's name
 GAME_STEPS = "GAME_STEPS"
 """Keys of the game steps, separated by commas: `3` or `2,4`."""
 STORE = "STORE"
-"""Where documents are stored: the address that signs requests (trial/presigned.py), `s3://bucket`, or a folder."""
+"""Where documents are stored: the address that signs requests (trial/recordings/presigned.py), `s3://bucket`,
+a folder."""
 
 # The participant. A warm server reads both in its handover.
 

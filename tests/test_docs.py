@@ -128,7 +128,7 @@ def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
 def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
     import numpy as np
 
-    from trial import recording
+    from trial.recordings import recording
 
     picture = np.arange(6, dtype=np.uint8).reshape(2, 3)
     line = {"kind": "step", "reward": 1.0, "terminated": False, "truncated": True, "info": {"lives": 3}}
@@ -145,7 +145,7 @@ def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
-    from trial.agent import AgentAdapter
+    from trial.agent.agent import AgentAdapter
 
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
     names = ("noop", "up", "right", "down", "left")

@@ -17,7 +17,7 @@ from hippodrome.config import read_project
 from local.check import agent
 from testing import preloaded
 from tests.local.conftest import write_study
-from trial import process_group
+from trial.server import process_group
 
 TELLS = """
 import json, os, signal, sys

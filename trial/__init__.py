@@ -1,3 +1,1 @@
 """The trial server: runs one participant's trial and talks to their browser. Stands alone; see docs/wire.md."""
-
-VERSION = "1.0"

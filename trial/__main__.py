@@ -9,9 +9,9 @@ import signal
 import sys
 
 from protocol import environment, exits
-from trial import warm
-from trial.preauth_limit import PortNotPermitted
-from trial.server import Server
+from trial.server import warm
+from trial.server.preauth_limit import PortNotPermitted
+from trial.server.server import Server
 from trial.settings import Settings, SettingsError
 
 

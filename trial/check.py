@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from protocol import environment
-from trial import process_group, tracebacks
+from trial.agent import tracebacks
+from trial.server import process_group
 
 LACKS = "MISSING IN THE IMAGE: "
 """Begins the line that says what is missing."""
@@ -97,7 +98,7 @@ def _try(file: Path, report: Path) -> None:
 
 
 def _play(folder: Path, game: str | None) -> None:
-    from trial.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
+    from trial.agent.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
 
     player = AgentAdapter(

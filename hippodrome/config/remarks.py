@@ -20,7 +20,7 @@ IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "
 UI: Keys = ("trial", "ui")
 ARROWS = ("left", "right", "up", "down")
 PARTS = frozenset({*ARROWS, "fire"})
-"""Keys that act together with others: "up" and "right" are "upright" (`trial/controls.py`)."""
+"""Keys that act together with others: "up" and "right" are "upright" (`trial/core/controls.py`)."""
 
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = "no effect: servers get the certificate of the installation"
@@ -48,7 +48,7 @@ def starts_at_link(config: Config) -> bool:
 def without_a_key(config: Config) -> Remark | None:
     """What to say about an action that the game takes whenever no key is pressed, and that does something.
 
-    The trial then takes the action `noop`, or else the first one (`trial/controls.py`).
+    The trial then takes the action `noop`, or else the first one (`trial/core/controls.py`).
     """
     names = [name.strip().lower() for name in config.trial.action_space]
     if not names or "noop" in names or names[0] in IDLE or not config.game_steps:

@@ -1,7 +1,7 @@
 """The answers to steps: `Answers.store` stores what a participant POSTs, and `read` reads it for later pages.
 
 `journey.py` finds the step that a form answers and calls the step's type (`steps/`), which calls `store`. The trial
-stores the answer to a game step (`trial/recorder.py`) in a document of the same form (`protocol/answer.py`).
+stores the answer to a game step (`trial/recordings/recorder.py`) in a document of the same form (`protocol/answer.py`).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 1. `termination.py` closes the record with the reason why the server ended, and calls `Replacement.request`.
 2. `request` publishes the start message of the next attempt, if `next_attempt` names one.
 3. `start.py` handles that message, and calls `Replacement.write_record`: the next attempt's record replaces the closed
-   one. The trial on the new server resumes from the recordings (`trial/resume.py`).
+   one. The trial on the new server resumes from the recordings (`trial/recordings/resume.py`).
 
 After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`). If the message of step
 2 is lost, the sweep sends it again (`overdue.py`), and so does the participant's next GET

@@ -11,7 +11,7 @@ from hippodrome.model import ids
 from hippodrome.ports import DnsRecord
 from local.backend import files
 from local.backend.retry import Retry, reports_errors
-from trial import disk
+from trial.recordings import disk
 
 
 @reports_errors

@@ -10,7 +10,7 @@ from pathlib import Path
 from local.backend import files
 from local.backend.task_record import Task
 from protocol.keys import with_number
-from trial import disk
+from trial.recordings import disk
 
 
 def unfinished(spool: Path, task: Task) -> Sequence[Path]:

@@ -45,7 +45,7 @@ from local.backend.retry import Retry, reports_errors, start_thread
 from local.backend.task_record import HOST, Task, TaskFolder, claim_of, event, now
 from protocol import environment, handover
 from protocol.keys import participant_folder
-from trial import disk
+from trial.recordings import disk
 
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 START_TIMEOUT = 120.0  # seconds in which a server must listen

@@ -1,8 +1,8 @@
 """Whether agent.py can be read, and whether its agent starts the game and plays whole episodes, in each group.
 
 The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`) with a
-server's environment variables. With `warmServers` it is tried as on a warm server (`trial/warm.py`): the participant
-becomes known only before the first `reset`, and code that asks earlier gets a message.
+server's environment variables. With `warmServers` it is tried as on a warm server (`trial/server/warm.py`): the
+participant becomes known only before the first `reset`, and code that asks earlier gets a message.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from local.check.remedies import remedy
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.handover import Handover
-from trial import process_group
+from trial.server import process_group
 
 SECONDS = 120.0  # in which the agent must have done everything, in each group
 PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted

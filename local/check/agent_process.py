@@ -23,8 +23,8 @@ from typing import Any, ClassVar
 from local.check.pace import Pace
 from protocol import environment as variables
 from protocol import handover
-from trial import warm
-from trial.agent import AgentAdapter
+from trial.agent.agent import AgentAdapter
+from trial.server import warm
 from trial.settings import trial_section
 
 PLAY_STEPS = 5_000  # in each group

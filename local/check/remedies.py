@@ -50,7 +50,7 @@ def _of_module(module: str) -> str:
 
 
 def _of_gym(name: str) -> str:
-    """What Gym had and Hippodrome's stand-in for it lacks (`trial/old_gym`)."""
+    """What Gym had and Hippodrome's stand-in for it lacks (`trial/agent/old_gym`)."""
     if util.find_spec("gym"):  # a real one comes first
         return ""
     return f"; what stands in for Gym here has no {name}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"

@@ -1,4 +1,4 @@
-"""Errors of agent.py during a rehearsal, as the servers' logs have them (`trial/tracebacks.py` writes them)."""
+"""Errors of agent.py during a rehearsal, as the servers' logs have them (`trial/agent/tracebacks.py` writes them)."""
 
 from __future__ import annotations
 

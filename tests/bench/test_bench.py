@@ -28,7 +28,7 @@ from testing import browser
 from testing.simulation import aws_bound, hippo, ports, world
 from testing.simulation.ports import Conditions
 from testing.tasks import Life
-from trial.encoder import Encoder
+from trial.pictures.encoder import Encoder
 
 COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met", "kind"}
 

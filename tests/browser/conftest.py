@@ -15,7 +15,7 @@ from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.browser import ARGUMENTS, NoChromium, chromium_path
 from testing.held_study import HeldStudy
-from trial.recording import read
+from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 SHOTS = ROOT / "shots"

@@ -27,9 +27,9 @@ from hippodrome.ports import Conflict
 from local.backend.documents import FolderDocuments
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
-from trial.certificate import Certificate
+from trial.recordings.store import FolderStore
+from trial.server.certificate import Certificate
 from trial.settings import Settings
-from trial.store import FolderStore
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -256,7 +256,7 @@ def test_the_same_files_are_the_same_bundle_wherever_they_lie(folder: Path, tmp_
 
 def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     here = tmp_path / "hippodrome"
-    for part in ("infra/Dockerfile", "requirements/trial.txt", "protocol/trial.py", "trial/server.py"):
+    for part in ("infra/Dockerfile", "requirements/trial.txt", "protocol/trial.py", "trial/server/server.py"):
         (here / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / part, here / part)
     monkeypatch.setattr(bundle, "HERE", here)
@@ -265,7 +265,7 @@ def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.Monkey
         here / "infra/Dockerfile",
         here / "requirements/trial.txt",
         here / "protocol/trial.py",
-        here / "trial/server.py",
+        here / "trial/server/server.py",
         folder / "agent.py",
     ):
         file.write_text(file.read_text() + "\n")

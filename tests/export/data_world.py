@@ -14,8 +14,8 @@ from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import to_json
 from testing.studies import study
-from trial import recording
-from trial.recording import Recording
+from trial.recordings import recording
+from trial.recordings.recording import Recording
 
 PROJECT = study()
 Put = Callable[[str, bytes], None]

@@ -22,7 +22,7 @@ from export.scrub import Scrub, clean, identities
 from export.state import File, State
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
-from trial.recording import line
+from trial.recordings.recording import line
 
 TEXT = st.text(st.characters(), max_size=20)  # half characters, NUL, newlines and all
 HOSTILE = [

@@ -19,8 +19,8 @@ from local.backend.bus import FolderBus
 from local.backend.documents import FolderDocuments
 from local.backend.timers import FolderTimers
 from testing.power_cut import Disk
-from trial.recording import Recording
-from trial.store import FolderStore
+from trial.recordings.recording import Recording
+from trial.recordings.store import FolderStore
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the paths of handles are read from /proc")
 
@@ -129,7 +129,7 @@ def test_a_power_cut_breaks_no_promise(steps: list[tuple[str, int]], seed: int, 
 @pytest.mark.parametrize("lazy", ["sync_folder", "write_new"])
 def test_that_model_sees_what_is_not_synced(lazy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same without one of the syncs breaks promises."""
-    from trial import disk
+    from trial.recordings import disk
 
     without: dict[str, Callable[..., Any]] = {
         "sync_folder": lambda folder: None,

@@ -33,11 +33,11 @@ from protocol.keys import answer_key, handover_key, recordings_folder
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
-from trial import warm
-from trial.recorder import Recorder
+from trial.recordings.recorder import Recorder
+from trial.recordings.spool import Spool
+from trial.recordings.store import FolderStore
+from trial.server import warm
 from trial.settings import Settings, SettingsError, trial_section
-from trial.spool import Spool
-from trial.store import FolderStore
 
 ROOT = Path(__file__).parents[2]
 VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}

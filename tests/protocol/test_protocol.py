@@ -39,7 +39,7 @@ def test_both_sides_import_the_check_of_a_section() -> None:
 
 
 def test_the_exit_codes_are_written_once() -> None:
-    assert "protocol" in top_level("trial")["trial/server.py"]
+    assert "protocol" in top_level("trial")["trial/server/server.py"]
     assert "protocol" in top_level("hippodrome")["hippodrome/servers/causes.py"]
     codes = {exits.NO_AGENT, exits.LATE_AGENT, exits.NO_PORT}
     assert len(codes) == 3

@@ -18,9 +18,9 @@ from websockets.typing import Subprotocol
 
 from testing import preloaded
 from tests.trial.taking import TakesMessages
-from trial import recording
-from trial.connection import SUBPROTOCOLS
-from trial.frames import Decoder, Frame
+from trial.pictures.frames import Decoder, Frame
+from trial.recordings import recording
+from trial.wire.connection import SUBPROTOCOLS
 
 ROOT = Path(__file__).parents[2]
 

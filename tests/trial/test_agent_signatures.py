@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trial import recording, signatures
-from trial.agent import AgentAdapter, AgentError, read_step_result
-from trial.agent_calls import AgentCalls
-from trial.effects import StepCall
-from trial.progress import Action
+from trial.agent import signatures
+from trial.agent.agent import AgentAdapter, AgentError, read_step_result
+from trial.agent.calls import AgentCalls
+from trial.core.effects import StepCall
+from trial.core.progress import Action
+from trial.recordings import recording
 
 AGENT = """
 import numpy

@@ -1,4 +1,4 @@
-"""`import gym` where Gym is not installed: its old interface over Gymnasium (trial/old_gym)."""
+"""`import gym` where Gym is not installed: its old interface over Gymnasium (trial/agent/old_gym)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from trial.agent import AgentAdapter
+from trial.agent.agent import AgentAdapter
 
-OLD_GYM = Path(__file__).parents[2] / "trial/old_gym"
+OLD_GYM = Path(__file__).parents[2] / "trial/agent/old_gym"
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +305,7 @@ def test_a_real_gym_comes_first(tmp_path: Path) -> None:
     )
     code = f"""
 import sys; sys.path[:0] = [{str(OLD_GYM.parents[1])!r}, {str(tmp_path / "site")!r}]
-from pathlib import Path; from trial.agent import load
+from pathlib import Path; from trial.agent.agent import load
 load(Path({str(tmp_path / "agent")!r}))
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 
 from protocol import trial
-from trial import messages, plain
-from trial.message_log import MessageLog
-from trial.messages import BadMessage
-from trial.resume import RecordedTrial, add_lines
+from trial.core import messages
+from trial.core.message_log import MessageLog
+from trial.core.messages import BadMessage
+from trial.core.unfinished import RecordedTrial
+from trial.recordings.resume import add_lines
 from trial.settings import trial_section
+from trial.wire import plain
 
 UI = {"start": True, "left": True, "reallyGood": True, "fire": True, "leftUp": True, "brightness": False}
 

@@ -6,8 +6,9 @@ from itertools import groupby
 
 import pytest
 
-from trial.progress import Break, Episode, PlayState, Progress
-from trial.resume import RecordedTrial, add_lines
+from trial.core.progress import Break, Episode, PlayState, Progress
+from trial.core.unfinished import RecordedTrial
+from trial.recordings.resume import add_lines
 from trial.settings import trial_section
 
 SPACE = ("noop", "up", "right", "left", "down", "upright")

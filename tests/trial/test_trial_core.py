@@ -12,15 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from testing.exploration import examples
-from trial import messages, recording
-from trial.agent import AgentError, read_step_result
-from trial.connection import Connection
-from trial.controls import Controls
-from trial.flow_control import STALLED_SECONDS, Window
-from trial.progress import Break, CommandRefused, Episode, PlayState, Progress
+from trial.agent.agent import AgentError, read_step_result
+from trial.core import messages
+from trial.core.controls import Controls
+from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.progress import Break, CommandRefused, Episode, PlayState, Progress
+from trial.core.timing import Pacer
+from trial.recordings import recording
+from trial.server.watchdog import Watchdog
 from trial.settings import Settings, SettingsError, trial_section
-from trial.timing import Pacer
-from trial.watchdog import Watchdog
+from trial.wire.connection import Connection
 
 SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
 

@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 from tests.trial.test_trial_tls import KEYS, put
-from trial.preauth_limit import MAX_UNAUTHENTICATED
+from trial.server.preauth_limit import MAX_UNAUTHENTICATED
 
 SILENT = b""
 SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # and never the rest

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from testing.imports import imported
-from trial import messages
-from trial.agent import AgentTimeout
-from trial.core import Phase, Trial
-from trial.effects import (
+from trial.core import messages
+from trial.core.effects import (
+    AgentTimeout,
     Call,
     Close,
     CloseRecording,
@@ -30,9 +29,10 @@ from trial.effects import (
     StepTaken,
     WriteLine,
 )
-from trial.flow_control import STALLED_SECONDS, Window
-from trial.progress import Episode
-from trial.resume import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.progress import Episode
+from trial.core.trial import Phase, Trial
+from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -119,19 +119,8 @@ def sent(effects, kind=SendMessage):
 
 
 CORE = [
-    "core",
-    "effects",
-    "clients",
-    "message_log",
-    "timing",
-    "progress",
-    "controls",
-    "messages",
-    "inbound",
-    "flow_control",
-    "watchdog",
-    "encoder",
-    "frames",
+    *sorted((ROOT / "trial/core").glob("*.py")),
+    *(ROOT / f"trial/{name}.py" for name in ("pictures/encoder", "pictures/frames", "server/watchdog", "wire/inbound")),
 ]
 
 
@@ -140,7 +129,7 @@ def test_the_core_imports_nothing_that_waits_or_tells_the_time():
                "logging", "math", "numpy", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
                "isal", "PIL"}  # fmt: skip
     for module in CORE:
-        names = {name.partition(".")[0] for name in imported(ROOT / f"trial/{module}.py")}
+        names = {name.partition(".")[0] for name in imported(module)}
         assert names <= allowed, module
 
 
@@ -326,7 +315,7 @@ def test_feedback_goes_to_the_agent_with_the_next_step_once():
 
 
 def test_too_many_messages_between_two_steps_are_counted_and_not_kept(monkeypatch):
-    monkeypatch.setattr("trial.message_log.MESSAGES_KEPT", 3)
+    monkeypatch.setattr("trial.core.message_log.MESSAGES_KEPT", 3)
     driver = Driver().playing()
     driver.step()
     for _ in range(5):

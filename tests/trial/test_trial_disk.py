@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial import disk, recording
-from trial.recording import Recording, line
-from trial.spool import Spool
-from trial.store import FolderStore
+from trial.recordings import disk, recording
+from trial.recordings.recording import Recording, line
+from trial.recordings.spool import Spool
+from trial.recordings.store import FolderStore
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -64,7 +64,7 @@ def test_files_of_a_trial_are_its_owners_alone(tmp_path: Path) -> None:
     """What the program does first, in a process of its own, and what the agent's programs write."""
     program = (
         "import os, subprocess, sys; from trial.__main__ import main; code = main()\n"
-        "from trial.store import FolderStore; FolderStore(__import__('pathlib').Path(sys.argv[1])).create('a/b', b'')\n"
+        "from trial.recordings.store import FolderStore; FolderStore(__import__('pathlib').Path(sys.argv[1])).create('a/b', b'')\n"
         "subprocess.run(['touch', sys.argv[1] + '/touched'], check=True); sys.exit(code)"
     )
     before = os.umask(0o022)

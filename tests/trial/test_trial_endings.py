@@ -4,7 +4,7 @@ import asyncio
 import json
 import time
 
-from trial import recording
+from trial.recordings import recording
 
 UI = {"stop": True}
 
@@ -251,7 +251,7 @@ def test_s3(launch, open_client, grid, monkeypatch):
         body = s3.get_object(Bucket="data", Key="study/users/P1/trials/a1/3-episode-0002.jsonl.gz")["Body"].read()
         assert len(steps_of(recording.read(body))) == 10
         # The same server's name again: nothing is overwritten.
-        from trial.store import open_store
+        from trial.recordings.store import open_store
 
         store = open_store("s3://data")
         assert store.create("study/users/P1/answers/3.json", b"{}") is False

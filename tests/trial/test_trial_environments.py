@@ -25,9 +25,9 @@ from websockets.uri import parse_uri
 from testing.gym_server import Client
 from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
-from trial import environments
-from trial.environments import LARGEST_REQUEST, MOST, REQUESTS_A_SECOND
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
+from trial.programs import environments
+from trial.programs.environments import LARGEST_REQUEST, MOST, REQUESTS_A_SECOND
 
 TOKEN = "the-secret-token"
 SERVES = {"gym": "environments", "startingFrameRate": 30}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from protocol.exits import LATE_AGENT, NO_AGENT
-from trial.agent import Agent, AgentAdapter
+from trial.agent.agent import Agent, AgentAdapter
 
 BASE = """
 import time

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
-from trial import recording
-from trial.resume import RecordedTrial, add_lines
+from trial.core.unfinished import RecordedTrial
+from trial.recordings import recording
+from trial.recordings.resume import add_lines
 
 HISTORY = '''
 """Each reward depends on everything that happened in the episode before it, feedback included."""

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from testing.exploration import examples
-from trial import frames
-from trial.connection import SUBPROTOCOLS, Connection
-from trial.encoder import Encoder
-from trial.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
+from trial.pictures import frames
+from trial.pictures.encoder import Encoder
+from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
+from trial.wire.connection import SUBPROTOCOLS, Connection
 
 EXACT = {KEY, DIFFERENCE}
 

@@ -15,11 +15,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from testing.exploration import examples
 from tests.trial.hippo_page import hippo_page
-from trial import messages, plain, recording
-from trial.controls import Controls
-from trial.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
-from trial.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
+from trial.core import messages
+from trial.core.controls import Controls
+from trial.core.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
+from trial.recordings import recording
+from trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
 from trial.settings import Settings
+from trial.wire import plain
 
 HERE = "https://play.example.org"
 UI = {

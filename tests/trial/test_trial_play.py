@@ -102,7 +102,7 @@ def test_recording_says_what_happened(launch, open_client, grid):
     assert end["kind"] == "end"
     assert end["why"] == "reset"
     assert end["steps"] == len(steps)
-    from trial.recording import read_observation
+    from trial.recordings.recording import read_observation
 
     assert read_observation(left[0]["observation"]).tolist() == [left[0]["step"], 3]
     assert server.answer()["answers"]["outcome"] == "stopped"

@@ -18,8 +18,8 @@ from protocol.handover import Handover
 from protocol.keys import handover_key
 from testing.strict_s3 import StrictS3
 from testing.studies import study
-from trial import presigned, recording
-from trial.presigned import PresignedStore, StoreError
+from trial.recordings import presigned, recording
+from trial.recordings.presigned import PresignedStore, StoreError
 
 USER = "P1"
 UI = {"stop": True, "start": True}

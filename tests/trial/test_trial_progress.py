@@ -2,10 +2,10 @@
 
 import pytest
 
-from trial.controls import Controls
-from trial.progress import Action, CommandRefused, Episode, PlayState, Progress
+from trial.core.controls import Controls
+from trial.core.progress import Action, CommandRefused, Episode, PlayState, Progress
+from trial.core.timing import Pacer
 from trial.settings import trial_section
-from trial.timing import Pacer
 
 SPACE = ("noop", "up", "left")
 

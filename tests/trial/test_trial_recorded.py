@@ -6,9 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from trial import recording
-from trial.progress import Episode
-from trial.resume import RecordedStep, RecordedTrial, UnfinishedEpisode, add_lines, load_recorded
+from trial.core.progress import Episode
+from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.recordings import recording
+from trial.recordings.resume import add_lines, load_recorded
 
 
 def header(rate=20):

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial import recording
-from trial.resume import RecordedTrial, add_lines, load_recorded
-from trial.store import FolderStore
+from trial.core.unfinished import RecordedTrial
+from trial.recordings import recording
+from trial.recordings.resume import add_lines, load_recorded
+from trial.recordings.store import FolderStore
 
 DICE = (
     "\n_step = Grid.step\ndef _lucky(self, action):\n    import random\n    seen, _, *rest = _step(self, action)\n"

@@ -7,7 +7,7 @@ import boto3
 import pytest
 from moto import mock_aws
 
-from trial.store import open_store
+from trial.recordings.store import open_store
 
 
 @pytest.fixture(params=["folder", "s3", "s3 with a prefix"])

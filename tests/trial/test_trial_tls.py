@@ -9,9 +9,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from trial.certificate import Certificate
+from trial.recordings.store import FolderStore
+from trial.server.certificate import Certificate
 from trial.settings import Settings
-from trial.store import FolderStore
 
 
 def certificate(serial):

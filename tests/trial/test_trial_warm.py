@@ -17,9 +17,9 @@ from protocol import handover
 from protocol.exits import NO_AGENT
 from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key
-from trial import warm
+from trial.server import warm
+from trial.server.watchdog import Watchdog
 from trial.settings import Settings, SettingsError
-from trial.watchdog import Watchdog
 
 WARM_SERVER, OWN = "sparesparesparespare-1", "a-1"
 UI = {"stop": True, "start": True}

@@ -11,8 +11,8 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from trial import resume
-from trial.watch import MOST, Watchers
+from trial.programs.watch import MOST, Watchers
+from trial.recordings import resume
 
 PROOF = "?token=the-secret-token"
 ANSWER_SECONDS = 15

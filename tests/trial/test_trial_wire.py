@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trial import frames, messages
-from trial.controls import Controls
-from trial.watchdog import Watchdog
+from trial.core import messages
+from trial.core.controls import Controls
+from trial.pictures import frames
+from trial.server.watchdog import Watchdog
 
 # ---- what a client says
 

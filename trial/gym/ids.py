@@ -1,7 +1,7 @@
 """Ids of environments that Gymie's users wrote for gym 0.17, as Gymnasium and ALE have them now.
 
-`trial/old_gym` does the same for agents that import gym; it stands for a package of its own, and imports nothing of the
-trial.
+`trial/agent/old_gym` does the same for agents that import gym; it stands for a package of its own, and imports nothing
+of the trial.
 """
 
 from __future__ import annotations

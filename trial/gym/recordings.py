@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from protocol.keys import recordings_folder
-from trial import recording
 from trial.gym.errors import EnvironmentFailed
-from trial.recording import Recording
+from trial.recordings import recording
+from trial.recordings.recording import Recording
 
 PROJECT = "gym"
 FLUSH_SECONDS = 1.0

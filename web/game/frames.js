@@ -2,7 +2,7 @@
 
 export const HEADER = 10; // bytes before the pixels
 export const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
-const LARGEST = 4096 * 4096; // pixels of a picture; trial/frames.py sends no more
+const LARGEST = 4096 * 4096; // pixels of a picture; trial/pictures/frames.py sends no more
 
 export const canInflate = typeof DecompressionStream === "function";
 export const canDecode = typeof createImageBitmap === "function";

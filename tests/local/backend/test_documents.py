@@ -16,7 +16,7 @@ import pytest
 from hippodrome.ports import Conflict
 from local.backend.documents import FolderDocuments
 from tests.local.conftest import ROOT
-from trial.store import FolderStore
+from trial.recordings.store import FolderStore
 
 COUNT_UP = """
 import sys

@@ -26,7 +26,7 @@ from local.backend.task_record import Task, TaskFolder
 from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
 from tests.local.conftest import ROOT
-from trial import recording
+from trial.recordings import recording
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"

@@ -22,7 +22,7 @@ from local.watch import Watch
 from testing import preloaded
 from testing.exploration import sample
 from tests.local.conftest import ROOT, Local, write_study
-from trial import process_group
+from trial.server import process_group
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 
 from local.check.remedies import remedy
 
-OLD_GYM = Path(__file__).resolve().parents[3] / "trial/old_gym"
+OLD_GYM = Path(__file__).resolve().parents[3] / "trial/agent/old_gym"
 STAND_IN = "; what stands in for Gym here has no {}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"
 PIP = "; install its package: .venv/bin/pip install {}"
 

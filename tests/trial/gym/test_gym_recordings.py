@@ -18,7 +18,7 @@ import pytest
 from console.problem import Exit
 from deploy.__main__ import main
 from testing.gym_server import ROOT, Client, gym_server
-from trial import recording
+from trial.recordings import recording
 
 HERE = Path(__file__).parent
 ODD = ("--import", "odd_environments")

@@ -1,0 +1,1 @@
+"""The researcher's code: loaded, called on a thread of its own, and its errors reported."""

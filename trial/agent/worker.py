@@ -1,0 +1,98 @@
+"""The agent's thread: it runs the researcher's code, so that slow code never holds up the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from trial.core.effects import AgentTimeout
+
+T = TypeVar("T")
+
+Done = Callable[[Any, Exception | None], None]
+"""Takes a function's result, or the exception that it raised."""
+
+
+class Worker:
+    """Calls functions one after another on a single thread of its own (many simulators need one and the same thread).
+
+    The thread is a daemon: code that never returns cannot keep the process alive.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="agent", daemon=True)
+        self._thread.start()
+        self.busy = False
+        """A function has not returned yet (it may never)."""
+
+    def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
+        """Call the function on the thread, and then, once, `done` on the event loop; for AgentTimeout after `limit` s.
+
+        To be called from the event loop.
+        """
+        loop = asyncio.get_running_loop()
+        waiting = True
+
+        def finish(result: Any, error: Exception | None) -> None:
+            nonlocal waiting
+            if waiting:
+                waiting = False
+                timer.cancel()
+                done(result, error)
+
+        def returned(result: Any, error: Exception | None) -> None:
+            self.busy = False
+            finish(result, error)
+
+        def job() -> None:
+            result, error = _call(function)
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(returned, result, error)
+
+        timer = loop.call_later(limit, finish, None, AgentTimeout(f"no answer within {limit:g} s"))
+        self.busy = True
+        self._jobs.put(job)
+
+    async def call(self, function: Callable[[], T], *, limit: float) -> T:
+        """The function's result, or the exception that it raised. Raises AgentTimeout after `limit` seconds."""
+        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+
+        def done(result: T, error: Exception | None) -> None:
+            if future.done():
+                return
+            if error is not None:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        self.submit(function, limit, done)
+        return await future
+
+    def close(self) -> None:
+        """End the thread after its present call."""
+        self._jobs.put(None)
+
+    def _run(self) -> None:
+        while True:
+            job = self._jobs.get()
+            if job is None:
+                return
+            job()
+
+
+def _call(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
+    """The function's result, and what it raised. SystemExit in a researcher's code is a failure like another."""
+    try:
+        return function(), None
+    except StopIteration as error:  # cannot be raised in a coroutine
+        failure = RuntimeError("StopIteration")
+        failure.__cause__ = error
+        return None, failure
+    except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+        return None, error
+    except BaseException as error:  # noqa: BLE001 - as above
+        return None, RuntimeError(repr(error)).with_traceback(error.__traceback__)

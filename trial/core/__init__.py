@@ -1,0 +1,1 @@
+"""Every decision of a trial. Pure: no I/O, no threads, no clock."""

@@ -1,0 +1,80 @@
+"""Participants' messages until they stand in the recording and the agent has heard their feedback. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from trial.core.messages import Message, is_feedback
+
+MESSAGES_KEPT = 5000
+"""Messages between two lines of the recording; a client that sends more is hostile."""
+FIELDS_WAITING = 1024 * 1024
+"""Characters of unknown fields that wait for the next line of the recording."""
+FIELDS_KEPT = 32 * 1024 * 1024
+"""Characters of unknown fields that are recorded of one trial."""
+
+
+class MessageLog:
+    """Keeps messages in their order. `ns` is the time of a message, in nanoseconds of a monotonic clock."""
+
+    def __init__(self) -> None:
+        self._messages: list[dict[str, Any]] = []
+        self._feedback: list[str] = []  # among them, and the agent has not heard it
+        self._dropped = 0
+        self._fields_left = FIELDS_KEPT
+        self._fields_waiting = 0
+
+    @property
+    def messages(self) -> list[dict[str, Any]]:
+        """A copy of the messages that stand in no line of the recording yet."""
+        return self._messages.copy()
+
+    @property
+    def feedback(self) -> tuple[str, ...]:
+        """The feedback that the agent has not heard yet."""
+        return tuple(self._feedback)
+
+    def add(self, message: Message, ns: int) -> None:
+        """Keep what a client has sent, unless there is too much of it."""
+        if message.fields:
+            length = len(str(message.fields))
+            self._fields_left -= length
+            self._fields_waiting += length
+            if self._fields_left < 0 or self._fields_waiting > FIELDS_WAITING:
+                message = replace(message, fields=None, fields_dropped=len(message.fields))
+        said = message.record()
+        if not said:
+            return
+        if len(self._messages) >= MESSAGES_KEPT:
+            self._dropped += 1
+            return
+        self._messages.append({"ns": ns, **said})
+        if message.command is not None and is_feedback(message.command):
+            self._feedback.append(message.command)
+
+    def note(self, event: str, ns: int) -> None:
+        """Keep an event that no message reports."""
+        if len(self._messages) < MESSAGES_KEPT:
+            self._messages.append({"ns": ns, "event": event})
+
+    def repeat(self, feedback: Sequence[str], ns: int) -> None:
+        """Put feedback first that the agent of an earlier server did not hear."""
+        self._messages[:0] = [{"ns": ns, "command": word, "again": True} for word in feedback]
+        self._feedback[:0] = feedback
+
+    def take_dropped(self) -> int:
+        """How many messages were dropped since this was asked last."""
+        dropped, self._dropped = self._dropped, 0
+        return dropped
+
+    def recorded(self, messages: int, feedback: int) -> None:
+        """The first messages stand in the recording. Of their feedback the agent will hear no more."""
+        del self._messages[:messages]
+        self._fields_waiting = 0
+        self.heard(feedback)
+
+    def heard(self, feedback: int) -> None:
+        """The agent has heard the first words of feedback."""
+        del self._feedback[:feedback]

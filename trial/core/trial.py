@@ -1,0 +1,607 @@
+"""The core of a trial: every decision about one game step, from the first frame to the stored answer. Pure.
+
+`Trial` is a state machine without I/O, threads, asyncio or a clock (a Sans-I/O core). Its shell,
+`trial/server/loop.py`, calls a method for each event and carries out the effects (`trial/core/effects.py`) that the
+method returns, in their order. All times are seconds of one monotonic clock.
+
+Events in:
+  already_played, start, agent_failed    what the store holds of the step, and whether the agent has started
+  connect, disconnect, receive           clients; each connection belongs to a player
+  call_returned, call_failed             the agent's thread has finished the call that it was given
+  recording_opened, recording_failed, answer_saved        the store
+  advance                                the time `wake_at` has come
+  close                                  the server must end
+
+Effects out: messages, states and frames for connections; one call at a time for the agent; lines for the recording; the
+answer; lines for the log.
+
+Phases: STARTING until the store was read and the agent has started, PLAYING, SAVING (the last lines, then recordings
+and the answer), then FINISHED (the answer is stored) or CLOSED (there is no answer: the server had to end, or the game
+could not begin).
+
+Several players: connections are kept by player, and every client is shown the same. What a player's keys do is decided
+in `trial/core/progress.py` and `trial/core/controls.py`, which know one set of keys so far.
+"""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable, Hashable, Mapping
+from enum import Enum
+from typing import Any
+
+from trial.core import messages
+from trial.core.clients import Client, Clients, state_of
+from trial.core.effects import (
+    AgentTimeout,
+    Call,
+    CloseRecording,
+    Effect,
+    FeedbackCall,
+    Log,
+    LogAgentError,
+    OpenRecording,
+    RecordLine,
+    ReplayCall,
+    ResetCall,
+    SaveAnswer,
+    StepCall,
+    StepTaken,
+    WriteLine,
+)
+from trial.core.flow_control import Window
+from trial.core.message_log import MessageLog
+from trial.core.progress import Break, CommandRefused, Episode, Progress
+from trial.core.timing import Timing
+from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
+from trial.pictures.frames import Frame
+from trial.settings import Settings
+
+LAST_CALL_SECONDS = 2.0
+"""The time that a call of the agent has to come back once the server must end."""
+
+EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
+EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
+TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+
+
+class Phase(Enum):
+    STARTING = "starting"
+    PLAYING = "playing"
+    SAVING = "saving"
+    FINISHED = "finished"
+    CLOSED = "closed"
+
+
+class Trial:
+    """One game step as it is played on this server. See the module's docstring for events, effects and phases."""
+
+    def __init__(self, settings: Settings, step: str, *, trial_id: str, new_seed: Callable[[], int]) -> None:
+        self.settings = settings
+        self.config = settings.trial
+        self._shown = self.config.ui.shown()
+        self.step = step
+        self.id = trial_id
+        self.phase = Phase.STARTING
+        self.ready = False
+        """The first frame is there, or the trial is over."""
+        self.wake_at: float | None = None
+        """When `advance` is to be called if nothing else happens before; None: there is no need to."""
+        self.progress = Progress(self.config, self.config.action_space or ("noop",))
+        self._new_seed = new_seed
+        self._effects: list[Effect] = []
+        self._clients = Clients(self._emit)
+        self._messages = MessageLog()
+        self._timing = Timing()
+        self._call: Call | None = None  # the agent has this call
+        self._agent_hangs = False  # a call was given up, so the agent's thread takes no other
+        self._commands: list[str] = []  # reset and stop wait for the end of a step
+        self._recording = False  # a recording is open
+        self._opening = False  # an episode waits for its recording to be opened
+        self._seed = 0  # of the episode
+        self._unfinished: UnfinishedEpisode | None = None  # an earlier server began it
+        self._begun_again: int | None = None  # this episode, because it could not be replayed
+        self._failed_words: str | None = None
+        self._earlier_answers: Mapping[str, Any] | None = None
+        self._closing = False
+        self._give_up_at: float | None = None
+        self._break_shut_down = False
+        self._last_lines_written = False
+        self._now = 0.0
+
+    @property
+    def broken(self) -> bool:
+        """The game could not even begin: there is no frame, and there will be no answer. Certain once it is `ready`."""
+        return self.progress.outcome == "failed" and self._clients.frame is None
+
+    @property
+    def finished(self) -> bool:
+        """All recordings and the answer are stored."""
+        return self.phase is Phase.FINISHED
+
+    @property
+    def done(self) -> bool:
+        """Nothing happens any more."""
+        return self.phase in (Phase.FINISHED, Phase.CLOSED)
+
+    @property
+    def saving(self) -> bool:
+        """The trial is over, and not everything is stored."""
+        return self.progress.over and not self.finished
+
+    # ---- events: the start
+
+    def already_played(self, answers: Mapping[str, Any]) -> list[Effect]:
+        """An earlier server stored this answer of the step."""
+        self._earlier_answers = answers
+        self.phase = Phase.FINISHED
+        self.ready = True
+        return []
+
+    def agent_failed(self, now: float) -> list[Effect]:
+        """The agent cannot be started."""
+        if self.phase is not Phase.STARTING:
+            return []
+        self.phase = Phase.PLAYING
+        self.progress.failed(fatal=True)
+        return self.advance(now)
+
+    def start(self, action_space: tuple[str, ...], recorded: RecordedTrial | None, now: float) -> list[Effect]:
+        """The agent has started, and this is what earlier servers recorded of the step."""
+        if self.phase is not Phase.STARTING:
+            return []
+        self.phase = Phase.PLAYING
+        self.progress = Progress(self.config, action_space)
+        if recorded is not None:
+            self.progress.resume(recorded.ended)
+            self._unfinished = recorded.unfinished
+            self._timing.seconds = recorded.seconds
+        return self.advance(now)
+
+    # ---- events: clients
+
+    def connect(self, player: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
+        """A player's client has connected, once the trial is `ready`. It replaces an earlier one of this player.
+
+        `window` knows the acknowledgements of this connection.
+        """
+        self._now = now
+        if self._clients.replace(player):
+            self._left()
+        client = self._clients.add(player, connection, window)
+        self._note("connected")
+        if self.finished:
+            self._send_done()
+            return self._take_effects()
+        self._clients.send(client, self._controls())
+        client.sent = state_of(self.progress)
+        if self._failed_words is not None:
+            self._clients.send(client, messages.error(self._failed_words))
+        elif self._begun_again == self.progress.episode and not self.progress.steps:
+            self._clients.send(client, messages.error(EPISODE_BEGINS_AGAIN))
+        self._clients.show_again(client)
+        return self.advance(now)
+
+    def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
+        """A connection is closed. The game is held until its player starts it again."""
+        self._now = now
+        if not self._clients.remove(connection):
+            return []
+        self._left()
+        return self.advance(now)
+
+    def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
+        """A client's message. One from a connection that was replaced changes nothing."""
+        self._now = now
+        client = self._clients.of(connection)
+        if client is None:
+            return []
+        try:
+            self._handle(client, message)
+        except CommandRefused as error:
+            self._clients.send(client, messages.error(str(error)))
+        return self.advance(now)
+
+    def advise(self, action: int) -> None:
+        """A program that may do so advises an action for the next step. Raises CommandRefused."""
+        if self.phase is not Phase.PLAYING:
+            raise CommandRefused("no game is going on")
+        self.progress.advise(action)
+
+    # ---- events: the agent
+
+    def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:
+        """The agent's call came back. One that was given up changes nothing."""
+        if call is not self._call:
+            return []
+        self._now, self._call, self._give_up_at = now, None, None
+        if isinstance(call, StepCall):
+            self._stepped(call, result)
+        elif isinstance(call, FeedbackCall):
+            self._record_end(call)
+        elif isinstance(call, ReplayCall):
+            self._replayed(call.unfinished, result)
+        else:
+            line, frame = result
+            self._emit(WriteLine(line))
+            self.progress.began()
+            self._show(frame)
+        return self.advance(now)
+
+    def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
+        """The agent's call raised this error; AgentTimeout: it has not come back."""
+        if call is not self._call:
+            return []
+        self._now, self._call, self._give_up_at = now, None, None
+        hangs = self._agent_hangs = isinstance(error, AgentTimeout)
+        if isinstance(call, ReplayCall) and not hangs:
+            kind = type(error).__name__
+            text = f"the episode cannot go on where it was and begins again ({kind})"
+            self._emit(Log(logging.WARNING, text))
+            self._begun_again = self.progress.episode
+            self._reset()
+        elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
+            self._record_error(error, _number(self.progress.ended[0]))
+            if hangs:
+                self._fail(fatal=True)
+            self._record_end(call)
+        else:
+            if isinstance(call, StepCall):
+                self._messages.heard(call.heard)  # the messages stay, for the line that ends the episode
+            self._record_error(error, self.progress.episode)
+            self._fail(fatal=hangs)
+            if isinstance(call, ReplayCall):
+                self._repeat_feedback(call.unfinished)
+        return self.advance(now)
+
+    # ---- events: the store
+
+    def recording_opened(self, now: float) -> list[Effect]:
+        """The recording that was asked for is open."""
+        self._now, self._recording, self._opening = now, True, False
+        unfinished, self._unfinished = self._unfinished, None
+        if unfinished is not None and unfinished.steps:
+            default = self.progress.controls.default
+            self._start_call(
+                ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_action=default)
+            )
+        else:
+            if unfinished is not None:
+                self._repeat_feedback(unfinished)
+            self._reset()
+        return self.advance(now)
+
+    def recording_failed(self, now: float) -> list[Effect]:
+        """The recording cannot be opened: nothing is played that is not recorded."""
+        self._now, self._opening = now, False
+        self._fail(fatal=True)
+        return self.advance(now)
+
+    def answer_saved(self, now: float) -> list[Effect]:
+        """Everything is stored."""
+        self._now = now
+        if not self.progress.over or self.broken:
+            self.phase = Phase.CLOSED
+            return []
+        self.phase = Phase.FINISHED
+        self._send_done()
+        text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
+        return [Log(logging.INFO, text), *self._take_effects()]
+
+    # ---- events: time
+
+    def advance(self, now: float) -> list[Effect]:
+        """Do all that can be done at this time. Every other event does this, too."""
+        self._now = now
+        self.wake_at = None
+        if self._give_up_at is not None and now >= self._give_up_at:
+            self._call, self._give_up_at, self._agent_hangs = None, None, True
+        while self._call is None and not self._opening and self._go_on():
+            pass
+        if self._call is not None:
+            self.wake_at = self._give_up_at
+        self._send_state()
+        return self._take_effects()
+
+    def close(self, now: float) -> list[Effect]:
+        """The server must end: stop where the game stands. There is no answer unless the trial is over."""
+        self._closing = True
+        if self._call is not None:
+            self._give_up_at = now + LAST_CALL_SECONDS
+        if self.phase is Phase.STARTING:
+            self.phase = Phase.CLOSED
+        return self.advance(now)
+
+    # ---- what comes next
+
+    def _go_on(self) -> bool:
+        """Do the next thing; whether there is another one to do at this time."""
+        if self.phase is Phase.PLAYING:
+            return self._play()
+        if self.phase is Phase.SAVING and not self._last_lines_written:
+            return self._write_last_lines()
+        return False
+
+    def _play(self) -> bool:
+        progress = self.progress
+        if not self._closing:
+            self._do_commands()
+            if progress.ended:
+                return self._write_end()
+        if progress.over or self._closing:
+            self.phase = Phase.SAVING
+            self.ready = True
+            return True
+        left = self._break_left()
+        if left is not None:
+            self._timing.rest()
+            if left > 0.0:
+                self.wake_at = self._now + left
+                return False
+            progress.go_on()
+        elif progress.needs_reset:
+            self._begin_episode()
+        elif not progress.playing:
+            self._timing.rest()
+            return False
+        else:
+            return self._step_if_due()
+        return True
+
+    def _do_commands(self) -> None:
+        commands, self._commands = self._commands, []
+        for command in commands:
+            self._timing.skip()
+            if command == "stop":
+                self.progress.stop()
+            else:
+                self.progress.reset()
+
+    def _break_left(self) -> float | None:
+        """Seconds until the next episode; None if this is no break."""
+        if not self.progress.on_break:
+            self._timing.break_over()
+            return None
+        return self._timing.break_left(self._now, self.config.between_episodes)
+
+    def _begin_episode(self) -> None:
+        unfinished = self._unfinished
+        self._seed = self._new_seed() if unfinished is None or unfinished.seed is None else unfinished.seed
+        if self._recording:
+            self._reset()
+            return
+        self._opening = True
+        progress = self.progress
+        self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space))
+
+    def _reset(self) -> None:
+        self._start_call(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
+
+    def _replayed(self, unfinished: UnfinishedEpisode, frame: Frame) -> None:
+        steps = len(unfinished.steps)
+        self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
+        self.progress.replayed(steps, unfinished.score)
+        self._show(frame)
+        self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
+        self._repeat_feedback(unfinished)
+
+    def _repeat_feedback(self, unfinished: UnfinishedEpisode) -> None:
+        """Take up the feedback that an earlier server's agent did not hear any more."""
+        self._messages.repeat(unfinished.unheard, self._ns())
+
+    def _step_if_due(self) -> bool:
+        due = self._timing.step_due(self._now, self.progress.frame_rate)
+        if self._now < due:
+            self.wake_at = due
+            return False
+        self._timing.skip()
+        if self._clients.stalled(self._now):
+            self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
+            self._note("stopped answering")
+            self.progress.leave()
+            return True
+        self._take_step()
+        return False
+
+    def _take_step(self) -> None:
+        progress, clients = self.progress, self._clients
+        said, dropped = self._messages.messages, self._messages.take_dropped()
+        fields: dict[str, Any] = {
+            "episode": progress.episode,
+            "step": progress.steps + 1,
+            "frame": clients.frame_id + 1,
+        }
+        if said:
+            fields["messages"] = said
+        if dropped:
+            fields["messagesDropped"] = dropped
+        self._start_call(
+            StepCall(
+                limit=self.settings.step_seconds,
+                action=progress.next_action(),
+                feedback=self._messages.feedback,
+                messages=len(said),
+                fields=fields,
+            )
+        )
+
+    def _stepped(self, call: StepCall, step: StepTaken) -> None:
+        self._emit(WriteLine(step.line))
+        self._messages.recorded(call.messages, len(call.feedback))
+        self._timing.stepped(self._now, self.progress.frame_rate)
+        self.progress.stepped(step.reward, step.terminated, step.truncated)
+        self._show(step.frame)
+
+    def _show(self, frame: Frame) -> None:
+        self._clients.show(frame)
+        self.ready = True
+
+    def _start_call(self, call: Call) -> None:
+        self._call = call
+        self._emit(call)
+
+    # ---- what ends
+
+    def _write_end(self) -> bool:
+        """Record the end of an episode or a break, and its last messages. The agent hears their feedback before."""
+        call = FeedbackCall(
+            limit=LAST_CALL_SECONDS if self._closing else self.settings.step_seconds,
+            feedback=self._messages.feedback,
+            messages=len(self._messages.messages),
+        )
+        if call.feedback and not self._agent_hangs:
+            self._start_call(call)
+            return False
+        self._record_end(call)
+        return True
+
+    def _record_end(self, call: FeedbackCall) -> None:
+        over = self.progress.ended.pop(0)
+        fields: dict[str, Any] = {"episode": _number(over)}
+        if not isinstance(over, Break):
+            fields |= {"steps": over.steps, "score": messages.tidy(over.score)}
+        fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
+        self._emit(RecordLine("break" if isinstance(over, Break) else "end", fields))
+        self._messages.recorded(call.messages, len(call.feedback))
+        # The break after an episode belongs to its file.
+        more = isinstance(self.progress.ended[0], Break) if self.progress.ended else self.progress.on_break
+        if self.config.data_file == "episode" and not more:
+            self._close_recording()
+
+    def _write_last_lines(self) -> bool:
+        progress = self.progress
+        if self._closing and progress.on_break and not self._break_shut_down:
+            self._break_shut_down = True
+            progress.ended.append(Break(progress.episode, "shutdown"))
+        if progress.ended:
+            return self._write_end()
+        self._last_lines_written = True
+        if self._closing and not progress.over and not progress.on_break:
+            self._emit(
+                RecordLine(
+                    "end",
+                    {
+                        "episode": progress.episode,
+                        "steps": progress.steps,
+                        "why": "shutdown",
+                        "score": messages.tidy(progress.episode_score),
+                        "messages": self._messages.messages,
+                    },
+                )
+            )
+        self._close_recording()
+        self._emit(SaveAnswer(self._answers() if progress.over and not self.broken else None))
+        return False
+
+    def _close_recording(self) -> None:
+        if self._recording:
+            self._recording = False
+            self._emit(CloseRecording())
+
+    def _answers(self) -> dict[str, Any]:
+        progress = self.progress
+        return {
+            "episodes": progress.episodes_played,
+            "score": messages.tidy(progress.score),
+            "frames": progress.total_steps,
+            "seconds": round(self._timing.seconds, 3),
+            "trial": self.id,
+            "outcome": progress.outcome,
+        }
+
+    # ---- what fails
+
+    def _record_error(self, error: Exception, episode: int) -> None:
+        words = "".join(traceback.format_exception_only(error)).strip()
+        self._emit(LogAgentError(error))
+        self._emit(RecordLine("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
+
+    def _fail(self, *, fatal: bool) -> None:
+        self.progress.failed(fatal=fatal)
+        words = EPISODE_FAILED
+        if self.progress.over:
+            words = self._failed_words = TRIAL_FAILED
+        self._clients.send_all(messages.error(words))
+
+    # ---- clients
+
+    def _left(self) -> None:
+        self._note("disconnected")
+        self.progress.leave()
+
+    def _handle(self, client: Client, message: messages.Message) -> None:
+        """Do what a client asks for. Raises CommandRefused with words for the client."""
+        command = message.command
+        if message.frame_rate is not None and not self.config.allow_frame_rate_change:
+            raise CommandRefused("the frame rate of this game is fixed")
+        missing = messages.not_offered(message, self._shown)
+        if missing is not None:
+            raise CommandRefused(f"{missing} is not offered in this game")
+        if messages.is_feedback(command) and self.progress.over:
+            raise CommandRefused("the game is over, and no command has an effect any more")
+        self._messages.add(message, self._ns())
+        if command is not None:
+            self._command(client, command)
+        if message.frame_rate is not None:
+            self.progress.change_frame_rate(message.frame_rate)
+        if message.action is not None:
+            self.progress.act(message.action, message.held, lasts=message.lasts)
+
+    def _command(self, client: Client, command: str) -> None:
+        if command == "start":
+            self.progress.start()
+        elif command == "pause":
+            self.progress.pause()
+        elif command == "requestUI":
+            self._clients.send(client, self._controls())
+        elif command in ("reset", "stop") and command not in self._commands:
+            self._commands.append(command)
+
+    def _note(self, event: str) -> None:
+        """Keep for the recording an event that no message reports."""
+        self._messages.note(event, self._ns())
+
+    def _ns(self) -> int:
+        return int(self._now * 1e9)
+
+    def _send_state(self) -> None:
+        if not self.finished:
+            self._clients.send_state(self.progress, self._break_left())
+
+    def _controls(self) -> str:
+        config, progress = self.config, self.progress
+        return messages.controls(
+            ui=self._shown,
+            words=[word for word in messages.words_of(config) if word.lower() not in progress.action_space],
+            frame_rate=progress.frame_rate,
+            min_frame_rate=config.min_frame_rate,
+            max_frame_rate=config.max_frame_rate,
+            frame_rate_step_size=config.frame_rate_step_size,
+            allow_frame_rate_change=config.allow_frame_rate_change,
+            action_space=progress.action_space,
+            state=progress.state.value,
+            episode=progress.episode,
+            max_episodes=config.max_episodes,
+            score=progress.score,
+            episode_score=progress.episode_score,
+            next_in=self._break_left(),
+        )
+
+    def _send_done(self) -> None:
+        episodes, score = self.progress.episodes_played, self.progress.score
+        if self._earlier_answers is not None:
+            episodes, score = self._earlier_answers.get("episodes", 0), self._earlier_answers.get("score", 0)
+        self._clients.send_done(episodes, score)
+
+    def _emit(self, effect: Effect) -> None:
+        self._effects.append(effect)
+
+    def _take_effects(self) -> list[Effect]:
+        effects, self._effects = self._effects, []
+        return effects
+
+
+def _number(over: Episode | Break) -> int:
+    """The number of the episode that is over, or of the one before the break."""
+    return over.after if isinstance(over, Break) else over.number

@@ -1,0 +1,1 @@
+"""Pictures of a game: frames, and how they become bytes."""

@@ -1,0 +1,1 @@
+"""What programs get at the path /gym of a trial: to watch, to advise, environments."""

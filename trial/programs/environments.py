@@ -1,0 +1,192 @@
+"""Environments for programs, beside the game of a participant: the path /gym of its server (docs/gym.md).
+
+A process of its own makes them (`trial/programs/environments_process.py`), as `make gym` does. It is started for the
+first program. It listens nowhere: this process hands it one end of a socket pair for each program that has the token,
+and passes messages on between the other end and the program.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import logging
+import os
+import socket
+import sys
+from pathlib import Path
+from urllib.parse import parse_qs, quote, urlsplit
+
+from websockets.asyncio.client import connect
+from websockets.asyncio.connection import Connection
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from protocol import environment
+from trial.gym.errors import reason
+from trial.gym.server import FORMS
+from trial.gym.server import SUBPROTOCOL as _NAME
+
+log = logging.getLogger("trial")
+
+SUBPROTOCOL = Subprotocol(_NAME)
+MOST = 4
+"""Programs that may be connected at a time."""
+LARGEST_REQUEST = 2**20
+"""Bytes in one message of a program."""
+LARGEST_REPLY = 8 * 2**20
+"""Bytes of observations in one answer."""
+REQUESTS_A_SECOND = 500
+"""Of all programs together. More of them wait, so that the game has the time that it needs."""
+_LARGEST_ANSWER = 8 * LARGEST_REPLY  # bytes of a message: JSON takes several for each byte of an observation
+_AHEAD_SECONDS = 0.02  # so much sooner than evenly spread may requests be passed on
+_START_SECONDS = 60.0
+_CLOSE_SECONDS = 2.0
+_SEND_SECONDS = 30.0  # that a program may leave an answer unread
+_NOT_SENT = (1005, 1006, 1015)  # close codes that no message has (RFC 6455, 7.4.1)
+_GONE = "The process of the environments has ended."
+
+
+def prepare(websocket: ServerConnection, request: Request) -> Response | None:
+    """Let a program that has the token send what `make gym` lets it send. An answer if it asks for an unknown form."""
+    if _form(request.path) not in FORMS:
+        return websocket.respond(http.HTTPStatus.BAD_REQUEST, f"form must be one of {', '.join(FORMS)}.\n")
+    websocket.protocol.max_message_size = LARGEST_REQUEST
+    websocket.ping_timeout = None  # while requests wait for an environment, its pong waits behind them
+    return None
+
+
+class Environments:
+    """The process that makes environments, and the programs that are connected to it. For the event loop."""
+
+    def __init__(self, agent_dir: Path) -> None:
+        self._agent_dir = agent_dir
+        self._folder = Path.cwd()  # the agent may change it
+        self._process: asyncio.subprocess.Process | None = None
+        self._handing: socket.socket | None = None
+        self._starting = asyncio.Lock()
+        self._next = 0.0  # when the next request may be passed on, if they were evenly spread
+        self.connections = 0
+        """Programs that are connected."""
+
+    async def serve(self, websocket: ServerConnection) -> None:
+        """Pass on messages until the program or the process is gone, and the close of one to the other."""
+        self.connections += 1
+        try:
+            await self._serve(websocket)
+        finally:
+            self.connections -= 1
+
+    async def close(self) -> None:
+        """End the process, with all that it has started."""
+        process, self._process = self._process, None
+        if self._handing is not None:
+            self._handing.close()  # it ends by itself
+            self._handing = None
+        if process is not None:
+            try:
+                async with asyncio.timeout(_CLOSE_SECONDS):
+                    await process.wait()
+            except TimeoutError:
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+
+    async def _serve(self, websocket: ServerConnection) -> None:
+        path = websocket.request.path if websocket.request is not None else ""
+        ours: socket.socket | None = None
+        try:
+            ours = await self._connection()
+            connecting = connect(
+                f"ws://localhost/gym?form={quote(_form(path))}",
+                sock=ours,
+                subprotocols=[SUBPROTOCOL] if websocket.subprotocol == SUBPROTOCOL else None,
+                compression=None,
+                max_size=_LARGEST_ANSWER,
+                open_timeout=_START_SECONDS,
+                close_timeout=_CLOSE_SECONDS,
+                ping_interval=None,
+                proxy=None,
+            )
+            process = await connecting
+        except (OSError, TimeoutError, InvalidHandshake, EOFError) as error:
+            log.error("no environments can be made: %s", type(error).__name__)
+            if ours is not None:
+                ours.close()
+            await websocket.close(1011, "No environments can be made here; the server's log says why.")
+            return
+        requests = asyncio.create_task(self._pass_on(websocket, process, paced=True))
+        try:
+            await self._pass_on(process, websocket)
+        except TimeoutError:
+            websocket.transport.abort()
+        finally:
+            requests.cancel()
+            await asyncio.wait({requests})
+            process.transport.abort()
+
+    async def _pass_on(self, source: Connection, target: Connection, *, paced: bool = False) -> None:
+        """Pass on messages until one of the two is closed; then close the other with the same words.
+
+        Raises TimeoutError if a program does not read its answers.
+        """
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                message = await source.recv()
+                if paced:
+                    await self._turn()
+                async with asyncio.timeout(None if paced else _SEND_SECONDS):
+                    await target.send(message)
+        if source.close_code is None:
+            return  # the target is gone, which the other direction tells the source
+        code, words = source.close_code, source.close_reason or ""
+        if code in _NOT_SENT:
+            code, words = (1000, "") if paced else (1011, _GONE)
+        await target.close(code, reason(words))
+
+    async def _turn(self) -> None:
+        """Wait until a request may be passed on."""
+        now = asyncio.get_running_loop().time()
+        self._next = max(self._next, now) + 1.0 / REQUESTS_A_SECOND
+        if self._next - now > _AHEAD_SECONDS:
+            await asyncio.sleep(self._next - now)
+
+    async def _connection(self) -> socket.socket:
+        """A connection to the process, which is started if there is none. Raises OSError."""
+        async with self._starting:
+            if self._process is None or self._process.returncode is not None:
+                await self._start()
+        if self._handing is None:
+            raise OSError("the process is ending")
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                socket.send_fds(self._handing, [b"c"], [theirs.fileno()])
+            except OSError:
+                ours.close()
+                raise
+        ours.setblocking(False)
+        return ours
+
+    async def _start(self) -> None:
+        if self._handing is not None:
+            self._handing.close()
+        self._handing, theirs = socket.socketpair()
+        self._handing.setblocking(False)
+        with theirs:
+            command = (sys.executable, "-m", "trial.programs.environments_process", str(theirs.fileno()))
+            variables = {name: value for name, value in os.environ.items() if name not in environment.SECRETS}
+            self._process = await asyncio.create_subprocess_exec(
+                *command,
+                cwd=self._folder,
+                env=variables | {environment.AGENT_DIR: str(self._agent_dir)},
+                pass_fds=[theirs.fileno()],
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.DEVNULL,
+            )
+
+
+def _form(path: str) -> str:
+    """The form that an address asks for, as the server of environments reads it."""
+    return parse_qs(urlsplit(path).query).get("form", [FORMS[0]])[0]

@@ -1,0 +1,142 @@
+"""Programs that watch a trial, and advise where the project allows it: the path /gym of its server (docs/gym.md).
+
+They speak in Gymie's messages, `{"method", "params"}`. They change nothing about the participant's connection, and do
+not keep the server running.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from trial.core.messages import CloseConnection
+from trial.core.progress import CommandRefused
+from trial.wire.inbound import MESSAGES_A_SECOND, RateLimit
+
+PATH = "/gym"
+MOST = 8
+"""Programs that may be connected at a time."""
+_UNREAD = 1000  # lines that wait for a program; one more ends its connection
+_UNREAD_BYTES = 16 * 1024**2  # the same of their bytes; a single line may be longer
+
+Advise = Callable[[int], None]
+"""Takes the number of an action. Raises CommandRefused."""
+
+
+class Watchers:
+    """Passes on what is recorded, line by line, to programs that watch. To be used on the event loop."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[Lines, Callable[[], None]] = {}
+
+    def tell(self, line: bytes) -> None:
+        """Pass on a line. A program that does not read is cut off; the trial waits for none."""
+        for lines, cut_off in [*self._waiting.items()]:
+            if not lines.put(line):
+                del self._waiting[lines]
+                cut_off()
+
+    @contextlib.contextmanager
+    def lines(self, cut_off: Callable[[], None]) -> Iterator[Lines]:
+        """All lines from now on; `cut_off` is called if too many wait."""
+        lines = Lines()
+        self._waiting[lines] = cut_off
+        try:
+            yield lines
+        finally:
+            self._waiting.pop(lines, None)
+
+
+class Lines:
+    """Lines that wait for a program."""
+
+    def __init__(self) -> None:
+        self._waiting: asyncio.Queue[bytes] = asyncio.Queue()
+        self._bytes = 0
+
+    def put(self, line: bytes) -> bool:
+        """Let a line wait; False if there is no room for it."""
+        if len(self) >= _UNREAD or (self._bytes and self._bytes + len(line) > _UNREAD_BYTES):
+            return False
+        self._waiting.put_nowait(line)
+        self._bytes += len(line)
+        return True
+
+    async def get(self) -> bytes:
+        """The next line, once there is one."""
+        line = await self._waiting.get()
+        self._bytes -= len(line)
+        return line
+
+    def __len__(self) -> int:
+        return self._waiting.qsize()
+
+
+class Watching:
+    """One program's connection. `advise` is None if the project does not allow advice."""
+
+    def __init__(
+        self,
+        websocket: ServerConnection,
+        watchers: Watchers,
+        actions: Callable[[], tuple[str, ...]],
+        advise: Advise | None,
+    ) -> None:
+        self._websocket = websocket
+        self._watchers = watchers
+        self._actions = actions
+        self._advise = advise
+        self._sending: asyncio.Task[None] | None = None
+
+    async def run(self) -> None:
+        """Answer requests until the program goes. Raises CloseConnection and ConnectionClosed."""
+        rate, loop = RateLimit(MESSAGES_A_SECOND), asyncio.get_running_loop()
+        try:
+            async for data in self._websocket:
+                if rate.exceeded(loop.time()):
+                    raise CloseConnection(4429, "too many messages")
+                try:
+                    answer = self._answer(data)
+                except CommandRefused as error:
+                    answer = {"error": {"type": "Refused", "message": str(error)}}
+                await self._websocket.send(json.dumps(answer))
+        finally:
+            if self._sending is not None:
+                self._sending.cancel()
+
+    def _answer(self, data: str | bytes) -> Any:
+        try:
+            message = json.loads(data)
+            method, params = message["method"], message["params"]
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise CommandRefused('a request is {"method": ..., "params": {...}}') from None
+        if method == "watch":
+            if self._sending is None:
+                self._sending = asyncio.create_task(self._send_lines())
+            return True
+        if method == "action_space":
+            names = self._actions()
+            return {"name": "Discrete", "n": len(names), "names": list(names)}
+        if method == "advise":
+            return self._advised(params)
+        raise CommandRefused("there are the methods watch, action_space and advise")
+
+    def _advised(self, params: Any) -> bool:
+        if self._advise is None:
+            raise CommandRefused("the project allows no advice (gym: advise, in the section trial of config.yml)")
+        action = params.get("action") if isinstance(params, dict) else None
+        if type(action) is not int:
+            raise CommandRefused("action must be the number of an action")
+        self._advise(action)
+        return True
+
+    async def _send_lines(self) -> None:
+        with self._watchers.lines(self._websocket.transport.abort) as lines, contextlib.suppress(ConnectionClosed):
+            while True:
+                await self._websocket.send((await lines.get()).decode().rstrip("\n"))

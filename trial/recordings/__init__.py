@@ -1,0 +1,1 @@
+"""Recordings and answers: written, spooled, stored, and read again by the next server."""

@@ -1,0 +1,162 @@
+"""The recordings and the answer of a trial, on the event loop: written soon, stored when they are complete."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from protocol.answer import GAME, Answer, answers_in, to_json
+from protocol.keys import answer_key, recordings_folder
+from trial.core.effects import OpenRecording
+from trial.core.unfinished import RecordedTrial
+from trial.recordings import recording
+from trial.recordings.recording import Recording
+from trial.recordings.resume import load_recorded
+from trial.recordings.spool import Spool, retry_forever, store_file
+from trial.recordings.store import Store, short_error
+from trial.settings import Settings
+
+log = logging.getLogger("trial")
+
+FLUSH_SECONDS = 0.5
+"""Play that may be lost if the process is killed outright."""
+
+
+class Recorder:
+    """Writes what one trial leaves behind, and reads what earlier servers left of the same step."""
+
+    def __init__(self, settings: Settings, step: str, trial_id: str, store: Store, spool: Spool) -> None:
+        self._settings = settings
+        self._step = step
+        self._trial_id = trial_id
+        self._store = store
+        self._spool = spool
+        self._recording: Recording | None = None
+        self._flush_timer: asyncio.TimerHandle | None = None
+        self._flushing: asyncio.Task[None] | None = None
+        self._uploads: set[asyncio.Task[None]] = set()
+
+    # ---- before
+
+    async def earlier_answers(self) -> dict[str, Any] | None:
+        """What an earlier server answered for this step; None if the step has not been played."""
+        try:
+            found = await asyncio.to_thread(self._store.get, self._answer_key)
+        except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
+            log.warning("cannot look for an earlier answer (%s)", short_error(error))
+            return None
+        return None if found is None else answers_in(found) or {}
+
+    async def recorded(self) -> RecordedTrial | None:
+        """What earlier servers recorded of the step."""
+        folder, _, server = self._folder.rpartition("/")
+        try:
+            return await asyncio.to_thread(load_recorded, self._store, folder, server, self._step)
+        except Exception as error:  # noqa: BLE001 - whatever the store or an old recording raises: it is played anew
+            log.warning("cannot look for earlier recordings (%s)", short_error(error))
+            return None
+
+    # ---- recordings
+
+    def stamp(self) -> dict[str, Any]:
+        """What every line begins with. May be called on any thread."""
+        return {
+            "v": recording.SCHEMA,
+            "session": self._settings.server,
+            "trial": self._trial_id,
+            "time": now_text(),
+            "ns": time.monotonic_ns(),
+        }
+
+    def open(self, opening: OpenRecording) -> None:
+        """Open a recording and write its header. Raises OSError."""
+        settings, config = self._settings, self._settings.trial
+        name = "trial" if config.data_file == "trial" else f"episode-{opening.episode:04d}"
+        self._recording = self._spool.open(f"{self._folder}/{self._step}-{name}.jsonl.gz")
+        header = recording.line(
+            "header",
+            **self.stamp(),
+            project=settings.project_id,
+            user=settings.user_id,
+            server=settings.server,
+            step=self._step,
+            game=config.game,
+            actionSpace=list(opening.action_space),
+            frameRate=opening.frame_rate,
+            actionBufferLifespan=config.action_buffer_lifespan,
+            episode=opening.episode,
+            seed=opening.seed,
+            versions=recording.versions(),
+        )
+        self._recording.add(header)
+
+    def line(self, kind: str, fields: Mapping[str, Any]) -> bytes:
+        """A line of this kind, stamped with the time."""
+        return recording.line(kind, **self.stamp(), **fields)
+
+    def write(self, line: bytes) -> None:
+        """Write a finished line. It is in the file within `FLUSH_SECONDS`."""
+        if self._recording is None:
+            return
+        self._recording.add(line)
+        if self._flush_timer is None:
+            self._flush_later()
+
+    def close(self) -> None:
+        """Close the recording and store it, in the background."""
+        current, self._recording = self._recording, None
+        if current is not None:
+            self._uploads.add(asyncio.create_task(self._finish(current)))
+
+    def _flush_later(self) -> None:
+        self._flush_timer = asyncio.get_running_loop().call_later(FLUSH_SECONDS, self._flush_soon)
+
+    def _flush_soon(self) -> None:
+        self._flush_timer = None
+        current = self._recording
+        if current is not None and current.dirty:
+            self._flushing = asyncio.create_task(self._flush(current))
+
+    async def _flush(self, current: Recording) -> None:
+        try:
+            await asyncio.to_thread(current.flush)
+        except OSError as error:
+            log.warning("a recording cannot be written (%s); trying again", short_error(error))
+            if self._flush_timer is None:
+                self._flush_later()
+
+    async def _finish(self, current: Recording) -> None:
+        await retry_forever("close a recording", lambda: asyncio.to_thread(current.close))
+        if self._spool.local_only:
+            current.path.replace(current.path.with_suffix(""))
+            return
+        await store_file(self._store, current.key, current.path)
+
+    # ---- the end
+
+    async def save(self, answers: Mapping[str, Any] | None) -> None:
+        """Wait until all recordings are stored, then store the answer: a reader of the answer finds them."""
+        if self._uploads:
+            await asyncio.wait(self._uploads)
+        if answers is None:
+            return
+        answer = Answer(self._step, GAME, self._settings.group, datetime.now(UTC), answers)
+        data = to_json(answer)
+        await retry_forever("write the answer", lambda: asyncio.to_thread(self._store.create, self._answer_key, data))
+
+    @property
+    def _folder(self) -> str:
+        return recordings_folder(self._settings.project_id, self._settings.user_id) + self._settings.server
+
+    @property
+    def _answer_key(self) -> str:
+        return answer_key(self._settings.project_id, self._settings.user_id, self._step)
+
+
+def now_text() -> str:
+    """The time as in all of the study's records: `2026-11-21T14:46:40.123456Z`."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

@@ -1,0 +1,171 @@
+"""Recordings: gzip of JSON lines, one line per step, readable to the last flush whatever happens to the process.
+
+Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `error` (the researcher's code
+raised) and `end` (an episode or the file ends). Nothing is pickled.
+
+A `step` tells the choice of its action: `human` is the index of the action that the participant's keys asked for (null
+if no key acted); `action` and `actionName` are the one that was taken; `by` is its origin: `agent` (the agent reports
+it as its own, even if it is the human's), `human`, or `none` (no key acted, and the default was taken). Times are UTC:
+2026-11-21T14:46:40.123456Z.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import platform
+import threading
+import time
+import zlib
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trial.recordings import disk
+from trial.recordings.recorded_values import LISTED, Values, text_of
+
+SCHEMA = 1
+VERSION = "1.0"
+"""Of the trial server; in the head of each recording."""
+SYNC_SECONDS = 5.0
+"""An open recording is synced to the disk this often: a power cut takes no more of it."""
+MAX_EXTRA_BYTES = 1_000_000
+"""Of what an agent's `step` returns beside Gymnasium's values, as JSON, in one line."""
+
+
+def line(kind: str, /, **fields: Any) -> bytes:
+    """One line of a recording; values that are not JSON are made so."""
+    record = {"kind": kind, **fields}
+    try:
+        text = json.dumps(record, default=plain, separators=(",", ":"), allow_nan=False)
+    except Exception:  # noqa: BLE001 - NaN, keys that are no text, circles, what raises: rare, so not looked for first
+        text = json.dumps(plain(record), separators=(",", ":"), allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
+    return Values().keep(value)
+
+
+def observation(value: Any) -> Any:
+    """An observation as a recording keeps it: arrays as base64 of zlib of their bytes, with dtype and shape."""
+    return Values(listed=-1).keep(value)
+
+
+def bounded_extra(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, int]]:
+    """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
+
+    A value that does not fit into MAX_EXTRA_BYTES together with those before it is replaced by
+    `{"tooLarge": bytes}`. The second result says which, and how large they are at least.
+    """
+    kept: dict[str, Any] = {}
+    too_large: dict[str, int] = {}
+    left = MAX_EXTRA_BYTES
+    for key, value in values.items():
+        name = text_of(key)
+        reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
+        fit = reader.keep(value)
+        size = len(json.dumps(fit, separators=(",", ":"))) + reader.left_out
+        if size > left or reader.exhausted:
+            too_large[name] = size
+            fit = {"tooLarge": size}
+        else:
+            left -= size
+        kept[name] = fit
+    return kept, too_large
+
+
+def read_observation(kept: Any) -> Any:
+    """Undo `observation` for one array."""
+    pixels = zlib.decompress(base64.b64decode(kept["zlib"]))
+    return np.frombuffer(pixels, dtype=np.dtype(kept["dtype"])).reshape(kept["shape"])
+
+
+def versions() -> dict[str, str]:
+    """Versions of what may change how a game plays."""
+    found = {"trial": VERSION, "python": platform.python_version()}
+    for name in ("gymnasium", "ale-py", "numpy", "websockets"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+class Recording:
+    """One file being written. `add` only remembers; `flush` writes, and may be called from another thread."""
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = path
+        self.key = key
+        """Where the finished file belongs in the store."""
+        disk.make_folder(path.parent)
+        self._file = path.open("xb", buffering=0)
+        self._synced = time.monotonic()
+        self._named = False  # whether the file's name is on the disk
+        self._gzip = zlib.compressobj(6, zlib.DEFLATED, 31)
+        self._lines: list[bytes] = []
+        self._packed = b""
+        self._finished = False
+        self._lock = threading.Lock()
+        self.closed = False
+
+    @property
+    def dirty(self) -> bool:
+        """There is something that `flush` would write."""
+        return bool(self._lines or self._packed)
+
+    def add(self, data: bytes) -> None:
+        """Remember one line."""
+        self._lines.append(data)
+
+    def flush(self) -> None:
+        """Bring all lines to the file, so that they can be read even if the process is killed. Raises OSError.
+
+        Every few seconds (`SYNC_SECONDS`) they are also brought to the disk, where a power cut does not harm them.
+        """
+        with self._lock:
+            self._write(zlib.Z_SYNC_FLUSH)
+            if not self.closed and time.monotonic() >= self._synced + SYNC_SECONDS:
+                self._sync()
+
+    def close(self) -> None:
+        """Write what is left and the end of the gzip stream, all of it to the disk.
+
+        Raises OSError; may then be called again.
+        """
+        with self._lock:
+            if self.closed:
+                return
+            self._write(zlib.Z_FINISH)
+            self._sync()
+            self._file.close()
+            self.closed = True
+
+    def _sync(self) -> None:
+        os.fsync(self._file.fileno())
+        if not self._named:
+            disk.sync_folder(self.path.parent)
+            self._named = True
+        self._synced = time.monotonic()
+
+    def _write(self, how: int) -> None:
+        if self.closed:
+            return
+        lines, self._lines = self._lines, []
+        if not self._finished and (lines or how == zlib.Z_FINISH):
+            self._packed += self._gzip.compress(b"".join(lines)) + self._gzip.flush(how)
+            self._finished = how == zlib.Z_FINISH
+        while self._packed:  # kept until it is written, so that a full disk loses nothing
+            self._packed = self._packed[self._file.write(self._packed) :]
+
+
+def read(data: bytes) -> list[dict[str, Any]]:
+    """The lines of a recording, also of one cut off in the middle."""
+    text = zlib.decompressobj(31).decompress(data)
+    return [json.loads(part) for part in text.split(b"\n")[: text.count(b"\n")]]

@@ -1,0 +1,101 @@
+"""What earlier servers of the participant recorded of a step, so that an interrupted game goes on where it was.
+
+A lost server, such as one that Spot took back, is replaced by another. If the environment is deterministic (the same
+seed and the same actions give the same rewards), the interrupted episode is replayed up to its last recorded step,
+without frames and without pauses; otherwise it begins again. Episodes that were over count as before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+from trial.core.messages import is_feedback
+from trial.core.progress import Episode
+from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.recordings import recording
+from trial.recordings.store import Store
+
+_ATTEMPT = re.compile(r"(.+)-([0-9]{1,3})")
+
+
+def load_recorded(store: Store, folder: str, server: str, step: str) -> RecordedTrial | None:
+    """Read the recordings of a step by the servers before this one; None if there are none.
+
+    The participant's recordings lie in `folder`. `server` is this server's name, which ends in the number of its
+    attempt. Blocks; raises the store's errors.
+    """
+    named = _ATTEMPT.fullmatch(server)
+    if named is None:
+        return None
+    recorded = RecordedTrial()
+    found = False
+    for attempt in range(1, int(named[2])):
+        for lines in _recordings(store, f"{folder}/{named[1]}-{attempt}/{step}", recorded):
+            found = True
+            add_lines(recorded, lines)
+    return recorded if found else None
+
+
+def _recordings(store: Store, prefix: str, recorded: RecordedTrial) -> Iterable[list[dict[str, Any]]]:
+    """One server's recordings of the step, in order: one file for the trial, or one for each episode."""
+    whole = store.get(f"{prefix}-trial.jsonl.gz")
+    if whole is not None:
+        yield recording.read(whole)
+        return
+    first = recorded.unfinished.number if recorded.unfinished else len(recorded.ended) + 1
+    for number in count(first):
+        body = store.get(f"{prefix}-episode-{number:04d}.jsonl.gz")
+        if body is None:
+            return
+        yield recording.read(body)
+
+
+def add_lines(recorded: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> None:
+    """Add a recording's lines. Lines of other kinds, and malformed ones, change nothing."""
+    rate = 30.0
+    for line in lines:
+        with contextlib.suppress(KeyError, TypeError, ValueError):
+            if line["kind"] == "header":
+                rate = float(line["frameRate"]) or rate
+            else:
+                _add_line(recorded, line, rate)
+
+
+def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> None:
+    kind, number, current = line["kind"], int(line["episode"]), recorded.unfinished
+    if kind == "reset":
+        recorded.unfinished = UnfinishedEpisode(number, line["seed"])
+    elif kind == "break":
+        if line["why"] == "stop" and recorded.ended and recorded.ended[-1].number == number:
+            recorded.ended[-1] = replace(recorded.ended[-1], why="stopped")  # the trial ended in the break after it
+    elif current is None or number != current.number:
+        return
+    elif kind == "resume":
+        del current.steps[max(0, int(line["steps"])) :]
+    elif kind == "step":
+        words = tuple(_feedback(line))
+        current.steps.append(
+            RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, line.get("advice"))
+        )
+        current.unheard = []
+        recorded.seconds += 1.0 / rate
+        if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more
+            _end(recorded, current, "terminated" if line.get("terminated") else "truncated")
+    elif kind == "end" and line["why"] == "shutdown":
+        current.unheard = _feedback(line)
+    elif kind == "end":
+        _end(recorded, current, str(line["why"]))
+
+
+def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
+    recorded.ended.append(Episode(episode.number, len(episode.steps), episode.score, why))
+    recorded.unfinished = None
+
+
+def _feedback(line: Mapping[str, Any]) -> list[str]:
+    return [message["command"] for message in line.get("messages", ()) if is_feedback(message.get("command"))]

@@ -1,0 +1,73 @@
+"""Where recordings are written, and how they get into the store: nothing is lost or overwritten."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import tempfile
+from collections.abc import Awaitable, Callable
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import TypeVar
+
+from protocol.keys import with_number
+from trial.recordings.recording import Recording
+from trial.recordings.store import FolderStore, Store, short_error
+from trial.settings import Settings
+
+T = TypeVar("T")
+log = logging.getLogger("trial")
+
+_LONGEST_PAUSE = 20.0
+
+
+class Spool:
+    """The folder where recordings are written before they are stored."""
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self.local_only = not settings.trial.s3upload
+        if settings.spool is not None:
+            self.folder = settings.spool
+        elif isinstance(store, FolderStore) and not self.local_only:
+            self.folder = store.folder
+        else:
+            self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
+
+    def open(self, key: str) -> Recording:
+        """A new recording for the key, or for the key with a number if there is one already. Raises OSError."""
+        for number in range(1, 100):
+            numbered = with_number(key, number)
+            path = self.folder / f"{numbered}.part"
+            if (self.folder / numbered).exists():
+                continue
+            with contextlib.suppress(FileExistsError):
+                return Recording(path, numbered)
+        raise FileExistsError(key)
+
+    def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
+        """Recordings of this server that a killed process left here, with their keys."""
+        paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
+        return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
+
+
+async def store_file(store: Store, key: str, path: Path) -> None:
+    """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
+    for number in count(1):
+        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
+        if await retry_forever("store a recording", attempt):
+            break
+    path.unlink(missing_ok=True)
+
+
+async def retry_forever(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
+    """Try until an attempt succeeds, with growing pauses; its result."""
+    pause = 0.5
+    while True:
+        try:
+            return await attempt()
+        except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
+            log.warning("cannot %s (%s); trying again in %g s", what, short_error(error), pause)
+        await asyncio.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE)

@@ -1,0 +1,109 @@
+"""The listening WebSocket server: its port, its certificate, and how many connections may be unauthenticated."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+from websockets.asyncio.server import Server as WebSocketServer
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.typing import Subprotocol
+
+from trial.programs.environments import SUBPROTOCOL
+from trial.recordings.store import Store
+from trial.server.certificate import RELOAD_SECONDS, Certificate
+from trial.server.handshake import process_request, select_subprotocol
+from trial.server.preauth_limit import PreauthLimitedSocket
+from trial.settings import Settings
+from trial.wire.connection import SUBPROTOCOLS
+
+log = logging.getLogger("trial")
+
+LARGEST_MESSAGE = 4096
+MAX_UNAUTHENTICATED = 64
+"""WebSockets that have not authenticated yet; one more closes the oldest. Of sockets see preauth_limit.py."""
+CLOSE_SECONDS = 2.0
+
+
+class Listener:
+    """Accepts connections. `handle` is called for each one that speaks WebSocket."""
+
+    def __init__(self, settings: Settings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]) -> None:
+        self._settings = settings
+        self._handle = handle
+        self._certificate = Certificate(settings, store) if settings.tls else None
+        self._socket: PreauthLimitedSocket
+        self._server: WebSocketServer
+        self._unauthenticated: dict[ServerConnection, None] = {}
+
+    async def open(self) -> int:
+        """Listen; the port. Raises PortNotPermitted, and SettingsError or the store's errors for the certificate."""
+        settings, certificate = self._settings, self._certificate
+        if certificate is not None:
+            await asyncio.to_thread(certificate.load)
+        self._socket = PreauthLimitedSocket(settings.host, settings.port)
+        self._server = await serve(
+            self._connected,
+            sock=self._socket,
+            open_timeout=settings.hello_seconds,
+            ssl=certificate.context if certificate is not None else None,
+            ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
+            subprotocols=[Subprotocol(name) for name in (*SUBPROTOCOLS, SUBPROTOCOL)],
+            select_subprotocol=partial(select_subprotocol, gym=settings.trial.gym),
+            process_request=partial(process_request, gym=settings.trial.gym, token=settings.token),
+            server_header=None,
+            compression=None,
+            max_size=LARGEST_MESSAGE,
+            write_limit=(1, 0),  # so that sending returns only when nothing is left in the buffer
+            ping_interval=15,
+            ping_timeout=15,
+            close_timeout=CLOSE_SECONDS,
+            logger=_silent(),
+        )
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    def authenticated(self, websocket: ServerConnection) -> None:
+        """This connection no longer counts as unauthenticated."""
+        self._unauthenticated.pop(websocket, None)
+        self._socket.authenticated(websocket.remote_address)
+
+    async def renew_certificate(self) -> None:
+        """Load renewed certificates until it is cancelled. Returns at once without TLS."""
+        certificate = self._certificate
+        while certificate is not None:
+            await asyncio.sleep(RELOAD_SECONDS)
+            try:
+                renewed = await asyncio.to_thread(certificate.fetch)
+                if renewed is not None:
+                    certificate.use(renewed)
+                    log.info("a renewed certificate is in use")
+            except Exception:
+                log.exception("the certificate cannot be renewed; the present one stays")
+
+    def close(self, reason: str) -> None:
+        """Accept no more connections, and close all of them (1001)."""
+        self._server.close(code=1001, reason=reason)
+
+    async def wait_closed(self) -> None:
+        await self._server.wait_closed()
+
+    async def _connected(self, websocket: ServerConnection) -> None:
+        self._unauthenticated[websocket] = None
+        if len(self._unauthenticated) > MAX_UNAUTHENTICATED:
+            oldest = next(iter(self._unauthenticated))
+            del self._unauthenticated[oldest]
+            oldest.transport.abort()
+        try:
+            await self._handle(websocket)
+        finally:
+            self._unauthenticated.pop(websocket, None)
+
+
+def _silent() -> logging.Logger:
+    """A logger that logs nothing: what unauthenticated clients send does not belong in the log."""
+    logger = logging.getLogger("trial.websockets")
+    logger.setLevel(logging.CRITICAL + 1)
+    return logger

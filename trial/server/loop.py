@@ -1,0 +1,210 @@
+"""The asyncio shell of a trial: brings events to its core (`trial/core/trial.py`) and carries out the effects."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from trial.agent.agent import AgentAdapter
+from trial.agent.calls import AgentCalls
+from trial.agent.tracebacks import report
+from trial.agent.worker import Worker
+from trial.core.effects import (
+    Call,
+    Close,
+    CloseRecording,
+    Effect,
+    Log,
+    LogAgentError,
+    OpenRecording,
+    RecordLine,
+    SaveAnswer,
+    SendDone,
+    SendFrame,
+    SendMessage,
+    SendState,
+    WriteLine,
+)
+from trial.core.messages import Message
+from trial.core.trial import Trial
+from trial.programs.watch import Watchers
+from trial.recordings.recorder import Recorder
+from trial.recordings.spool import Spool
+from trial.recordings.store import Store, short_error
+from trial.settings import Settings
+from trial.wire.connection import Connection
+
+log = logging.getLogger("trial")
+
+
+class TrialLoop:
+    """Runs one trial on the event loop, from which all methods are to be called."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        step: str,
+        *,
+        worker: Worker,
+        agent: AgentAdapter,
+        store: Store,
+        spool: Spool,
+        watchers: Watchers,
+    ) -> None:
+        self.core = Trial(settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31))
+        self.ready = asyncio.Event()
+        """The first frame is there, or the trial is over."""
+        self._settings = settings
+        self._worker = worker
+        self._agent = agent
+        self._watchers = watchers
+        self._recorder = Recorder(settings, step, self.core.id, store, spool)
+        self._calls = AgentCalls(agent, self._recorder.stamp, record_observations=settings.trial.record_observations)
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._starting: asyncio.Task[None] | None = None
+        self._saving: asyncio.Task[None] | None = None
+        self._done: asyncio.Future[None] = self._loop.create_future()
+        self._logged: set[str] = set()
+        self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
+            SendMessage: lambda effect: effect.connection.send(effect.text),
+            SendState: self._send_state,
+            SendFrame: lambda effect: effect.connection.send_frame(effect.frame, effect.frame_id),
+            SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
+            Close: lambda effect: effect.connection.close(effect.code, effect.text),
+            WriteLine: lambda effect: self._write(effect.line),
+            RecordLine: lambda effect: self._write(self._recorder.line(effect.kind, effect.fields)),
+            OpenRecording: self._open_recording,
+            CloseRecording: lambda _: self._recorder.close(),
+            SaveAnswer: self._save,
+            Log: lambda effect: log.log(effect.level, effect.text),
+            LogAgentError: self._log_agent_error,
+        }
+
+    def begin(self, agent_ready: Awaitable[bool]) -> asyncio.Future[None]:
+        """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
+        self._starting = asyncio.create_task(self._start(agent_ready))
+        self._starting.add_done_callback(self._started)
+        return self._done
+
+    async def close(self, seconds: float) -> None:
+        """End playing where the game stands and store what was recorded.
+
+        Gives up after `seconds`, even if the researcher's code or the store never answers.
+        """
+        if self._starting is not None:
+            self._starting.cancel()
+        self._do(self.core.close)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await asyncio.wait({self._done})
+
+    # ---- clients
+
+    def connect(self, player: str, connection: Connection) -> None:
+        """Show the trial to this client and do what it asks for."""
+        connection.rate = self.core.progress.frame_rate
+        self._apply(self.core.connect(player, connection, connection.window, self._loop.time()))
+
+    def disconnect(self, connection: Connection) -> None:
+        self._apply(self.core.disconnect(connection, self._loop.time()))
+
+    def receive(self, connection: Connection, message: Message) -> None:
+        self._apply(self.core.receive(connection, message, self._loop.time()))
+
+    # ---- events
+
+    async def _start(self, agent_ready: Awaitable[bool]) -> None:
+        answers = await self._recorder.earlier_answers()
+        if answers is not None:
+            self._apply(self.core.already_played(answers))
+        elif await agent_ready:
+            recorded = await self._recorder.recorded()
+            self._apply(self.core.start(self._agent.action_space, recorded, self._loop.time()))
+        else:
+            self._apply(self.core.agent_failed(self._loop.time()))
+
+    def _started(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and task.exception() is not None:
+            self._fail(task.exception())
+
+    def _do(self, event: Callable[..., list[Effect]], *args: Any) -> None:
+        """Bring an event to the core. No caller waits for it, so an error here ends the trial."""
+        try:
+            self._apply(event(*args, self._loop.time()))
+        except Exception as error:  # noqa: BLE001 - the future of `begin` gets it
+            self._fail(error)
+
+    def _fail(self, error: BaseException | None) -> None:
+        if not self._done.done() and error is not None:
+            self._done.set_exception(error)
+
+    def _called(self, call: Call, result: Any, error: Exception | None) -> None:
+        if error is not None:
+            self._do(self.core.call_failed, call, error)
+        else:
+            self._do(self.core.call_returned, call, result)
+
+    # ---- effects
+
+    def _apply(self, effects: list[Effect]) -> None:
+        """Carry out effects; then see when to go on."""
+        for effect in effects:
+            if isinstance(effect, Call):
+                self._call(effect)
+            else:
+                self._carry_out[type(effect)](effect)
+        core = self.core
+        if core.ready:
+            self.ready.set()
+        if core.done and not self._done.done():
+            self._done.set_result(None)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._do, core.advance)
+
+    def _call(self, call: Call) -> None:
+        self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
+
+    def _send_state(self, effect: SendState) -> None:
+        connection: Any = effect.connection
+        connection.rate = effect.frame_rate
+        connection.send_state(effect.text)
+
+    def _write(self, line: bytes) -> None:
+        self._recorder.write(line)
+        self._watchers.tell(line)
+
+    def _open_recording(self, opening: OpenRecording) -> None:
+        try:
+            self._recorder.open(opening)
+        except OSError as error:
+            log.error("a recording cannot be opened (%s)", short_error(error))
+            self._apply(self.core.recording_failed(self._loop.time()))
+        else:
+            self._apply(self.core.recording_opened(self._loop.time()))
+
+    def _save(self, effect: SaveAnswer) -> None:
+        self._saving = asyncio.create_task(self._recorder.save(effect.answers))
+        self._saving.add_done_callback(self._saved)
+
+    def _saved(self, task: asyncio.Task[None]) -> None:
+        if task.cancelled():
+            return
+        if task.exception() is not None:
+            self._fail(task.exception())
+        else:
+            self._do(self.core.answer_saved)
+
+    def _log_agent_error(self, effect: LogAgentError) -> None:
+        text = report(effect.error, self._settings.agent_dir, self._settings.user_id)
+        if text in self._logged:
+            log.warning("the agent failed again, in the same way")
+        else:
+            self._logged.add(text)
+            log.error("the agent failed\n%s", text)

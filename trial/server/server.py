@@ -1,0 +1,382 @@
+"""The server: admits one participant, connects them to their trial, and ends when it is over or they do not come.
+
+A warm server does not know its participant yet. It refuses clients until it has read its handover
+(`trial/server/warm.py`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from protocol import exits
+from protocol.handover import Handover
+from protocol.keys import handover_key, recordings_folder
+from trial.agent.agent import AgentAdapter
+from trial.agent.tracebacks import report
+from trial.agent.worker import Worker
+from trial.core import messages
+from trial.core.effects import AgentTimeout
+from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
+from trial.core.progress import CommandRefused
+from trial.programs import watch
+from trial.programs.environments import MOST, Environments
+from trial.recordings.spool import Spool, store_file
+from trial.recordings.store import Store, open_store
+from trial.server import warm
+from trial.server.handshake import (
+    OTHER_ID,
+    OTHER_STUDY,
+    check_access,
+    check_matches,
+    is_program,
+    receive_hello,
+    show_refusal,
+    token_in_address,
+)
+from trial.server.lifetime import Lifetime, exit_hard_after
+from trial.server.listener import CLOSE_SECONDS, Listener
+from trial.server.loop import TrialLoop
+from trial.settings import Settings
+from trial.wire.connection import Connection
+from trial.wire.inbound import Inbound
+
+log = logging.getLogger("trial")
+
+STORE_MARGIN = 10.0
+"""Storing recordings gives up this many seconds before the process is killed."""
+EXIT_MARGIN = 4.0
+"""The process ends in any case this many seconds before it would be killed."""
+TELL_SECONDS = 5.0
+"""If a trial cannot begin, the process tells it to clients that connect within so many seconds. Then it ends, and
+another server replaces it."""
+_TOLD_SECONDS = 0.3  # the same, once a client has been told
+_NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
+_CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
+
+
+class Server:
+    """One participant's server. `run` returns the process's exit status."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._store: Store
+        self._spool: Spool
+        self._listener: Listener
+        self._lifetime: Lifetime
+        self._worker = Worker()
+        self._agent = AgentAdapter(settings.agent_dir, settings.trial.game, settings.trial.action_space)
+        self._agent_ready: asyncio.Task[bool]
+        self._failure = 1  # the exit status if the server ends by an error
+        self._trial: TrialLoop | None = None
+        self._finished_steps: set[str] = set()
+        self._handover: warm.HandoverSearch
+        self._connections: dict[Connection, asyncio.Task[None]] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._watchers = watch.Watchers()
+        self._watching = 0  # programs that are connected
+        self._environments = Environments(settings.agent_dir)
+
+    async def run(self) -> int:
+        """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
+        settings = self.settings
+        self._lifetime = Lifetime(settings, saving=lambda: self._trial is not None and self._trial.core.saving)
+        self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
+        self._spool = await asyncio.to_thread(Spool, settings, self._store)
+        self._listener = Listener(settings, self._store, self._connected)
+        port = await self._listener.open()
+        print(json.dumps({"port": port}), flush=True)
+        log.info("listening on port %d", port)
+        self._agent_ready = asyncio.create_task(self._start_agent())
+        if settings.warm_server:
+            key = handover_key(settings.project_id, settings.server)
+            self._handover = warm.HandoverSearch(self._store, key, settings.warm_server_seconds)
+            self._keep(self._handover.run(self._assign))
+        else:
+            self._keep(self._store_files(await self._leftovers(settings)))
+        self._keep(self._listener.renew_certificate())
+        self._lifetime.watch()
+        reason = await self._lifetime.over()
+        log.info("ending: %s", reason)
+        exit_hard_after(self.settings.stop_seconds - EXIT_MARGIN)
+        await self._close(reason)
+        return self._failure if reason == "error" else 0
+
+    def end(self, reason: str) -> None:
+        """End the server. Call it on the event loop."""
+        self._lifetime.end(reason)
+
+    @property
+    def stuck(self) -> bool:
+        """The researcher's code is still running and may never return."""
+        return self._worker.busy
+
+    async def _close(self, reason: str) -> None:
+        for task in self._tasks:
+            task.cancel()
+        self._listener.close("the trial is done" if reason == "done" else "the server is going away")
+        if self._trial is not None:
+            await self._trial.close(self.settings.stop_seconds - STORE_MARGIN)
+        if not self._agent_ready.done():
+            self._agent_ready.cancel()
+        if not self._worker.busy:
+            with contextlib.suppress(Exception):  # the game is over; nothing depends on how the agent ends
+                await self._worker.call(self._agent.close, limit=CLOSE_SECONDS)
+        self._worker.close()
+        for connection in self._connections:
+            connection.abort()
+        await self._environments.close()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._listener.wait_closed(), CLOSE_SECONDS)
+
+    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # ---- before the participant comes
+
+    async def _start_agent(self) -> bool:
+        try:
+            await self._worker.call(self._agent.start, limit=self.settings.start_seconds)
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            settings = self.settings  # as they are now: a warm server may have been assigned meanwhile
+            self._failure = exits.LATE_AGENT if isinstance(error, AgentTimeout) else exits.NO_AGENT
+            log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
+            self._lifetime.end_in(TELL_SECONDS, "error")
+            return False
+        log.info("the agent is ready")
+        return True
+
+    async def _assign(self, handover: Handover) -> None:
+        """Make this warm server the server of the participant in the handover."""
+        settings = warm.assigned(self.settings, handover)
+        self._keep(self._store_files(await self._leftovers(settings)))
+        warm.set_environment(os.environ, handover)
+        self.settings = settings
+        self._lifetime.expect_participant()
+        log.info("this server is assigned to a participant now")
+
+    async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
+        """Recordings that an earlier process of this server left. Call it before this process records anything."""
+        if not self._spool.local_only:
+            prefix = recordings_folder(settings.project_id, settings.user_id) + settings.server
+            with contextlib.suppress(OSError):
+                return await asyncio.to_thread(self._spool.leftovers, prefix)
+        return []
+
+    async def _store_files(self, left: list[tuple[str, Path]]) -> None:
+        for key, path in left:
+            log.warning("storing a recording that an earlier process left")
+            await store_file(self._store, key, path)
+
+    # ---- a connection
+
+    async def _connected(self, websocket: ServerConnection) -> None:
+        try:
+            await self._serve(websocket)
+        except ConnectionClosed:
+            pass
+        except CloseConnection as closing:
+            try:
+                async with asyncio.timeout(2 * CLOSE_SECONDS):
+                    await websocket.send(messages.error(closing.words))
+                    await websocket.close(closing.code, _reason(closing.words))
+            except (TimeoutError, ConnectionClosed):
+                websocket.transport.abort()
+        except Exception:
+            log.exception("a connection failed")
+            await websocket.close(1011)
+
+    async def _serve(self, websocket: ServerConnection) -> None:
+        if is_program(websocket):
+            if self.settings.trial.gym == "environments":
+                await self._serve_environments(websocket)
+            else:
+                await self._serve_watching(websocket)
+            return
+        step = await self._authenticate(websocket)
+        self._listener.authenticated(websocket)
+        trial = self._trial_of(step)
+        connection = Connection(websocket, lossless=self.settings.trial.lossless)
+        sender = asyncio.create_task(connection.run())
+        self._connections[connection] = sender
+        self._lifetime.connected()
+        try:
+            await self._connect(trial, connection)
+            await self._receive(trial, connection)
+        except CloseConnection as closing:
+            connection.close(closing.code, messages.error(closing.words))
+            if closing.code == 1011:
+                sender.add_done_callback(lambda _: self._lifetime.end_in(_TOLD_SECONDS, "error"))
+        finally:
+            trial.disconnect(connection)
+            if websocket.close_code is None:  # ended by us: what was to be sent goes first
+                await asyncio.wait({sender}, timeout=2 * CLOSE_SECONDS)
+                if not sender.done():
+                    connection.abort()
+            sender.cancel()
+            del self._connections[connection]
+            if not self._connections:
+                self._lifetime.disconnected()
+
+    async def _serve_watching(self, websocket: ServerConnection) -> None:
+        """Serve a program that watches, with the token in its address. Raises CloseConnection and ConnectionClosed."""
+        check_matches(token_in_address(websocket), self.settings.token)
+        if self.settings.warm_server:
+            raise CloseConnection(1013, _NOT_ASSIGNED)
+        if self._watching >= watch.MOST:
+            raise CloseConnection(1013, f"{watch.MOST} programs watch already")
+        self._listener.authenticated(websocket)
+        self._watching += 1
+        try:
+            advise = self._advise if self.settings.trial.gym == "advise" else None
+            await watch.Watching(websocket, self._watchers, self._action_space, advise).run()
+        finally:
+            self._watching -= 1
+
+    async def _serve_environments(self, websocket: ServerConnection) -> None:
+        """Serve environments to a program, whose token the handshake has checked.
+
+        A close says what is wrong: a message would be taken for an answer.
+        """
+        self._listener.authenticated(websocket)
+        if self.settings.warm_server:
+            await websocket.close(1013, _NOT_ASSIGNED)
+        elif self._environments.connections >= MOST:
+            await websocket.close(1013, f"{MOST} programs are connected already; try later.")
+        else:
+            await self._environments.serve(websocket)
+
+    def _action_space(self) -> tuple[str, ...]:
+        return self._current().core.progress.action_space
+
+    def _advise(self, action: int) -> None:
+        self._current().core.advise(action)
+
+    def _current(self) -> TrialLoop:
+        if self._trial is None:
+            raise CommandRefused("no game is going on")
+        return self._trial
+
+    async def _authenticate(self, websocket: ServerConnection) -> str | None:
+        """The step that a client asks for who may play. Raises CloseConnection."""
+        hello = await receive_hello(websocket, self.settings.hello_seconds)
+        try:
+            await self._admit(websocket, hello)
+        except CloseConnection as closing:
+            if closing.code == 4401 and hello.names_project and websocket.subprotocol is None:
+                await show_refusal(websocket, closing.words)
+            raise
+        if hello.step is not None and hello.step not in self.settings.game_steps:
+            raise CloseConnection(4404, "that is not a game step of this server")
+        return hello.step
+
+    async def _admit(self, websocket: ServerConnection, hello: Hello) -> None:
+        """Raises CloseConnection unless this is the participant, with the token where one is needed."""
+        check_access(websocket, hello, self.settings.token, self.settings.plain_origins)
+        if self.settings.warm_server:
+            await self._wait_for_handover(websocket)
+        if hello.token is None:
+            check_matches(hello.user_id, self.settings.user_id, OTHER_ID)
+            if hello.project_id is not None:  # an id may take part in two studies, and its name leads to one server
+                check_matches(hello.project_id, self.settings.project_id, OTHER_STUDY)
+        else:
+            check_matches(hello.user_id, self.settings.user_id)
+
+    async def _wait_for_handover(self, websocket: ServerConnection) -> None:
+        """Look for the handover of a warm server. Raises CloseConnection if it is not there in time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.settings.hello_seconds):
+                await _first_of(self._handover.look(), websocket.wait_closed())
+        if self.settings.warm_server:
+            raise CloseConnection(1013, _NOT_ASSIGNED)
+
+    async def _connect(self, trial: TrialLoop, connection: Connection) -> None:
+        """Connect a client to the trial once it has begun. Raises CloseConnection if it cannot begin."""
+        await _first_of(trial.ready.wait(), connection.websocket.wait_closed())
+        if connection.websocket.close_code is not None:
+            return  # gone before the game was ready; a client that plays now is not disturbed
+        if trial.core.broken:
+            raise CloseConnection(1011, _CANNOT_START)
+        trial.connect(self.settings.user_id, connection)
+
+    async def _receive(self, trial: TrialLoop, connection: Connection) -> None:
+        """Take a client's messages until it goes. Raises CloseConnection and ConnectionClosed."""
+        loop = asyncio.get_running_loop()
+        inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
+        async for data in connection.websocket:
+            try:
+                message = inbound.read(data, loop.time())
+            except (NotAMessage, BadMessage) as error:
+                connection.send(messages.error(str(error)))
+                continue
+            if message.ack is not None and connection.binary:
+                connection.acknowledged(message.ack, loop.time())
+            trial.receive(connection, message)
+
+    # ---- trials
+
+    def _trial_of(self, step: str | None) -> TrialLoop:
+        """The trial of this step; begins it if necessary. Raises CloseConnection."""
+        trial = self._trial
+        if trial is not None and trial.core.broken:
+            return trial
+        running = trial is not None and not trial.core.finished
+        if step is None:
+            step = trial.core.step if trial is not None and running else self._next_step()
+        if trial is not None and trial.core.step == step:
+            return trial
+        if running:
+            raise CloseConnection(4404, "another step's game is still going on")
+        trial = self._trial = TrialLoop(
+            self.settings,
+            step,
+            worker=self._worker,
+            agent=self._agent,
+            store=self._store,
+            spool=self._spool,
+            watchers=self._watchers,
+        )
+        trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(self._trial_done)
+        return trial
+
+    def _next_step(self) -> str:
+        steps = self.settings.game_steps
+        return next((step for step in steps if step not in self._finished_steps), steps[-1])
+
+    def _trial_done(self, done: asyncio.Future[None]) -> None:
+        trial = self._trial
+        if done.exception() is not None:
+            log.error("the trial broke", exc_info=done.exception())
+            self.end("error")
+        elif trial is not None and trial.core.broken:
+            self._lifetime.end_in(TELL_SECONDS, "error")
+        elif trial is not None and trial.core.finished:
+            self._finished_steps.add(trial.core.step)
+            if trial.core.step == self.settings.game_steps[-1]:
+                self._lifetime.end_in(self.settings.linger_seconds, "done")
+
+
+def _reason(words: str) -> str:
+    """The words as the reason of a close, which has at most 123 bytes (RFC 6455, 5.5)."""
+    return words.encode("utf-8", "replace")[:120].decode("utf-8", "ignore")
+
+
+async def _first_of(*waits: Coroutine[Any, Any, Any]) -> None:
+    """Wait until the first of these is done; cancel the others."""
+    tasks = [asyncio.ensure_future(wait) for wait in waits]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()

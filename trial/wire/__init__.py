@@ -1,0 +1,1 @@
+"""WebSocket connections to participants: what is sent, and how messages are read."""
