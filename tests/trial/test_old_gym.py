@@ -304,7 +304,7 @@ def test_a_real_gym_comes_first(tmp_path: Path) -> None:
         + "".join(f"def {name}(*a): pass\n" for name in ("start", "step", "render", "reset", "close"))
     )
     code = f"""
-import sys; sys.path[:0] = [{str(OLD_GYM.parents[1])!r}, {str(tmp_path / "site")!r}]
+import sys; sys.path[:0] = [{str(OLD_GYM.parents[2])!r}, {str(tmp_path / "site")!r}]
 from pathlib import Path; from trial.agent.agent import load
 load(Path({str(tmp_path / "agent")!r}))
 """
