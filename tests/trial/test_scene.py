@@ -1,0 +1,227 @@
+"""What `render()` may return as objects, and what is said of objects that cannot be drawn."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trial.pictures.frames import FrameError
+from trial.pictures.picture import as_picture
+from trial.pictures.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, as_scene, images_of
+
+BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}
+
+
+def problem(**fields: Any) -> str:
+    """The one sentence about a scene whose only object is a ball with other fields; the ball is not drawn."""
+    scene = as_scene([BALL | fields])
+    assert not scene.objects
+    (sentence,) = scene.problems
+    return sentence
+
+
+def test_a_list_of_objects_is_a_scene() -> None:
+    scene = as_scene([BALL])
+    assert scene.objects == {"ball": {"type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}}
+    assert not scene.problems
+
+
+def test_a_map_also_has_a_text_for_the_hud() -> None:
+    scene = as_scene({"objects": [BALL], "hud": "Time left: 3"})
+    assert (list(scene.objects), scene.hud) == (["ball"], "Time left: 3")
+
+
+@dataclasses.dataclass
+class Sprite:
+    """In the words of Interactive Gym."""
+
+    uuid: str
+    x: float
+    y: float
+    height: int
+    width: int
+    image_name: str | None = None
+    frame: str | int | None = None
+    object_size: int | None = None
+    angle: int | None = None
+    depth: int = 1
+    animation: str | None = None
+    object_type: str = "sprite"
+    tween: bool = False
+    tween_duration: int = 50
+    permanent: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@pytest.mark.parametrize("form", [lambda cook: cook, Sprite.as_dict])
+def test_interactive_gyms_words_and_objects_are_understood(form: Any) -> None:
+    cook = Sprite("cook", 0.1, 0.2, 45, 40, image_name="chefs", frame="EAST.png", tween=True, tween_duration=75)
+    scene = as_scene([form(cook)])
+    assert scene.objects["cook"] == {
+        **{"type": "sprite", "x": 0.1, "y": 0.2, "image": "chefs", "frame": "EAST.png"},
+        **{"width": 40, "height": 45, "depth": 1, "tween": 75},
+    }
+    assert not scene.problems
+    assert images_of(scene) == {"chefs"}
+
+
+def test_numbers_of_numpy_become_those_of_json() -> None:
+    line = {
+        "id": 7,
+        "type": "line",
+        "points": np.array([[0, 0.123456], [1, 2]], dtype=np.float32),
+        "width": np.int64(2),
+    }
+    scene = as_scene([line, BALL | {"x": np.float32(0.5), "depth": np.int8(3)}])
+    assert json.loads(json.dumps(scene.objects["7"])) == {"type": "line", "points": [[0, 0.1235], [1, 2]], "width": 2}
+    assert json.loads(json.dumps(scene.objects["ball"]))["depth"] == 3
+
+
+def test_tween_is_a_number_of_milliseconds_or_true() -> None:
+    assert as_scene([BALL | {"tween": 120}]).objects["ball"]["tween"] == 120
+    assert as_scene([BALL | {"tween": True}]).objects["ball"]["tween"] == 50
+    assert "tween" not in as_scene([BALL | {"tween": False}]).objects["ball"]
+
+
+# ---- from one scene to the next
+
+
+def test_a_permanent_object_stays_until_the_episode_ends() -> None:
+    ground = {"id": "ground", "type": "rectangle", "x": 0, "y": 0.9, "width": 600, "height": 40, "permanent": True}
+    first = as_scene([ground, BALL])
+    second = as_scene([BALL | {"x": 0.6}], first)
+    third = as_scene([], second)
+    assert [list(scene.objects) for scene in (second, third)] == [["ground", "ball"], ["ground"]]
+    assert not as_scene([]).objects, "the first scene of an episode has none before it"
+
+
+def test_a_permanent_object_can_be_changed_and_removed() -> None:
+    first = as_scene([BALL | {"permanent": True}])
+    changed = as_scene([BALL | {"permanent": True, "x": 1}], first)
+    assert (changed.objects["ball"]["x"], changed.problems) == (1, ())
+    assert not as_scene([{"id": "ball", "remove": True}], changed).objects
+
+
+def test_an_object_that_did_not_change_is_the_same_one() -> None:
+    first = as_scene([dict(BALL), BALL | {"id": "other"}])
+    second = as_scene([dict(BALL), BALL | {"id": "other", "x": 0.9}], first)
+    assert second.objects["ball"] is first.objects["ball"]
+    assert second.objects["other"] is not first.objects["other"]
+
+
+# ---- what is wrong
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"x": float("nan")}, "the object 'ball' cannot be drawn: its x is no finite number (nan)"),
+        ({"x": float("inf")}, "the object 'ball' cannot be drawn: its x is no finite number (inf)"),
+        ({"x": "left"}, "the object 'ball' cannot be drawn: its x is no number"),
+        ({"x": None}, "the object 'ball' has no x, which a circle needs"),
+        ({"radius": -1}, "the object 'ball' cannot be drawn: its radius is -1; it must be from 0 to 1e+06"),
+        ({"alpha": 2}, "the object 'ball' cannot be drawn: its alpha is 2; it must be from 0 to 1"),
+        (
+            {"color": "url(x)"},
+            "the object 'ball' cannot be drawn: its color is no color: 'url(x)'; write it as '#rrggbb'",
+        ),
+        ({"tween": 1e9}, "the object 'ball' cannot be drawn: its tween is 1e+09; it must be from 0 to 10000"),
+        (
+            {"type": "blob"},
+            "the object 'ball' has the type 'blob'; there are sprite, line, circle, rectangle, polygon, text",
+        ),
+        (
+            {"type": "polygon", "points": [(0, 0)] * (MOST_POINTS + 1)},
+            "the object 'ball' cannot be drawn: its points are 5001; there must be 3 to 5000",
+        ),
+        (
+            {"type": "line", "points": [(0, 0), (1,)]},
+            "the object 'ball' cannot be drawn: its points are not pairs of numbers",
+        ),
+        (
+            {"type": "text", "text": "a" * 1001},
+            "the object 'ball' cannot be drawn: its text has 1001 characters; at most 1000 are shown",
+        ),
+    ],
+)
+def test_an_object_that_cannot_be_drawn_is_left_out_with_a_sentence(fields: dict[str, Any], said: str) -> None:
+    assert problem(**fields) == said
+
+
+def test_the_other_objects_are_drawn() -> None:
+    scene = as_scene([BALL | {"id": "lost", "x": float("nan")}, BALL])
+    assert list(scene.objects) == ["ball"]
+
+
+def test_an_object_without_an_id_is_drawn_and_remarked() -> None:
+    scene = as_scene([{key: value for key, value in BALL.items() if key != "id"}])
+    assert len(scene.objects) == 1
+    assert scene.problems == ("object 1 of render() (circle) has no id; give each object an id that it keeps",)
+
+
+def test_of_two_objects_with_one_id_the_later_counts() -> None:
+    scene = as_scene([BALL, BALL | {"x": 0.9}])
+    assert scene.objects["ball"]["x"] == 0.9
+    assert scene.problems == ("two objects have the id 'ball'; the later one counts",)
+
+
+def test_a_field_that_the_type_does_not_have_is_remarked() -> None:
+    scene = as_scene([BALL | {"colour": "#00ff00"}])
+    assert list(scene.objects) == ["ball"]
+    assert scene.problems == ("the object 'ball' has a field 'colour', which a circle does not have",)
+
+
+def test_text_is_text_and_control_characters_are_dropped() -> None:
+    words = {"id": "words", "type": "text", "x": 0, "y": 0, "text": "<b>3 & 4</b>\n\x00\x1bend"}
+    assert as_scene([words]).objects["words"]["text"] == "<b>3 & 4</b>\nend"
+
+
+def test_all_points_of_a_scene_are_bounded() -> None:
+    lines = [{"id": n, "type": "line", "points": [(0, 0)] * MOST_POINTS} for n in range(6)]
+    scene = as_scene(lines)
+    assert len(scene.objects) == 4
+    assert scene.problems == ("the scene has more than 20000 points; the objects after these are left out",)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ([BALL] * (MOST_OBJECTS + 1), "render() returned 2001 objects; a scene has at most 2000"),
+        ({"hud": "3"}, "render() returned a map without 'objects'; return a list, or {'objects': […], 'hud': '…'}"),
+        ({"objects": 3}, "render() must return a list of objects, not int"),
+    ],
+)
+def test_what_is_no_scene_at_all_is_refused_with_a_sentence(value: Any, said: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        as_scene(value)
+    assert str(refused.value) == said
+
+
+@pytest.mark.parametrize("item", [3, "ball", None, [1, 2]])
+def test_an_item_that_is_no_object_is_left_out_with_a_sentence(item: Any) -> None:
+    scene = as_scene([BALL, item])
+    assert list(scene.objects) == ["ball"]
+    assert scene.problems == (f"object 2 of render() is no map of fields, but {type(item).__name__}",)
+
+
+# ---- scenes and frames
+
+
+def test_a_picture_is_a_scene_or_a_frame() -> None:
+    assert isinstance(as_picture([BALL]), Scene)
+    assert isinstance(as_picture([]), Scene)
+    assert isinstance(as_picture(np.zeros((2, 3, 3), np.uint8)), np.ndarray)
+    assert isinstance(as_picture([np.zeros((3, 3), np.uint8)]), np.ndarray), "rows of pixels in a list"
+    with pytest.raises(FrameError):
+        as_picture(None)
+
+
+def test_objects_without_a_scene_in_config_yml_are_refused_with_a_sentence() -> None:
+    with pytest.raises(SceneError, match=r"say in config\.yml how large the picture is, as trial\.scene"):
+        as_picture([BALL], scenes=False)

@@ -1,0 +1,25 @@
+"""What `render()` may return: a frame (pixels) or a scene (objects). Pure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trial.pictures import frames
+from trial.pictures.frames import Frame
+from trial.pictures.scene import Scene, SceneError, as_scene, is_scene
+
+Picture = Frame | Scene
+"""What a client is shown. It must not change afterwards."""
+
+
+def as_picture(value: Any, before: Scene | None = None, *, scenes: bool = True) -> Picture:
+    """The picture that `render()` returned. `before` is the scene before it in the episode (`as_scene`).
+
+    `scenes` is whether config.yml has `trial.scene`. Raises FrameError or SceneError, with a sentence for the
+    researcher.
+    """
+    if not is_scene(value):
+        return frames.as_frame(value)
+    if not scenes:
+        raise SceneError("render() returned objects; say in config.yml how large the picture is, as trial.scene")
+    return as_scene(value, before)
