@@ -14,6 +14,7 @@ WITH_TLS = $(if $(TLS_GIVEN),--tls) $(if $(NAMES_GIVEN),--names "$(NAMES)")
 HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command line: shells have a variable HOST too
 PORT ?= 8000
 BOTS ?= 20
+TEMPLATE ?=
 SAMPLE ?= 150
 SEED ?=
 MODULES ?=
@@ -26,7 +27,7 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
-KNOWN := PYTHON VENV BIN PROJECT DATA HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
+KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
@@ -46,6 +47,10 @@ try: $(VENV)/local ## send BOTS=20 simulated participants through the study of P
 .PHONY: gym
 gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
 	@$(BIN)/python -m trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+
+.PHONY: new
+new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPLATE= (without it: which there are)
+	@$(BIN)/python -m local.new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
 
 .PHONY: check
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.

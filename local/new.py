@@ -1,0 +1,174 @@
+"""`python -m local.new FOLDER TEMPLATE`: begin a study of one's own with a copy of an example."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hippodrome.config import ConfigErrors
+from hippodrome.config.folder import Source, read_source
+from hippodrome.model import ids
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = "examples"
+OF_A_STUDY = ("config.yml", "agent.py", "steps", "requirements.txt")
+"""What belongs to the study at the top, whose folder holds Hippodrome too."""
+LEFT_OUT = shutil.ignore_patterns("data", "data-*", "erased-*.json", "__pycache__", "*.pyc", ".*")
+"""Data, caches and hidden files, wherever they lie in a template."""
+
+_ID = ("project", "id")
+_ID_LINE = re.compile(r"(?P<key>\s*id:\s*)[^#\s]+(?P<comment>.*)", re.DOTALL)
+_NO_LETTERS = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+class NotMade(Exception):
+    """The study cannot be made; str() is a sentence for the researcher."""
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """A study to copy: its folder, its title, and whether it lies at the top, in Hippodrome's own folder."""
+
+    folder: Path
+    title: str
+    at_top: bool = False
+
+
+def templates(root: Path = ROOT) -> dict[str, Template]:
+    """Every template by its name: the examples by their folders' names, the study at the top by its id."""
+    found: dict[str, Template] = {}
+    top = _source(root)
+    if top is not None:
+        found[_text(top, _ID)] = Template(root, _text(top, ("project", "name")), at_top=True)
+    for folder in sorted((root / EXAMPLES).glob("*/")):
+        source = _source(folder)
+        if source is not None:
+            found[folder.name] = Template(folder, _text(source, ("project", "name")))
+    return found
+
+
+def listing(known: Mapping[str, Template]) -> str:
+    """The templates, a line for each."""
+    width = max(map(len, known), default=0)
+    return "\n".join(["There are these templates:", *(f"  {name:{width}}  {known[name].title}" for name in known)])
+
+
+def make_study(template: Template, folder: Path) -> str:
+    """Copy the template to `folder`, with an id of its own that is made of the folder's name; the id.
+
+    Raises NotMade if the folder holds something already, if its name makes no id, or if it cannot be written.
+    """
+    project_id = _id_of(folder)
+    _refuse_what_is_there(template, folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _copy(template, folder)
+        _name(folder, project_id)
+    except OSError as error:
+        raise NotMade(f"{folder} cannot be written: {error.strerror or error}") from None
+    return project_id
+
+
+def what_next(folder: Path) -> str:
+    """The commands with which a new study is looked at, tried and changed."""
+    given, requirements = f"PROJECT={shlex.quote(str(folder))}", folder / "requirements.txt"
+    lines = ["Next:"]
+    if requirements.is_file():
+        lines.append(f"  .venv/bin/pip install -r {shlex.quote(str(requirements))}   installs what its agent imports")
+    lines += [
+        f"  make run {given}     holds it on this machine; open the link and take part",
+        f"  make check {given}   finds mistakes in what you change",
+        f"  make try {given}     sends simulated participants through it",
+        "Change config.yml (title, researcher, steps, game), steps/ (the pages) and agent.py (game and agent).",
+    ]
+    return "\n".join(lines)
+
+
+def _refuse_what_is_there(template: Template, folder: Path) -> None:
+    there, inside = folder.resolve(), template.folder.resolve()
+    if folder.exists() and not folder.is_dir():
+        raise NotMade(f"{folder} is a file; name a folder that does not exist yet")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise NotMade(f"{folder} is not empty, and nothing in it was changed; name a folder that does not exist yet")
+    if not template.at_top and there.is_relative_to(inside):
+        raise NotMade(f"{folder} lies in the template itself; name a folder outside of it")
+
+
+def _copy(template: Template, folder: Path) -> None:
+    if not template.at_top:
+        shutil.copytree(template.folder, folder, ignore=LEFT_OUT, dirs_exist_ok=True)
+        return
+    for name in OF_A_STUDY:
+        source = template.folder / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, ignore=LEFT_OUT)
+        elif source.is_file():
+            shutil.copy(source, folder / name)
+
+
+def _name(folder: Path, project_id: str) -> None:
+    """Write the id into config.yml; its comments stay."""
+    source = read_source(folder)
+    file = source.layout.config
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    number = source.parsed.lines[_ID] - 1
+    found = _ID_LINE.fullmatch(lines[number])
+    if found is None:
+        raise NotMade(f"{file}: the id is not on a line of its own; write id: {project_id} there yourself")
+    lines[number] = f"{found['key']}{project_id}{found['comment']}"
+    file.write_text("".join(lines), encoding="utf-8")
+
+
+def _id_of(folder: Path) -> str:
+    """The folder's name with dashes for what an id cannot have. Raises NotMade if that is no id."""
+    name = folder.resolve().name
+    found = _NO_LETTERS.sub("-", name).strip("-_")[:64]
+    if not ids.is_project_id(found) or found.upper() == "SSL":
+        raise NotMade(f'of the folder\'s name "{name}" no project id can be made; use letters, digits and dashes')
+    return found
+
+
+def _source(folder: Path) -> Source | None:
+    try:
+        source = read_source(folder)
+    except ConfigErrors:
+        return None
+    return source if _text(source, _ID) else None
+
+
+def _text(source: Source, path: tuple[str, ...]) -> str:
+    return str(source.adapted.at(path) or "")
+
+
+def main(
+    folder: Annotated[str, typer.Argument(help="The folder of the new study; it must be empty or not there.")] = "",
+    template: Annotated[str, typer.Argument(help="The name of the study to copy.")] = "",
+) -> None:
+    """Copy the study TEMPLATE to FOLDER, give it an id of its own, and say what to do next."""
+    known = templates()
+    usage = f"make new PROJECT=../my-study TEMPLATE={next(iter(known), '')}"
+    if template not in known:
+        said = f"There is no template {template}." if template else f"Name a template: {usage}"
+        sys.stdout.write(f"{said}\n{listing(known)}\n")
+        raise typer.Exit(1)
+    if folder in ("", "."):
+        sys.stdout.write(f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={template}\n")
+        raise typer.Exit(1)
+    try:
+        project_id = make_study(known[template], Path(folder))
+    except NotMade as refusal:
+        sys.stdout.write(f"{refusal}\n")
+        raise typer.Exit(1) from None
+    sys.stdout.write(f"Made {folder} of {template}; its project id is {project_id}.\n{what_next(Path(folder))}\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

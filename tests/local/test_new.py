@@ -1,0 +1,157 @@
+"""`make new`: a study of one's own from an example, or a sentence that says why not."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import read_project
+from local import new
+
+ROOT = Path(__file__).resolve().parents[2]
+TOP = "ms-pacman"
+
+
+def make_new(*variables: str) -> subprocess.CompletedProcess[str]:
+    """`make new` as people type it, without a look at what is installed."""
+    env = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL", "PROJECT")}
+    command = ["make", "-o", ".venv/local", "new", *variables]
+    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A clone with one example, in which someone has played and tried things."""
+    root = tmp_path / "clone"
+    example = root / "examples" / "maze"
+    for file in (
+        *("steps/hello.html", "steps/.draft.html", "policies/partner.onnx", "agent.py", "requirements.txt"),
+        *("data/maze/users/ada/participant.json", "data-try/try-1/x.json", "__pycache__/agent.pyc", "policies/a.pyc"),
+        *(".hippodrome/x", ".env"),
+    ):
+        (example / file).parent.mkdir(parents=True, exist_ok=True)
+        (example / file).write_text(file)
+    text = "# A maze.\nproject:\n  id: maze  # unique\n  name: In a maze\n  steps: {1: hello}\n"
+    (example / "config.yml").write_text(text)
+    return root
+
+
+def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "My study"
+    done = make_new(f"PROJECT={folder}", f"TEMPLATE={TOP}")
+    assert done.returncode == 0, done.stderr
+    assert f"Made {folder} of {TOP}; its project id is My-study." in done.stdout
+    for command in ("run", "check", "try"):
+        assert f"make {command} PROJECT='{folder}'" in done.stdout
+    assert read_project(folder).project.id == "My-study"
+    assert sorted(path.name for path in folder.iterdir()) == ["agent.py", "config.yml", "steps"]
+
+
+@pytest.mark.parametrize(
+    ("variables", "first"),
+    [
+        ((), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
+        (("PROJECT=../x",), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
+        (("PROJECT=../x", "TEMPLATE=pacman"), "There is no template pacman."),
+    ],
+)
+def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str) -> None:
+    done = make_new(*variables)
+    assert done.returncode != 0
+    assert done.stdout.splitlines()[0] == first
+    assert re.search(rf"^  {TOP} +Learning to play Ms\. Pac-Man$", done.stdout, re.MULTILINE)
+    assert not (ROOT.parent / "x").exists()
+
+
+@pytest.mark.parametrize("variables", [(), ("PROJECT=",), ("PROJECT=.",)])
+def test_without_a_folder_it_asks_for_one(variables: tuple[str, ...]) -> None:
+    done = make_new(*variables, f"TEMPLATE={TOP}")
+    assert done.returncode != 0
+    assert done.stdout == f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={TOP}\n"
+
+
+@pytest.mark.parametrize("name", new.templates())
+def test_every_template_makes_a_study_without_mistakes(tmp_path: Path, name: str) -> None:
+    template = new.templates()[name]
+    new.make_study(template, tmp_path / "mine")
+    made, shown = read_project(tmp_path / "mine"), read_project(template.folder)
+    assert made.project.id == "mine"
+    assert (made.trial, made.steps[0].page) == (shown.trial, shown.steps[0].page)
+
+
+def test_templates_are_the_examples_and_the_study_at_the_top() -> None:
+    examples = {path.parent.name for path in (ROOT / "examples").glob("*/config.yml")}
+    assert set(new.templates()) == {TOP, *examples}
+
+
+def test_data_caches_and_hidden_files_are_not_copied(root: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    assert new.make_study(new.templates(root)["maze"], folder) == "mine"
+    made = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert made == {"config.yml", "agent.py", "requirements.txt", "steps/hello.html", "policies/partner.onnx"}
+
+
+def test_only_the_id_changes_in_the_file(root: Path, tmp_path: Path) -> None:
+    new.make_study(new.templates(root)["maze"], tmp_path / "mine")
+    before = (root / "examples" / "maze" / "config.yml").read_text()
+    assert (tmp_path / "mine" / "config.yml").read_text() == before.replace("id: maze", "id: mine")
+
+
+def test_an_empty_folder_is_filled(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    new.make_study(new.templates(root)["maze"], tmp_path / "mine")
+    assert (tmp_path / "mine" / "agent.py").is_file()
+
+
+def test_a_folder_that_holds_something_stays_as_it_is(root: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("years of work")
+    with pytest.raises(new.NotMade, match="is not empty, and nothing in it was changed"):
+        new.make_study(new.templates(root)["maze"], folder)
+    assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
+
+
+def test_a_file_is_no_folder(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("a file")
+    with pytest.raises(new.NotMade, match="is a file"):
+        new.make_study(new.templates(root)["maze"], tmp_path / "mine")
+    assert (tmp_path / "mine").read_text() == "a file"
+
+
+def test_a_study_is_not_made_inside_its_template(root: Path) -> None:
+    with pytest.raises(new.NotMade, match="lies in the template itself"):
+        new.make_study(new.templates(root)["maze"], root / "examples" / "maze" / "mine")
+    assert not (root / "examples" / "maze" / "mine").exists()
+
+
+@pytest.mark.parametrize("name", ["???", "ssl", "_"])
+def test_a_name_that_makes_no_id_is_refused(root: Path, tmp_path: Path, name: str) -> None:
+    with pytest.raises(new.NotMade, match="no project id can be made"):
+        new.make_study(new.templates(root)["maze"], tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_place_where_nothing_can_be_written_is_a_sentence(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(new.NotMade, match="cannot be written: Not a directory"):
+        new.make_study(new.templates(root)["maze"], tmp_path / "file" / "mine")
+
+
+def test_packages_of_the_template_are_to_be_installed(root: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    new.make_study(new.templates(root)["maze"], folder)
+    assert f".venv/bin/pip install -r {folder}/requirements.txt" in new.what_next(folder)
+    (folder / "requirements.txt").unlink()
+    assert "pip install" not in new.what_next(folder)
+
+
+def test_a_template_whose_config_cannot_be_read_is_none(root: Path) -> None:
+    (root / "examples" / "maze" / "config.yml").write_text("project:\n\tid: maze\n")
+    shutil.copytree(root / "examples" / "maze", root / "examples" / "empty")
+    assert new.templates(root) == {}
