@@ -10,7 +10,7 @@ import html
 import json
 import re
 import secrets
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -105,10 +105,10 @@ def frame(
     )
 
 
-def script(name: str, nonce: str, *, module: bool = False) -> Html:
-    """A script of `web/`, with the page's nonce."""
+def script(name: str, nonce: str, *, module: bool = False, also: tuple[str, ...] = ()) -> Html:
+    """A script of `web/`, with the page's nonce. `also` are modules beside it that are to stand before it."""
     kind = ' type="module"' if module else ""
-    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name)}</script>\n')
+    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name, also)}</script>\n')
 
 
 def script_json(data: Any) -> Html:
@@ -199,10 +199,10 @@ def _style(kind: str | None) -> str:
     return _plain("style.css", text)
 
 
-@cache
-def _code(name: str) -> str:
-    """A script of `web/` with the modules that it imports."""
-    return _plain(name, scripts.join(WEB / name))
+@lru_cache(maxsize=16)
+def _code(name: str, also: tuple[str, ...] = ()) -> str:
+    """A script of `web/` with the modules that it imports, and with others."""
+    return _plain(name, scripts.join(WEB / name, also))
 
 
 @cache
@@ -210,10 +210,15 @@ def _template(name: str) -> Template:
     return Template(_PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8"))
 
 
-def _plain(name: str, text: str) -> str:
-    """A style or script without comments and indentation, and a style without spaces that mean nothing.
+_CODE_OR_TEXT = re.compile(r"""(?P<text>"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`)|[^"`]+""")
+_AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|[=?:{},;<>]) ?")
+"""Operators and brackets around which spaces mean nothing. Not + and -: `a + +b` is something else without spaces."""
 
-    A comment behind code begins with space, `//`, space.
+
+def _plain(name: str, text: str) -> str:
+    """A style or script without comments, indentation and most spaces that mean nothing.
+
+    A comment behind code begins with space, `//`, space. No regular expression of ours has spaces.
     """
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
@@ -223,4 +228,6 @@ def _plain(name: str, text: str) -> str:
     if name.endswith((".css", ".js")):
         lines = (line.strip() for line in text.splitlines())
         text = "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
+    if name.endswith(".js"):
+        text = _CODE_OR_TEXT.sub(lambda part: part[0] if part["text"] else _AROUND.sub(r"\1", part[0]), text)
     return text

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hippodrome.model.project import Project, Step
-from hippodrome.participants import fragments
+from hippodrome.participants import fragments, game_modules
 from hippodrome.participants.fragments import Fragment
 from hippodrome.participants.frame import (
     Html,
@@ -141,7 +141,7 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("game/main.js", nonce, module=True),
+        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project.trial)),
         head=Html() if over else Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n'),
         body="game",
     )

@@ -16,13 +16,16 @@ _EXPORT = re.compile(r"^export (?=async |const |function |let )", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
-def join(main: Path) -> str:
+def join(main: Path, also: tuple[str, ...] = ()) -> str:
     """The script of this module and of all that it imports, each once and after what it imports itself.
 
+    `also` are modules beside it that it does not import: they and what they import stand before it.
     Raises ValueError for an import or export of another form.
     """
     found: dict[Path, str] = {}
-    _add(main, found)
+    for module in (*map(main.with_name, also), main):
+        if module not in found:
+            _add(module, found)
     return "".join(found.values())
 
 

@@ -5,6 +5,7 @@ import { isRunning, releaseAll, start } from "./actions.js";
 import { countDown } from "./breaks.js";
 import { ask, play, watch } from "./connection.js";
 import { buildControls } from "./controls.js";
+import { hooks } from "./hooks.js";
 import { onKeyDown, onKeyUp } from "./keyboard.js";
 import { leave } from "./leave.js";
 import { hideMessage, showMessage, showOverlay } from "./overlay.js";
@@ -76,6 +77,7 @@ function hear(said) {
   if (Array.isArray(said.UI)) buildControls(said);
   if (said.state) showStatus(said);
   if (said.state === "playing") document.title = title;
+  for (const hook of hooks.said) hook(said);
 }
 
 // Two pages that took the game from each other by themselves would do so for ever.

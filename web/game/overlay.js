@@ -1,4 +1,5 @@
 // What covers the picture while the game does not run, and short messages of the server's.
+import { hooks } from "./hooks.js";
 import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
 
@@ -30,12 +31,12 @@ export function showOverlay(name) {
   const score = name === "break" ? `. Your score: ${points(game.episodeScore)}.` : "";
   setText(find("announce"), `${overlay.title ?? "Playing"}${score}`);
   setText(find("overlay-score"), "");
-  if (!overlay) return;
-  setText(find("overlay-title"), overlay.title);
+  setText(find("overlay-title"), overlay.title ?? "");
   const hint = matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? overlay.hint : "";
   setText(find("overlay-hint"), overlay.note ?? hint ?? "");
   find("overlay-button").textContent = overlay.button ?? "";
   find("overlay-button").hidden = !overlay.button;
+  for (const hook of hooks.overlay) hook(name);
 }
 
 let messageTimer;

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.participants import scripts
+from hippodrome.participants import frame, game_modules, scripts
 
 GAME = Path(__file__).resolve().parents[3] / "web" / "game"
 MODULES = sorted(GAME.glob("*.js"), key=lambda path: path.name)
@@ -65,11 +65,23 @@ def test_what_a_module_imports_is_exported(module: Path) -> None:
 
 
 def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() -> None:
-    joined = scripts.join(GAME / "main.js")
+    joined = scripts.join(GAME / "main.js", tuple(game_modules.MODULES))
     places = {module.name: joined.index(f"\n{code_of(module)}") for module in MODULES}
     assert len(set(places.values())) == len(MODULES)
     for module in MODULES:
         assert all(places[name] < places[module.name] for name in imported(module))
+
+
+def test_a_module_of_some_projects_is_in_no_other_script() -> None:
+    joined = scripts.join(GAME / "main.js")
+    assert [module.name for module in MODULES if f"\n{code_of(module)}" not in joined] == sorted(game_modules.MODULES)
+
+
+def test_modules_that_are_not_imported_stand_before_the_script_and_behind_what_they_import(tmp_path: Path) -> None:
+    (tmp_path / "a.js").write_text("export const a = 1;\n")
+    (tmp_path / "b.js").write_text('import { a } from "./a.js";\na(2);\n')
+    (tmp_path / "c.js").write_text('import { a } from "./a.js";\na(3);\n')
+    assert scripts.join(tmp_path / "c.js", ("b.js",)) == "const a = 1;\na(2);\na(3);\n"
 
 
 def code_of(module: Path) -> str:
@@ -101,3 +113,16 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
     (tmp_path / "b.js").write_text('import { a } from "./a.js";\nexport const b = a;\n')
     (tmp_path / "c.js").write_text('import {\n  a,\n} from "./a.js";\nimport { b } from "./b.js";\nb(a);\n')
     assert scripts.join(tmp_path / "c.js") == "// A\nconst a = 1;\nconst b = a;\nb(a);\n"
+
+
+@pytest.mark.parametrize(
+    ("source", "carried"),
+    [
+        ("  const a = (b) => ({ c: 1, d });\n", "const a=(b)=>({c:1,d});\n"),
+        ("  if (a !== b && c) return;\n", "if (a!==b&&c) return;\n"),
+        ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);\n'),
+        ("a + +b - -c;\n", "a + +b - -c;\n"),
+    ],
+)
+def test_a_page_carries_a_script_without_comments_and_spaces_but_texts_as_they_are(source: str, carried: str) -> None:
+    assert frame._plain("a.js", source) == carried
