@@ -168,6 +168,12 @@ class Trial:
     )
     record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
+    callback_seconds: float = _key(
+        values.number(0, 10),
+        0.5,
+        "Seconds for which the game waits for a callback of the agent; then it goes on without waiting.",
+        {"type": "number", "minimum": 0, "maximum": 10},
+    )
     gym: str = _key(
         values.one_of("none", "watch", "advise", "environments"),
         "none",

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from trial.agent import signatures
+from trial.agent import callbacks, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
 from trial.pictures import frames
@@ -130,6 +130,11 @@ class AgentAdapter:
         self._word = signatures.NO_WORD  # the newest since the last step
         self._env_says_action = False
         self.action_space: tuple[str, ...] = action_space or ()
+
+    @property
+    def callbacks(self) -> Mapping[str, Callable[..., Any]]:
+        """The callbacks that the agent has, once it has started."""
+        return callbacks.listening(self._agent)
 
     @property
     def env(self) -> Any:

@@ -6,14 +6,19 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from trial.agent.agent import AgentAdapter
+from trial.agent.agent import AgentAdapter, StepResult
+from trial.agent.callbacks import Callbacks
 from trial.core.effects import Call, FeedbackCall, ReplayCall, ResetCall, StepCall, StepTaken
-from trial.core.progress import Action
+from trial.core.progress import Action, Episode
 from trial.core.unfinished import UnfinishedEpisode
 from trial.pictures.frames import Frame
 from trial.recordings import recording
 
 log = logging.getLogger("trial")
+
+
+PLAYER = "player_0"
+"""The player of an environment that has only one."""
 
 
 class Diverged(Exception):
@@ -27,6 +32,8 @@ class AgentCalls:
         self._agent = agent
         self._stamp = stamp
         self._record_observations = record_observations
+        self.callbacks: Callbacks | None = None
+        """Of an agent that has some."""
         self._said_too_large: set[str] = set()
 
     def run(self, call: Call) -> Any:
@@ -34,38 +41,74 @@ class AgentCalls:
         if isinstance(call, StepCall):
             return self._step(call)
         if isinstance(call, FeedbackCall):
-            return self._give_feedback(call)
+            return self._end(call)
         if isinstance(call, ResetCall):
             return self._reset(call.episode, call.seed)
         assert isinstance(call, ReplayCall)
         return self._replay(call.unfinished, call.default_action)
 
     def _reset(self, episode: int, seed: int) -> tuple[bytes, Frame]:
+        if self.callbacks:
+            self.callbacks.session_begins()
         first, info, seeded = self._agent.reset(seed)
         frame = self._agent.render()
+        if self.callbacks:
+            self.callbacks.episode_began(episode, {PLAYER: first}, {PLAYER: info})
         fields: dict[str, Any] = {"episode": episode, "seed": seed if seeded else None, "info": recording.plain(info)}
         if self._record_observations:
             fields["observation"] = recording.observation(first)
         return recording.line("reset", **self._stamp(), **fields), frame
 
     def _replay(self, unfinished: UnfinishedEpisode, default_action: int) -> Frame:
-        _, _, seeded = self._agent.reset(unfinished.seed or 0)
+        if not self.callbacks:
+            return self._take_again(unfinished, default_action)
+        self.callbacks.session_begins()
+        self.callbacks.replaying = True
+        try:
+            return self._take_again(unfinished, default_action)
+        finally:
+            self.callbacks.replaying = False
+
+    def _take_again(self, unfinished: UnfinishedEpisode, default_action: int) -> Frame:
+        first, info, seeded = self._agent.reset(unfinished.seed or 0)
         if not seeded or unfinished.seed is None:
             raise Diverged("the environment takes no seed")
+        if self.callbacks:
+            self.callbacks.episode_began(unfinished.number, {PLAYER: first}, {PLAYER: info})
         for step in unfinished.steps:
             for word in step.feedback:
-                self._agent.feedback(word)
+                self._feedback(word)
             asked = next((one for one in (step.human, step.advice) if one is not None), default_action)
             result = self._agent.step(asked)
             action = asked if result.action is None else result.action
             if result.terminated or result.truncated or (action, result.reward) != (step.action, step.reward):
                 raise Diverged("it plays differently now")
+            if self.callbacks:
+                self._tell_step(action, result)
         return self._agent.render()
 
     def _give_feedback(self, call: FeedbackCall) -> None:
         for word in call.feedback:
             call.heard += 1
-            self._agent.feedback(word)
+            self._feedback(word)
+
+    def _feedback(self, word: str) -> None:
+        self._agent.feedback(word)
+        if self.callbacks:
+            self.callbacks.fed_back(PLAYER, word)
+
+    def _end(self, call: FeedbackCall) -> None:
+        self._give_feedback(call)
+        if self.callbacks:
+            if isinstance(call.over, Episode):
+                self.callbacks.episode_ended(call.over.why)
+            if call.last:
+                self.callbacks.session_ended()
+
+    def _tell_step(self, action: int, result: StepResult) -> None:
+        assert self.callbacks is not None
+        rewards = {PLAYER: result.reward}
+        self.callbacks.stepped({PLAYER: action}, rewards, {PLAYER: result.observation}, {PLAYER: result.info})
 
     def _step(self, call: StepCall) -> StepTaken:
         stamp, asked = self._stamp(), call.action
@@ -77,6 +120,8 @@ class AgentCalls:
             names = self._agent.action_space
             index, by = result.action, "agent"
             name = names[index] if 0 <= index < len(names) else str(index)
+        if self.callbacks:
+            self._tell_step(index, result)
         line = recording.line(
             "step",
             **stamp,

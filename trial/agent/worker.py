@@ -26,8 +26,12 @@ class Worker:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="agent", daemon=True)
         self._thread.start()
-        self.busy = False
+        self._out = 0  # functions that have not returned
+
+    @property
+    def busy(self) -> bool:
         """A function has not returned yet (it may never)."""
+        return self._out > 0
 
     def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
         """Call the function on the thread, and then, once, `done` on the event loop; for AgentTimeout after `limit` s.
@@ -45,7 +49,7 @@ class Worker:
                 done(result, error)
 
         def returned(result: Any, error: Exception | None) -> None:
-            self.busy = False
+            self._out -= 1
             finish(result, error)
 
         def job() -> None:
@@ -54,7 +58,7 @@ class Worker:
                 loop.call_soon_threadsafe(returned, result, error)
 
         timer = loop.call_later(limit, finish, None, AgentTimeout(f"no answer within {limit:g} s"))
-        self.busy = True
+        self._out += 1
         self._jobs.put(job)
 
     async def call(self, function: Callable[[], T], *, limit: float) -> T:

@@ -46,13 +46,12 @@ class Clients:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
         return client is not None
 
-    def remove(self, connection: Hashable) -> bool:
-        """Forget a connection that is closed; False if it was replaced before."""
+    def remove(self, connection: Hashable) -> str | None:
+        """Forget a connection that is closed, and return its player; None if it was replaced before."""
         player = next((player for player, each in self._by_player.items() if each.connection == connection), None)
-        if player is None:
-            return False
-        del self._by_player[player]
-        return True
+        if player is not None:
+            del self._by_player[player]
+        return player
 
     def of(self, connection: Hashable) -> Client | None:
         """The client with this connection; None if it was replaced."""

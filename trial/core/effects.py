@@ -9,7 +9,7 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from trial.core.progress import Action
+from trial.core.progress import Action, Break, Episode
 from trial.core.unfinished import UnfinishedEpisode
 from trial.pictures.frames import Frame
 
@@ -99,6 +99,10 @@ class FeedbackCall(Call):
     messages: int
     """So many of the participant's messages came before this call."""
     heard: int = 0
+    over: Episode | Break | None = None
+    """What has ended, for the agent's callbacks."""
+    last: bool = False
+    """The trial is over too."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -108,6 +112,14 @@ class StepCall(FeedbackCall):
     action: Action
     fields: Mapping[str, Any]
     """More for the step's line of the recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class TellMoved:
+    """Tell the agent's callbacks that a player's participant has come, gone or come back."""
+
+    callback: Literal["on_join", "on_leave", "on_return"]
+    player: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +198,7 @@ Effect = (
     | SendDone
     | Close
     | Call
+    | TellMoved
     | OpenRecording
     | WriteLine
     | RecordLine

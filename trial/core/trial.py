@@ -29,7 +29,7 @@ import logging
 import traceback
 from collections.abc import Callable, Hashable, Mapping
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 from trial.core import messages
 from trial.core.clients import Client, Clients, state_of
@@ -48,6 +48,7 @@ from trial.core.effects import (
     SaveAnswer,
     StepCall,
     StepTaken,
+    TellMoved,
     WriteLine,
 )
 from trial.core.flow_control import Window
@@ -86,6 +87,8 @@ class Trial:
         self.phase = Phase.STARTING
         self.ready = False
         """The first frame is there, or the trial is over."""
+        self.callbacks = False
+        """The agent has callbacks, which are told of the end of each episode and of players who come and go."""
         self.wake_at: float | None = None
         """When `advance` is to be called if nothing else happens before; None: there is no need to."""
         self.progress = Progress(self.config, self.config.action_space or ("noop",))
@@ -108,6 +111,7 @@ class Trial:
         self._give_up_at: float | None = None
         self._break_shut_down = False
         self._last_lines_written = False
+        self._met: set[str] = set()  # players whose participants have been here
         self._now = 0.0
 
     @property
@@ -168,12 +172,14 @@ class Trial:
         """
         self._now = now
         if self._clients.replace(player):
-            self._left()
+            self._left(player)
         client = self._clients.add(player, connection, window)
         self._note("connected")
         if self.finished:
             self._send_done()
             return self._take_effects()
+        self._tell_moved("on_return" if player in self._met else "on_join", player)
+        self._met.add(player)
         self._clients.send(client, self._controls())
         client.sent = state_of(self.progress)
         if self._failed_words is not None:
@@ -186,9 +192,10 @@ class Trial:
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
         """A connection is closed. The game is held until its player starts it again."""
         self._now = now
-        if not self._clients.remove(connection):
+        player = self._clients.remove(connection)
+        if player is None:
             return []
-        self._left()
+        self._left(player)
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
@@ -445,12 +452,15 @@ class Trial:
 
     def _write_end(self) -> bool:
         """Record the end of an episode or a break, and its last messages. The agent hears their feedback before."""
+        progress = self.progress
         call = FeedbackCall(
             limit=LAST_CALL_SECONDS if self._closing else self.settings.step_seconds,
             feedback=self._messages.feedback,
             messages=len(self._messages.messages),
+            over=progress.ended[0],
+            last=progress.over and len(progress.ended) == 1,
         )
-        if call.feedback and not self._agent_hangs:
+        if (call.feedback or self.callbacks) and not self._agent_hangs:
             self._start_call(call)
             return False
         self._record_end(call)
@@ -526,9 +536,14 @@ class Trial:
 
     # ---- clients
 
-    def _left(self) -> None:
+    def _left(self, player: str) -> None:
         self._note("disconnected")
         self.progress.leave()
+        self._tell_moved("on_leave", player)
+
+    def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
+        if self.callbacks and self.phase is Phase.PLAYING and not self._agent_hangs:
+            self._emit(TellMoved(callback, player))
 
     def _handle(self, client: Client, message: messages.Message) -> None:
         """Do what a client asks for. Raises CommandRefused with words for the client."""

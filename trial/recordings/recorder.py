@@ -72,6 +72,11 @@ class Recorder:
             "ns": time.monotonic_ns(),
         }
 
+    @property
+    def is_open(self) -> bool:
+        """There is a recording to which lines can be written."""
+        return self._recording is not None
+
     def open(self, opening: OpenRecording) -> None:
         """Open a recording and write its header. Raises OSError."""
         settings, config = self._settings, self._settings.trial

@@ -1,7 +1,7 @@
 """Recordings: gzip of JSON lines, one line per step, readable to the last flush whatever happens to the process.
 
-Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `error` (the researcher's code
-raised) and `end` (an episode or the file ends). Nothing is pickled.
+Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `callback` (what a callback of the
+agent recorded), `error` (the researcher's code raised) and `end` (an episode or the file ends). Nothing is pickled.
 
 A `step` tells the choice of its action: `human` is the index of the action that the participant's keys asked for (null
 if no key acted); `action` and `actionName` are the one that was taken; `by` is its origin: `agent` (the agent reports
@@ -57,20 +57,19 @@ def observation(value: Any) -> Any:
     return Values(listed=-1).keep(value)
 
 
-def bounded_extra(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, int]]:
+def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tuple[dict[str, Any], dict[str, int]]:
     """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
 
-    A value that does not fit into MAX_EXTRA_BYTES together with those before it is replaced by
+    A value that does not fit into `left` bytes together with those before it is replaced by
     `{"tooLarge": bytes}`. The second result says which, and how large they are at least.
     """
     kept: dict[str, Any] = {}
     too_large: dict[str, int] = {}
-    left = MAX_EXTRA_BYTES
     for key, value in values.items():
         name = text_of(key)
         reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
         fit = reader.keep(value)
-        size = len(json.dumps(fit, separators=(",", ":"))) + reader.left_out
+        size = size_of(fit) + reader.left_out
         if size > left or reader.exhausted:
             too_large[name] = size
             fit = {"tooLarge": size}
@@ -78,6 +77,11 @@ def bounded_extra(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, 
             left -= size
         kept[name] = fit
     return kept, too_large
+
+
+def size_of(kept: Any) -> int:
+    """Bytes of a value that is plain already, as JSON."""
+    return len(json.dumps(kept, separators=(",", ":")))
 
 
 def read_observation(kept: Any) -> Any:

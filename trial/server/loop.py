@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from trial.agent.agent import AgentAdapter
+from trial.agent.callbacks import About, Callbacks
 from trial.agent.calls import AgentCalls
 from trial.agent.tracebacks import report
 from trial.agent.worker import Worker
@@ -28,6 +29,8 @@ from trial.core.effects import (
     SendFrame,
     SendMessage,
     SendState,
+    StepCall,
+    TellMoved,
     WriteLine,
 )
 from trial.core.messages import Message
@@ -78,6 +81,7 @@ class TrialLoop:
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: lambda effect: self._write(effect.line),
+            TellMoved: self._tell_moved,
             RecordLine: lambda effect: self._write(self._recorder.line(effect.kind, effect.fields)),
             OpenRecording: self._open_recording,
             CloseRecording: lambda _: self._recorder.close(),
@@ -85,6 +89,11 @@ class TrialLoop:
             Log: lambda effect: log.log(effect.level, effect.text),
             LogAgentError: self._log_agent_error,
         }
+
+    @property
+    def callback_runs(self) -> bool:
+        """A callback of the agent has not returned, and may never."""
+        return self._calls.callbacks is not None and self._calls.callbacks.busy
 
     def begin(self, agent_ready: Awaitable[bool]) -> asyncio.Future[None]:
         """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
@@ -125,6 +134,7 @@ class TrialLoop:
             self._apply(self.core.already_played(answers))
         elif await agent_ready:
             recorded = await self._recorder.recorded()
+            self._find_callbacks()
             self._apply(self.core.start(self._agent.action_space, recorded, self._loop.time()))
         else:
             self._apply(self.core.agent_failed(self._loop.time()))
@@ -145,10 +155,13 @@ class TrialLoop:
             self._done.set_exception(error)
 
     def _called(self, call: Call, result: Any, error: Exception | None) -> None:
+        if not isinstance(call, StepCall):
+            self._write_callbacks()  # before the episode's end, with which its recording may be closed
         if error is not None:
             self._do(self.core.call_failed, call, error)
         else:
             self._do(self.core.call_returned, call, result)
+        self._write_callbacks()
 
     # ---- effects
 
@@ -164,12 +177,49 @@ class TrialLoop:
             self.ready.set()
         if core.done and not self._done.done():
             self._done.set_result(None)
+            if self._calls.callbacks:
+                self._calls.callbacks.close()
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._do, core.advance)
 
     def _call(self, call: Call) -> None:
         self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
+
+    def _find_callbacks(self) -> None:
+        """The agent has started: see which callbacks it has."""
+        settings, loop = self._settings, self._loop
+        found = self._agent.callbacks
+        if not found:
+            return
+        self.core.callbacks = True
+        self._calls.callbacks = Callbacks(
+            found,
+            About(self.core.id, self.core.step, settings.group),
+            lambda: self._agent.env,
+            seconds=settings.trial.callback_seconds,
+            stamp=self._recorder.stamp,
+            failed=lambda name, error: log.error(
+                "the callback %s failed\n%s", name, report(error, settings.agent_dir, settings.user_id)
+            ),
+            late=lambda: _soon(loop, self._write_callbacks),
+        )
+
+    def _write_callbacks(self) -> None:
+        """Write what callbacks have recorded, if a recording is open."""
+        if self._calls.callbacks and self._recorder.is_open:
+            for line in self._calls.callbacks.take():
+                self._write(line)
+
+    def _tell_moved(self, effect: TellMoved) -> None:
+        """On the agent's thread, between two calls, so that the callback sees the environment at rest."""
+        callbacks = self._calls.callbacks
+        if callbacks:
+            self._worker.submit(
+                lambda: callbacks.player_moved(effect.callback, callbacks.about.humans[0]),
+                self._settings.step_seconds,
+                lambda *_: self._write_callbacks(),
+            )
 
     def _send_state(self, effect: SendState) -> None:
         connection: Any = effect.connection
@@ -208,3 +258,9 @@ class TrialLoop:
         else:
             self._logged.add(text)
             log.error("the agent failed\n%s", text)
+
+
+def _soon(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
+    """Call it on the event loop, from another thread, unless the loop has ended."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(function)

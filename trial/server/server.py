@@ -118,7 +118,7 @@ class Server:
     @property
     def stuck(self) -> bool:
         """The researcher's code is still running and may never return."""
-        return self._worker.busy
+        return self._worker.busy or (self._trial is not None and self._trial.callback_runs)
 
     async def _close(self, reason: str) -> None:
         for task in self._tasks:

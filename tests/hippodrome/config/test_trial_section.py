@@ -22,7 +22,9 @@ ODD = st.sampled_from(
     [None, "", "x", " 3 ", "0.5", True, [], {}, ["up"], {"left": True}, float("nan"), float("inf"), 10**400]
 )
 KEYS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize"), NUMBERS),
+    **dict.fromkeys(
+        ("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize", "callbackSeconds"), NUMBERS
+    ),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
     **dict.fromkeys(
         (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS

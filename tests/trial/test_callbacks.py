@@ -1,0 +1,385 @@
+"""Callbacks of the agent: when they are called, what stands in the recording, and that none of them ends the game."""
+
+import asyncio
+import dataclasses
+import json
+import logging
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from trial.agent.agent import AgentAdapter
+from trial.agent.callbacks import MOST_VALUES, NAMES, About, Callbacks, Session, listening
+from trial.recordings import recording
+
+
+def made(agent, seconds=5.0, **more):
+    """The callbacks of an agent, and a list of what raised."""
+    raised = []
+    callbacks = Callbacks(
+        listening(agent),
+        About("trial-1", "3", 1),
+        lambda: "the environment",
+        seconds=seconds,
+        stamp=dict,
+        failed=lambda name, error: raised.append((name, error)),
+        **more,
+    )
+    return callbacks, raised
+
+
+def lines(callbacks):
+    return [json.loads(line) for line in callbacks.take()]
+
+
+def play(callbacks, steps=2, why="terminated"):
+    callbacks.session_begins()
+    callbacks.episode_began(4, {"player_0": "first"}, {"player_0": {}})
+    for step in range(1, steps + 1):
+        callbacks.stepped({"player_0": 2}, {"player_0": 1.5}, {"player_0": step}, {"player_0": {"t": step}})
+    callbacks.episode_ended(why)
+    callbacks.session_ended()
+
+
+def wait_for(condition):
+    until = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+class Noting:
+    def __init__(self):
+        self.sessions = []
+
+    def on_session_start(self, session):
+        self.sessions.append(("start", session))
+
+    def on_episode_start(self, session):
+        self.sessions.append(("episode", session))
+
+    def on_tick(self, session):
+        self.sessions.append(("tick", session))
+
+    def on_episode_end(self, session):
+        self.sessions.append(("over", session))
+
+    def on_session_end(self, session):
+        self.sessions.append(("end", session))
+
+
+def test_callbacks_are_told_how_the_session_stands():
+    agent = Noting()
+    callbacks, raised = made(agent)
+    play(callbacks)
+    assert [name for name, _ in agent.sessions] == ["start", "episode", "tick", "tick", "over", "end"]
+    tick = agent.sessions[2][1]
+    assert (tick.trial, tick.step, tick.group, tick.players, tick.humans) == (
+        "trial-1",
+        "3",
+        1,
+        ("player_0",),
+        ("player_0",),
+    )
+    assert (tick.episode, tick.ticks, tick.actions, tick.rewards) == (4, 1, {"player_0": 2}, {"player_0": 1.5})
+    assert (tick.observations, tick.infos) == ({"player_0": 1}, {"player_0": {"t": 1}})
+    assert (tick.scores, tick.why, tick.env) == ({"player_0": 1.5}, None, "the environment")
+    over = agent.sessions[4][1]
+    assert (over.ticks, over.scores, over.why) == (2, {"player_0": 3.0}, "terminated")
+    assert not raised
+    assert not lines(callbacks), "what returns nothing leaves no line"
+    callbacks.close()
+
+
+def test_what_they_return_and_record_becomes_lines():
+    class Agent:
+        def on_tick(self, session):
+            session.record("lean", session.ticks / 2)
+            return {"seen": session.observations["player_0"]}
+
+    callbacks, _ = made(Agent())
+    play(callbacks, steps=1)
+    assert lines(callbacks) == [
+        {"kind": "callback", "episode": 4, "step": 1, "name": "lean", "callback": "on_tick", "value": 0.5},
+        {"kind": "callback", "episode": 4, "step": 1, "name": "on_tick", "callback": "on_tick", "value": {"seen": 1}},
+    ]
+    callbacks.close()
+
+
+def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
+    class Agent:
+        def on_feedback(self, session, player, word):
+            return [player, word]
+
+        def on_join(self, session, player):
+            return player
+
+        on_leave = on_return = on_join
+
+    callbacks, _ = made(Agent())
+    callbacks.fed_back("player_0", "good")
+    for name in ("on_join", "on_leave", "on_return"):
+        callbacks.player_moved(name, "player_0")
+    assert [(line["name"], line["value"]) for line in lines(callbacks)] == [
+        ("on_feedback", ["player_0", "good"]),
+        ("on_join", "player_0"),
+        ("on_leave", "player_0"),
+        ("on_return", "player_0"),
+    ]
+    callbacks.close()
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), SystemExit(3), KeyboardInterrupt()])
+def test_a_callback_that_raises_is_told_once_and_called_again(error):
+    calls = []
+
+    class Agent:
+        def on_tick(self, session):
+            calls.append(session.ticks)
+            raise error
+
+    callbacks, raised = made(Agent())
+    play(callbacks, steps=3)
+    assert calls == [1, 2, 3]
+    assert raised == [("on_tick", error)]
+    (line,) = lines(callbacks)
+    assert (line["name"], line["step"]) == ("on_tick", 1)
+    assert line["error"].startswith(type(error).__name__)
+    callbacks.close()
+
+
+def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(caplog):
+    go = threading.Event()
+    came = threading.Event()
+
+    class Agent:
+        def on_tick(self, session):
+            if session.ticks == 1:
+                go.wait(20)
+            return session.ticks
+
+    callbacks, _ = made(Agent(), seconds=0.05, late=came.set)
+    callbacks.episode_began(1, {}, {})
+    with caplog.at_level(logging.WARNING, "trial"):
+        began = time.monotonic()
+        for _ in range(5):
+            callbacks.stepped({}, {}, {}, {})
+        assert time.monotonic() - began < 2
+    assert len([r for r in caplog.records if "on_tick has not returned within callbackSeconds" in r.message]) == 1
+    assert callbacks.busy
+    assert not lines(callbacks)
+    go.set()
+    assert came.wait(10), "lines that come late are announced"
+    assert [(line["step"], line.get("value"), line.get("skipped")) for line in lines(callbacks)] == [
+        (1, 1, None),
+        (1, None, 4),
+    ]
+    callbacks.stepped({}, {}, {}, {})
+    assert [(line["step"], line["value"]) for line in lines(callbacks)] == [(6, 6)]
+    callbacks.close()
+
+
+def test_what_is_recorded_is_bounded():
+    class Agent:
+        def on_tick(self, session):
+            session.record("small", 1)
+            session.record("large", "x" * recording.MAX_EXTRA_BYTES)
+            session.record("n" * 1_000, float("nan"))
+            session.record("object", object)
+            for _ in range(2 * MOST_VALUES):
+                session.record("many", 0)
+
+    callbacks, raised = made(Agent())
+    callbacks.stepped({}, {}, {}, {})
+    found = lines(callbacks)
+    assert not raised
+    assert len(found) == MOST_VALUES
+    assert found[0]["value"] == 1
+    assert found[1]["value"] == {"tooLarge": recording.MAX_EXTRA_BYTES + 2}
+    assert len(found[2]["name"]) == 200
+    assert found[2]["value"] is None
+    assert found[3]["value"] == "<class 'object'>"
+    callbacks.close()
+
+
+def test_what_an_earlier_server_recorded_is_not_recorded_again():
+    seen = []
+
+    class Agent:
+        def on_tick(self, session):
+            session.record("a", 1)
+            seen.append(session.replaying)
+            return 2
+
+    callbacks, _ = made(Agent())
+    callbacks.replaying = True
+    callbacks.stepped({}, {}, {}, {})
+    callbacks.replaying = False
+    callbacks.stepped({}, {}, {}, {})
+    assert seen == [True, False]
+    assert [line["step"] for line in lines(callbacks)] == [2, 2]
+    callbacks.close()
+
+
+def test_an_agent_without_callbacks_has_none():
+    assert not listening(object())
+    callbacks, _ = made(object())
+    assert not callbacks
+    play(callbacks)
+    assert not callbacks.busy
+
+
+# ---- on a real server
+
+CALLBACKS = """
+import time
+from pathlib import Path
+
+def _all(self, session, *more):
+    pass
+
+class Agent(Agent):
+    on_session_start = lambda self, session: "begun"
+    on_session_end = lambda self, session: "ended"
+    on_episode_start = lambda self, session: session.episode
+    on_episode_end = lambda self, session: [session.why, session.scores]
+    on_join = lambda self, session, player: player
+    on_leave = on_return = on_join
+    on_feedback = lambda self, session, player, word: word
+    def on_tick(self, session):
+        session.record("t", session.env.t)
+"""
+
+TRIAL = {"maxEpisodes": 2, "startingFrameRate": 60, "maxFrameRate": 60, "ui": {"start": True, "good": True}}
+
+
+def values(found):
+    return [(line["name"], line["value"]) for line in found if line["kind"] == "callback" and line["name"] != "t"]
+
+
+def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
+    server = launch(grid(30) + CALLBACKS, TRIAL)
+
+    async def journey():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.say(command="good")
+            await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+
+    asyncio.run(journey())
+    assert server.wait() == 0
+    first, second = server.recordings().values()
+    assert values(first) == [
+        ("on_session_start", "begun"),
+        ("on_episode_start", 1),
+        ("on_join", "player_0"),
+        ("on_feedback", "good"),
+        ("on_leave", "player_0"),
+        ("on_return", "player_0"),
+        ("on_episode_end", ["terminated", {"player_0": 45.0}]),
+    ]
+    assert values(second) == [
+        ("on_episode_start", 2),
+        ("on_episode_end", ["terminated", {"player_0": 45.0}]),
+        ("on_session_end", "ended"),
+    ]
+    for found in (first, second):
+        assert [line["value"] for line in found if line.get("name") == "t"] == list(range(1, 31))
+        assert found[-1]["kind"] == "end"
+        steps = [(line["kind"], line["step"]) for line in found if line["kind"] == "step" or line.get("name") == "t"]
+        assert steps == [(kind, step) for step in range(1, 31) for kind in ("step", "callback")]
+
+
+def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, open_client):
+    agent = grid(20) + (
+        "\nimport time\nclass Agent(Agent):\n"
+        "    def on_tick(self, session):\n        raise ValueError('no such thing')\n"
+        "    def on_episode_end(self, session):\n        while True: time.sleep(1)\n"
+    )
+    server = launch(agent, {**TRIAL, "callbackSeconds": 0.05})
+
+    async def journey():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+
+    asyncio.run(journey())
+    assert server.wait() == 0
+    assert server.answer()["answers"]["outcome"] == "finished"
+    assert server.answer()["answers"]["frames"] == 40
+    said = server.said()
+    assert "agent.py:" in said
+    assert said.count("ValueError: no such thing") == 1
+    assert said.count("on_episode_end has not returned within callbackSeconds") == 1
+
+
+RESUMED = """
+class Agent(Agent):
+    def on_session_start(self, session):
+        self.seen = []
+    def on_tick(self, session):
+        self.seen.append(session.ticks)
+        return len(self.seen)
+"""
+
+
+def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid, open_client):
+    deterministic = grid(60) + RESUMED
+
+    async def some(server):
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: len(client.frames) > 10)
+
+    async def rest(server):
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+
+    trial = {**TRIAL, "maxEpisodes": 1}
+    first = launch(deterministic, trial, SERVER="a-1")
+    asyncio.run(some(first))
+    first.terminate()
+    first.wait()
+    second = launch(deterministic, trial, SERVER="a-2")
+    asyncio.run(rest(second))
+    assert second.wait() == 0
+    (early,), (late,) = (list(second.recordings(server=name).values()) for name in ("a-1", "a-2"))
+    recorded = [[line["value"] for line in found if line["kind"] == "callback"] for found in (early, late)]
+    assert recorded[0]
+    assert recorded[0] + recorded[1] == list(range(1, 61))
+
+
+def test_the_callbacks_of_the_documentation_run(tmp_path):
+    text = (Path(__file__).parents[2] / "docs/callbacks.md").read_text()
+    (tmp_path / "agent.py").write_text(text.split("```python\n")[1].split("```")[0])
+    agent = AgentAdapter(tmp_path, "CartPole-v1", None)
+    agent.start()
+    callbacks, raised = made(agent._agent)
+    first, info, _ = agent.reset(1)
+    callbacks.episode_began(1, {"player_0": first}, {"player_0": info})
+    result = agent.step(1)
+    callbacks.stepped({"player_0": 1}, {"player_0": 1.0}, {"player_0": result.observation}, {})
+    callbacks.episode_ended("terminated")
+    assert not raised
+    assert [line["name"] for line in lines(callbacks)] == ["furthest", "on_episode_end"]
+    for name in NAMES:
+        assert f"`{name}(session" in text
+    for field in dataclasses.fields(Session):
+        assert f"`{field.name}" in text
+    callbacks.close()

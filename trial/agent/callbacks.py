@@ -1,0 +1,381 @@
+"""Callbacks: methods of the researcher's agent that are told what happens in a session, and may record values.
+
+They run on a thread of their own, one after another. The agent's thread waits for each at most `callbackSeconds`, so
+that a quick callback sees the environment at rest. A callback that takes longer goes on by itself. The game goes on
+too, and callbacks are skipped until it has returned. What they raise never ends the game.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from trial.recordings import recording
+from trial.recordings.recorded_values import text_of
+
+log = logging.getLogger("trial")
+
+SESSION_START = "on_session_start"
+SESSION_END = "on_session_end"
+EPISODE_START = "on_episode_start"
+EPISODE_END = "on_episode_end"
+TICK = "on_tick"
+FEEDBACK = "on_feedback"
+JOIN = "on_join"
+LEAVE = "on_leave"
+RETURN = "on_return"
+LOBBY_TIMEOUT = "on_lobby_timeout"
+NAMES = (
+    SESSION_START,
+    SESSION_END,
+    EPISODE_START,
+    EPISODE_END,
+    TICK,
+    FEEDBACK,
+    JOIN,
+    LEAVE,
+    RETURN,
+    LOBBY_TIMEOUT,
+)
+
+MOST_VALUES = 1_000
+"""Values that one call of a callback may record."""
+LONGEST_NAME = 200
+"""Characters of the name of a recorded value."""
+_ERROR = 2_000  # characters of an error in the recording
+_WAITING = 100_000  # finished lines that wait to be written
+
+Record = Callable[[str, Any], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """How the session stands when a callback is called. Mappings are by player.
+
+    `env` is the environment itself: it is at rest for `callbackSeconds`, and then the game goes on with it.
+    """
+
+    trial: str
+    step: str
+    """The key of the game step in config.yml."""
+    group: int | None
+    players: tuple[str, ...]
+    humans: tuple[str, ...]
+    """Those of the players whom participants play."""
+    episode: int
+    ticks: int
+    """Steps that were taken in the episode."""
+    actions: Mapping[str, Any]
+    """Of the last step, by number; empty before the first."""
+    rewards: Mapping[str, float]
+    observations: Mapping[str, Any]
+    infos: Mapping[str, Any]
+    scores: Mapping[str, float]
+    """Sums of the episode's rewards."""
+    why: str | None
+    """Why the episode ended: terminated, truncated, reset, stopped or failed; None while it goes on."""
+    replaying: bool
+    """An earlier server's steps are taken again. What is recorded now stands in its recording already."""
+    env: Any
+    record: Record
+    """`record(name, value)`: the value stands in the recording, under this name."""
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What stays the same in a trial."""
+
+    trial: str
+    step: str
+    group: int | None = None
+    players: tuple[str, ...] = ("player_0",)
+    humans: tuple[str, ...] = ("player_0",)
+
+
+@dataclass(slots=True)
+class _Standing:
+    """What callbacks are told, as it changes."""
+
+    episode: int = 1
+    ticks: int = 0
+    why: str | None = None
+    actions: Mapping[str, Any] = field(default_factory=dict)
+    rewards: Mapping[str, float] = field(default_factory=dict)
+    observations: Mapping[str, Any] = field(default_factory=dict)
+    infos: Mapping[str, Any] = field(default_factory=dict)
+    scores: dict[str, float] = field(default_factory=dict)
+
+
+def listening(agent: Any) -> dict[str, Callable[..., Any]]:
+    """The callbacks that an agent (an object or a module) has."""
+    found = {name: getattr(agent, name, None) for name in NAMES}
+    return {name: method for name, method in found.items() if callable(method)}
+
+
+class Callbacks:
+    """Calls an agent's callbacks. All methods are for the agent's thread, but `take` and `close`.
+
+    `stamp` returns the first fields of each line. `failed` is told the name and the error of a callback that raises,
+    `late` that lines have come for which the agent's thread did not wait; both on the callbacks' thread.
+    """
+
+    def __init__(
+        self,
+        found: Mapping[str, Callable[..., Any]],
+        about: About,
+        env: Callable[[], Any],
+        *,
+        seconds: float,
+        stamp: Callable[[], dict[str, Any]],
+        failed: Callable[[str, BaseException], None],
+        late: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._found = found
+        self.about = about
+        self._env = env
+        self._seconds = seconds
+        self._late = late
+        self._notes = _Notes(stamp, failed)
+        self._now = _Standing()
+        self._started = False
+        self._thread: _Thread | None = None
+        self.replaying = False
+
+    def __bool__(self) -> bool:
+        return bool(self._found)
+
+    @property
+    def busy(self) -> bool:
+        """A callback has not returned yet (it may never)."""
+        return self._thread is not None and self._thread.running is not None
+
+    # ---- what happens
+
+    def session_begins(self) -> None:
+        """The session begins, or goes on on this server. Only the first call counts."""
+        if not self._started:
+            self._started = True
+            self._call(SESSION_START)
+
+    def episode_began(self, episode: int, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> None:
+        """The environment has been reset."""
+        self._now = _Standing(episode, observations=observations, infos=infos)
+        self._now.scores = dict.fromkeys(self.about.players, 0.0)
+        self._call(EPISODE_START)
+
+    def stepped(
+        self,
+        actions: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        observations: Mapping[str, Any],
+        infos: Mapping[str, Any],
+    ) -> None:
+        """A step has been taken."""
+        now = self._now
+        now.ticks += 1
+        now.actions, now.rewards, now.observations, now.infos = actions, rewards, observations, infos
+        for player, reward in rewards.items():
+            now.scores[player] = now.scores.get(player, 0.0) + reward
+        self._call(TICK)
+
+    def fed_back(self, player: str, word: str) -> None:
+        """A participant has sent a word of feedback, and the agent has heard it."""
+        self._call(FEEDBACK, player, word)
+
+    def episode_ended(self, why: str) -> None:
+        """The episode is over."""
+        self._now.why = why
+        self._call(EPISODE_END)
+
+    def session_ended(self) -> None:
+        """The trial is over."""
+        self._call(SESSION_END)
+
+    def player_moved(self, name: str, player: str) -> None:
+        """A participant has come, gone or returned: `on_join`, `on_leave`, `on_return`."""
+        self._call(name, player)
+
+    # ---- lines
+
+    def take(self) -> list[bytes]:
+        """The lines of the recording that have come since the last call. For any thread."""
+        return self._notes.take()
+
+    def close(self) -> None:
+        """End the thread after its present callback. For any thread."""
+        if self._thread is not None:
+            self._thread.close()
+            running = self._thread.running
+            if running is not None:
+                log.warning("%s has not returned; %d callbacks were skipped", running, self._notes.skipped)
+
+    # ---- calls
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        method = self._found.get(name)
+        if method is None:
+            return
+        if self._thread is None:
+            self._thread = _Thread(self._late)
+        running = self._thread.running
+        if running is not None:
+            self._notes.skipped += 1
+            if self._notes.once("late"):
+                text = "%s has not returned within callbackSeconds (%g s); callbacks are skipped until it has"
+                log.warning(text, running, self._seconds)
+            return
+        call = _Call(self._notes, name, self._now.episode, self._now.ticks)
+        session = self._session(call)
+        self._thread.run(name, lambda: call.run(method, session, arguments), self._seconds)
+
+    def _session(self, call: _Call) -> Session:
+        about, now = self.about, self._now
+        return Session(
+            trial=about.trial,
+            step=about.step,
+            group=about.group,
+            players=about.players,
+            humans=about.humans,
+            episode=now.episode,
+            ticks=now.ticks,
+            actions=now.actions,
+            rewards=now.rewards,
+            observations=now.observations,
+            infos=now.infos,
+            scores=dict(now.scores),
+            why=now.why,
+            replaying=self.replaying,
+            env=self._env(),
+            record=_nowhere if self.replaying else call.record,
+        )
+
+
+class _Notes:
+    """The lines that callbacks leave, and what is said once about them."""
+
+    def __init__(self, stamp: Callable[[], dict[str, Any]], failed: Callable[[str, BaseException], None]) -> None:
+        self._stamp = stamp
+        self._failed = failed
+        self._lines: deque[bytes] = deque(maxlen=_WAITING)
+        self._said: set[str] = set()
+        self.skipped = 0
+
+    def take(self) -> list[bytes]:
+        taken = []
+        while True:
+            try:
+                taken.append(self._lines.popleft())
+            except IndexError:
+                return taken
+
+    def add(self, **fields: Any) -> None:
+        self._lines.append(recording.line("callback", **self._stamp(), **fields))
+
+    def once(self, text: str) -> bool:
+        """Whether this is the first time; of very many different texts, only so many are first ones."""
+        first = text not in self._said and len(self._said) < MOST_VALUES
+        if first:
+            self._said.add(text)
+        return first
+
+    def failed(self, name: str, error: BaseException, **where: int) -> None:
+        """A callback raised. The log and the recording have each error once."""
+        words = " ".join(f"{type(error).__name__}: {_words(error)}".split())[:_ERROR]
+        if self.once(f"{name} {words}"):
+            self.add(**where, name=name, callback=name, error=words)
+            self._failed(name, error)
+
+
+class _Call:
+    """One call of a callback, and what it records."""
+
+    def __init__(self, notes: _Notes, name: str, episode: int, step: int) -> None:
+        self._notes = notes
+        self._name = name
+        self._where = {"episode": episode, "step": step}
+        self._left = recording.MAX_EXTRA_BYTES
+        self._values = 0
+
+    def run(self, method: Callable[..., Any], session: Session, arguments: tuple[Any, ...]) -> None:
+        notes, name = self._notes, self._name
+        try:
+            value = method(session, *arguments)
+            if value is not None:
+                session.record(name, value)
+        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+            notes.failed(name, error, **self._where)
+        skipped, notes.skipped = notes.skipped, 0
+        if skipped:
+            notes.add(**self._where, name=name, callback=name, skipped=skipped)
+
+    def record(self, name: str, value: Any) -> None:
+        """A value for the recording. One that does not fit with those before it is replaced by its size."""
+        notes = self._notes
+        self._values += 1
+        if self._values > MOST_VALUES:
+            if notes.once(f"most {self._name}"):
+                log.warning("one call of %s may record %d values; it records more", self._name, MOST_VALUES)
+            return
+        name = text_of(name)[:LONGEST_NAME]
+        kept, too_large = recording.bounded_extra({name: value}, self._left)
+        size = too_large.get(name)
+        if size is None:
+            self._left -= recording.size_of(kept[name])
+        elif notes.once(f"large {name}"):
+            text = "what %s records as %r is too large for the recording (%d bytes); its size is recorded instead"
+            log.warning(text, self._name, name, size)
+        notes.add(**self._where, name=name, callback=self._name, value=kept[name])
+
+
+@dataclass(slots=True, eq=False)
+class _Job:
+    work: Callable[[], None]
+    returned: threading.Event
+    awaited: bool = True
+
+
+class _Thread:
+    """Runs one callback at a time. The thread is a daemon: a callback that hangs cannot keep the process alive."""
+
+    def __init__(self, late: Callable[[], None]) -> None:
+        self._late = late
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self.running: str | None = None
+        """The name of the callback that has not returned."""
+        threading.Thread(target=self._run, name="callbacks", daemon=True).start()
+
+    def run(self, name: str, work: Callable[[], None], seconds: float) -> None:
+        """Do the work, and wait for it at most so long. Nothing else may be running."""
+        job = _Job(work, threading.Event())
+        self.running = name
+        self._jobs.put(job)
+        job.awaited = job.returned.wait(seconds)
+
+    def close(self) -> None:
+        self._jobs.put(None)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job.work()
+            finally:
+                self.running = None
+                job.returned.set()
+            if not job.awaited:
+                self._late()
+
+
+def _nowhere(name: str, value: Any) -> None:
+    """What is recorded while an earlier server's steps are taken again."""
+
+
+def _words(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # noqa: BLE001 - the researcher's errors may raise anything
+        return ""
