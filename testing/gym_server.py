@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 from testing.preloaded import interruptible
 
 ROOT = Path(__file__).resolve().parent.parent
-SECONDS = 20.0  # that an answer may take
+SECONDS = 60.0  # that an answer may take: environments on a participant's server give way to all other processes
 
 
 @dataclass(frozen=True, slots=True)

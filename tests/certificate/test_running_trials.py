@@ -17,9 +17,7 @@ from cryptography import x509
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PRIVKEY
 
 ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = (
-    "import sys, trial.listener; trial.listener.RELOAD_SECONDS = 0.1; from trial.__main__ import main; sys.exit(main())"
-)
+PROGRAM = "import sys, trial.server.listener; trial.server.listener.RELOAD_SECONDS = 0.1; from trial.__main__ import main; sys.exit(main())"
 AGENT = """
 class Agent:
     def start(self, game): pass

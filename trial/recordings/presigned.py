@@ -38,7 +38,10 @@ class StoreError(OSError):
 
 
 class PresignedStore:
-    """Implements `trial.store.Store`. `server` and `credential` are those that this process was started with."""
+    """Implements `trial.recordings.store.Store`.
+
+    `server` and `credential` are those that this process was started with.
+    """
 
     def __init__(self, url: str, server: str, credential: str, pause: Callable[[float], object] = time.sleep) -> None:
         self._url = url
