@@ -6,6 +6,8 @@ DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 # `plan` and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
+# A study's own packages, by its requirements.txt.
+PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
 DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
 TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# the same for TLS=1 and NAMES=
@@ -37,10 +39,12 @@ help: ## list these commands
 
 .PHONY: run
 run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
+	@$(PACKAGES)
 	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
+	@$(PACKAGES)
 	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
 # 8000, the default of `make run`, is no wish for this server: Gymie's port is 5000.
@@ -54,6 +58,7 @@ new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPL
 
 .PHONY: check
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
+	@$(PACKAGES)
 	@$(BIN)/python -m local.check "$(PROJECT)" $(ARGS)
 
 .PHONY: deploy

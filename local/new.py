@@ -79,11 +79,9 @@ def make_study(template: Template, folder: Path) -> str:
 
 def what_next(folder: Path) -> str:
     """The commands with which a new study is looked at, tried and changed."""
-    given, requirements = f"PROJECT={shlex.quote(str(folder))}", folder / "requirements.txt"
-    lines = ["Next:"]
-    if requirements.is_file():
-        lines.append(f"  .venv/bin/pip install -r {shlex.quote(str(requirements))}   installs what its agent imports")
-    lines += [
+    given = f"PROJECT={shlex.quote(str(folder))}"
+    lines = [
+        "Next:",
         f"  make run {given}     holds it on this machine; open the link and take part",
         f"  make check {given}   finds mistakes in what you change",
         f"  make try {given}     sends simulated participants through it",

@@ -143,14 +143,6 @@ def test_a_place_where_nothing_can_be_written_is_a_sentence(root: Path, tmp_path
         new.make_study(new.templates(root)["maze"], tmp_path / "file" / "mine")
 
 
-def test_packages_of_the_template_are_to_be_installed(root: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "mine"
-    new.make_study(new.templates(root)["maze"], folder)
-    assert f".venv/bin/pip install -r {folder}/requirements.txt" in new.what_next(folder)
-    (folder / "requirements.txt").unlink()
-    assert "pip install" not in new.what_next(folder)
-
-
 def test_a_template_whose_config_cannot_be_read_is_none(root: Path) -> None:
     (root / "examples" / "maze" / "config.yml").write_text("project:\n\tid: maze\n")
     shutil.copytree(root / "examples" / "maze", root / "examples" / "empty")

@@ -1,0 +1,123 @@
+"""A study's requirements.txt is installed by the commands for one machine: once for each content."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """A study that needs the package `grove`, which pip finds in the folder `wheels` and nowhere else."""
+    wheels, folder = tmp_path / "wheels", tmp_path / "study"
+    wheels.mkdir()
+    for version in ("1.0", "2.0"):
+        with zipfile.ZipFile(wheels / f"grove-{version}-py3-none-any.whl", "w") as wheel:
+            about = f"grove-{version}.dist-info"
+            wheel.writestr("grove.py", f"VERSION = {version!r}\n")
+            wheel.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: grove\nVersion: {version}\n")
+            wheel.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+            wheel.writestr(f"{about}/RECORD", "")
+    (folder / "steps").mkdir(parents=True)
+    (folder / "config.yml").write_text("project:\n  id: grove\n  steps: {1: hello}\n")
+    (folder / "agent.py").write_text("import grove\n")
+    (folder / "requirements.txt").write_text("grove\n")
+    (tmp_path / "image.txt").write_text("grove==1.0\n")
+    return folder
+
+
+def installing(study: Path) -> str:
+    """What the command says. pip installs into the folder `there`."""
+    place = study.parent
+    env = {
+        **os.environ,
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": str(place / "wheels"),
+        "PIP_TARGET": str(place / "there"),
+        "PIP_UPGRADE": "1",
+        "PYTHONPATH": str(ROOT),
+    }
+    ran = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "local.requirements",
+            study,
+            "--constraints",
+            place / "image.txt",
+            "--stamps",
+            place / "stamps",
+        ],
+        cwd=place,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return ran.stdout
+
+
+def installed(study: Path) -> str:
+    return (study.parent / "there" / "grove.py").read_text()
+
+
+def test_packages_are_installed_once(study: Path) -> None:
+    assert installing(study) == f"Installing what {study}/requirements.txt names (once) …\n"
+    assert "1.0" in installed(study), "the version of the servers' image"
+    assert installing(study) == ""
+
+
+def test_a_changed_file_is_installed_again(study: Path) -> None:
+    installing(study)
+    (study.parent / "image.txt").write_text("")
+    assert "Installing" in installing(study)
+    assert "2.0" in installed(study)
+
+
+def test_what_cannot_be_installed_is_said_each_time_and_the_command_ends_well(study: Path) -> None:
+    (study / "requirements.txt").write_text("a-package-that-is-nowhere\n")
+    for _ in range(2):
+        assert "Not everything that" in installing(study)
+
+
+def test_a_clone_of_hippo_gym_is_left_alone(study: Path) -> None:
+    """Its file names versions for Python 3.7."""
+    (study / "steps").rename(study / "StepFiles")
+    assert installing(study) == ""
+
+
+def test_a_study_that_cannot_be_read_is_left_to_the_next_command(study: Path) -> None:
+    (study / "config.yml").unlink()
+    assert installing(study) == ""
+
+
+def test_the_commands_for_one_machine_install(study: Path) -> None:
+    for command in ("run", "try", "check"):
+        said = subprocess.run(
+            ["make", "-n", command, f"PROJECT={study}"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        first, second = (line for line in said.splitlines() if "-m local" in line)
+        assert f'-m local.requirements "{study}" --constraints requirements/trial.txt' in first
+        assert f'"{study}"' in second
+
+
+def test_our_tests_come_before_a_package_of_this_name(tmp_path: Path) -> None:
+    """`slimevb` installs a package `tests`; a folder without a file of its own would come after it."""
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "__init__.py").touch()
+    found = subprocess.run(
+        [sys.executable, "-c", "import tests; print(tests.__file__)"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert Path(found.strip()) == ROOT / "tests" / "__init__.py"
