@@ -1,0 +1,96 @@
+"""Examples, played to the end by bots as participants would play them."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+from bots.bot import Bot
+from local.new import LEFT_OUT
+from local.rehearsal.logs import verify
+from local.rehearsal.study_process import ROOT, wait_until_gone
+from testing.held_study import HeldStudy
+from trial.recordings.recording import read
+
+EXAMPLES = ROOT / "examples"
+PATIENCE = 120.0  # seconds in which a bot must have passed everything
+
+PlayExample = Callable[..., "Played"]
+LoadModule = Callable[[str, str], ModuleType]
+
+
+@dataclass(frozen=True)
+class Played:
+    """What is left of a participant: the lines of each recording, and the game's own result."""
+
+    recordings: list[list[dict[str, Any]]]
+    result: Mapping[str, Any]
+
+    def steps(self) -> list[dict[str, Any]]:
+        """The steps of all episodes."""
+        return [line for lines in self.recordings for line in lines if line["kind"] == "step"]
+
+
+@pytest.fixture
+def play_example(tmp_path: Path) -> Iterator[PlayExample]:
+    """Let a bot pass a whole example: `play_example("tamer", maxEpisodes=1)`, where the rest are keys of `trial`.
+
+    Fails if the bot does not come to the end, or if an answer, a recording or a server is missing or left over.
+    """
+    held: list[HeldStudy] = []
+
+    def play(name: str, **trial: Any) -> Played:
+        folder = tmp_path / name
+        shutil.copytree(EXAMPLES / name, folder, ignore=LEFT_OUT)
+        config = yaml.safe_load((folder / "config.yml").read_text())
+        config["trial"] |= trial
+        (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
+        study = HeldStudy(folder, tmp_path / "run" / "data", log=tmp_path / "local.log")
+        held.append(study)
+        study.start()
+        bot = Bot(study.link, "ada", Random(name), play=0, patience=PATIENCE)
+        asyncio.run(asyncio.wait_for(bot.run(), PATIENCE))
+        account, project = bot.account, config["project"]["id"]
+        assert (account.errors, account.troubles, account.finished) == ([], [], True)
+        assert verify(study.data, project, [account]).missing == []
+        assert wait_until_gone(study.data).words() == []
+        assert study.interrupt()
+        files = sorted((study.data / project / "users" / "ada" / "trials").glob("*/*.gz"))
+        return Played([list(read(file.read_bytes())) for file in files], vars(account.plays[-1]))
+
+    yield play
+    for study in held:
+        study.clear()
+
+
+@pytest.fixture
+def load_module(monkeypatch: pytest.MonkeyPatch) -> Iterator[LoadModule]:
+    """A module of an example, `load_module("tamer", "agent")`. The modules beside it are forgotten afterwards."""
+    before = set(sys.modules)
+
+    def load(name: str, module: str) -> ModuleType:
+        folder = EXAMPLES / name
+        monkeypatch.syspath_prepend(str(folder))
+        spec = importlib.util.spec_from_file_location(module, folder / f"{module}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        loaded = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, module, loaded)
+        spec.loader.exec_module(loaded)
+        return loaded
+
+    yield load
+    for name, module in list(sys.modules.items()):
+        if name not in before and str(getattr(module, "__file__", "")).startswith(f"{EXAMPLES}/"):
+            del sys.modules[name]
