@@ -31,6 +31,7 @@ _LONGEST_ID = 100
 _FARTHEST = 1e6
 _DIGITS = 4  # a relative coordinate then names a tenth of a pixel of a picture 1,000 pixels wide
 _HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
+_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # images are called without it
 _FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
 
 CheckedObject = Mapping[str, Any]
@@ -279,7 +280,7 @@ def _text(value: Any) -> str:
 def _image(value: Any) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 200:
         raise Wrong("is no name of a file in the folder of assets")
-    return value
+    return _EXTENSION.sub("", value)
 
 
 def _frame(value: Any) -> str:

@@ -1,0 +1,253 @@
+"""The images of a project that its sprites show (docs/objects.md, "Images"): found, checked, and packed for a browser.
+
+Of a folder these files count: PNG, JPEG and WebP images, and beside an image a JSON file of the same name, its atlas.
+An image is called by its path below the folder, without its extension. SVG is not among them: it is a document that
+may name other files and hold scripts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+MOST_ASSETS = 500
+MOST_BYTES = 4 * 2**20
+"""Of one image with its atlas."""
+MOST_BYTES_IN_ALL = 20 * 2**20
+LONGEST_SIDE = 4096
+"""Pixels; some phones draw no larger images."""
+MOST_FRAMES = 2_000
+
+IMAGE = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)
+"""How the name of an image file ends."""
+_REFUSED = re.compile(r"\.(?:svgz?|gif|bmp|tiff?|avif|ico)$", re.IGNORECASE)
+_TYPES = {"PNG": "image/png", "JPEG": "image/jpeg", "WEBP": "image/webp"}
+_HEAD = struct.Struct("!I")
+
+Box = tuple[int, int, int, int]
+"""Left, top, width and height in an image, in pixels."""
+
+
+class AssetError(ValueError):
+    """A file that cannot be used; the words go on after its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Animation:
+    """Frames of an atlas that are shown one after the other."""
+
+    frames: tuple[str, ...]
+    rate: float
+    """Frames per second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asset:
+    """An image, with what its atlas says of it."""
+
+    name: str
+    image: bytes = field(repr=False)
+    size: tuple[int, int]
+    """Width and height in pixels."""
+    packed: bytes = field(repr=False)
+    """What a browser gets: the length of a JSON object (4 bytes), that object, the image."""
+    hash: str
+    """Of `packed`; the same bytes have the same hash."""
+    frames: Mapping[str, Box] = field(default_factory=dict)
+    animations: Mapping[str, Animation] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Assets:
+    """The images of a folder by name, and what is wrong with its files, in sentences for the researcher."""
+
+    by_name: Mapping[str, Asset] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+
+    def table(self) -> list[dict[str, Any]]:
+        """What a client is told of them: it asks for those whose hash it does not have."""
+        return [{"name": each.name, "bytes": len(each.packed), "hash": each.hash} for each in self.by_name.values()]
+
+
+def load(project: Path, folder: str) -> Assets:
+    """Read the images of a project's folder. Never raises: what cannot be used is named in `problems`."""
+    place = project / folder
+    if not place.is_dir():
+        return Assets()
+    found: dict[str, Asset] = {}
+    problems: list[str] = []
+    total = 0
+    for path in _files(place):
+        name = path.relative_to(place).with_suffix("").as_posix()
+        shown = path.relative_to(project).as_posix()
+        try:
+            if _REFUSED.search(path.name):
+                raise AssetError("is no PNG, JPEG or WebP image; sprites show only these")
+            if not IMAGE.search(path.name):
+                continue
+            if name in found:
+                raise AssetError("has the name of another image, apart from its extension")
+            asset = read(path, name)
+            total += len(asset.packed)
+            if len(found) == MOST_ASSETS or total > MOST_BYTES_IN_ALL:
+                problems.append(
+                    f"{folder}: more than {MOST_ASSETS} images or {MOST_BYTES_IN_ALL >> 20} MB; "
+                    f"{shown} and all after it are not shown"
+                )
+                break
+            found[name] = asset
+        except AssetError as error:
+            problems.append(f"{shown} {error}")
+    return Assets(found, tuple(problems))
+
+
+def _files(place: Path) -> Iterator[Path]:
+    """The files below a folder, in the order of their names. Links and hidden files are none of them."""
+    for path in sorted(place.iterdir()):
+        if path.name.startswith(".") or path.is_symlink():
+            continue
+        if path.is_dir():
+            yield from _files(path)
+        elif path.is_file():
+            yield path
+
+
+def read(path: Path, name: str) -> Asset:
+    """Read and check an image and the atlas beside it. Raises AssetError."""
+    image = _bytes(path)
+    kind, size = _kind(image)
+    frames: dict[str, Box] = {}
+    animations: dict[str, Animation] = {}
+    atlas = path.with_suffix(".json")
+    if atlas.is_file() and not atlas.is_symlink():
+        try:
+            frames, animations = read_atlas(json.loads(_bytes(atlas)), size)
+        except (ValueError, RecursionError) as error:
+            words = str(error) if isinstance(error, AssetError) else "is no JSON"
+            raise AssetError(f"cannot be shown: {atlas.name} beside it {words}") from None
+    about: dict[str, Any] = {"type": kind}
+    if frames:
+        about["frames"] = frames
+    if animations:
+        about["animations"] = {key: [list(each.frames), each.rate] for key, each in animations.items()}
+    head = json.dumps(about, separators=(",", ":"), ensure_ascii=False).encode()
+    packed = _HEAD.pack(len(head)) + head + image
+    return Asset(name, image, size, packed, hashlib.sha256(packed).hexdigest()[:32], frames, animations)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise AssetError(f"has {path.stat().st_size >> 20} MB; a file has at most {MOST_BYTES >> 20} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise AssetError(f"cannot be read ({type(error).__name__})") from None
+
+
+def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
+    """The media type and the size of an image. Raises AssetError."""
+    import io  # noqa: PLC0415 - as below
+    import warnings  # noqa: PLC0415
+
+    from PIL import Image  # noqa: PLC0415 - only games with a scene need it
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a very large image is refused below
+            with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
+                kind, size = _TYPES[str(picture.format)], picture.size
+    except Exception:  # noqa: BLE001 - of a broken file Pillow raises many kinds
+        raise AssetError("is no PNG, JPEG or WebP image, or is broken") from None
+    if max(size) > LONGEST_SIDE:
+        raise AssetError(f"has {size[0]} x {size[1]} pixels; at most {LONGEST_SIDE} x {LONGEST_SIDE} are shown")
+    return kind, size
+
+
+# ---- atlases
+
+
+def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[str, Animation]]:
+    """The frames and animations of an atlas: TexturePacker's and Phaser's JSON, or frames of one size.
+
+    Raises AssetError. https://docs.phaser.io/phaser/concepts/textures#atlas names the forms.
+    """
+    if not isinstance(value, dict):
+        raise AssetError("is no atlas")
+    frames = _grid(value, size) if "frameWidth" in value else dict(_listed(value, size))
+    if len(frames) > MOST_FRAMES:
+        raise AssetError(f"has {len(frames)} frames; at most {MOST_FRAMES}")
+    animations = value.get("animations", {})
+    if not isinstance(animations, dict):
+        raise AssetError("has animations that are no map")
+    return frames, {str(key): _animation(str(key), each, frames) for key, each in animations.items()}
+
+
+def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
+    """Frames of one size, counted from 0, row by row."""
+    width, height = value.get("frameWidth"), value.get("frameHeight", value.get("frameWidth"))
+    if not _is_whole(width, 1) or not _is_whole(height, 1):
+        raise AssetError("has a frameWidth or frameHeight that is no whole number of pixels")
+    columns, rows = size[0] // width, size[1] // height
+    if columns * rows > MOST_FRAMES:
+        raise AssetError(f"has {columns * rows} frames; at most {MOST_FRAMES}")
+    return {
+        str(row * columns + column): (column * width, row * height, width, height)
+        for row in range(rows)
+        for column in range(columns)
+    }
+
+
+def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[str, Box]]:
+    frames = value.get("frames")
+    textures = value.get("textures")
+    if frames is None and isinstance(textures, list) and len(textures) == 1 and isinstance(textures[0], dict):
+        frames = textures[0].get("frames")  # Phaser's multiatlas with one image
+    pairs: list[tuple[Any, Any]]
+    if isinstance(frames, dict):
+        pairs = list(frames.items())
+    elif isinstance(frames, list):
+        pairs = [(each.get("filename") if isinstance(each, dict) else None, each) for each in frames]
+    else:
+        raise AssetError("has no frames")
+    for name, each in pairs[: MOST_FRAMES + 1]:
+        box = each.get("frame") if isinstance(each, dict) else None
+        if not isinstance(name, str) or not isinstance(box, dict):
+            raise AssetError("has a frame without a name or a place")
+        if each.get("rotated"):
+            raise AssetError(f"has the frame {name[:40]!r} turned; pack it without rotation")
+        numbers = tuple(box.get(key) for key in ("x", "y", "w", "h"))
+        left, top, width, height = numbers
+        inside = all(_is_whole(number, 0) for number in numbers) and _inside(left, width, size[0])
+        if not inside or not _inside(top, height, size[1]):
+            raise AssetError(f"has the frame {name[:40]!r} outside of the image")
+        yield name, (left, top, width, height)
+
+
+def _inside(start: int, length: int, whole: int) -> bool:
+    return length > 0 and start + length <= whole
+
+
+def _is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= LONGEST_SIDE
+
+
+def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> Animation:
+    if isinstance(value, list):
+        value = {"frames": value}
+    listed = value.get("frames") if isinstance(value, dict) else None
+    if not isinstance(listed, list) or not 0 < len(listed) <= MOST_FRAMES:
+        raise AssetError(f"has the animation {name[:40]!r} without frames")
+    missing = next((str(each) for each in listed if str(each) not in frames), None)
+    if missing is not None:
+        raise AssetError(f"has the animation {name[:40]!r} with a frame {missing[:40]!r} that is not there")
+    rate = value.get("frameRate", 8)
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not math.isfinite(rate) or not 0 < rate <= 240:
+        raise AssetError(f"has the animation {name[:40]!r} with a frameRate that is no number up to 240")
+    return Animation(tuple(str(each) for each in listed), rate)
