@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 MOST_ASSETS = 500
 MOST_BYTES = 4 * 2**20
@@ -222,19 +222,17 @@ def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[s
             raise AssetError("has a frame without a name or a place")
         if each.get("rotated"):
             raise AssetError(f"has the frame {name[:40]!r} turned; pack it without rotation")
-        numbers = tuple(box.get(key) for key in ("x", "y", "w", "h"))
-        left, top, width, height = numbers
-        inside = all(_is_whole(number, 0) for number in numbers) and _inside(left, width, size[0])
-        if not inside or not _inside(top, height, size[1]):
+        left, top, width, height = (box[key] if _is_whole(box.get(key), 0) else -1 for key in ("x", "y", "w", "h"))
+        if not (_inside(left, width, size[0]) and _inside(top, height, size[1])):
             raise AssetError(f"has the frame {name[:40]!r} outside of the image")
         yield name, (left, top, width, height)
 
 
 def _inside(start: int, length: int, whole: int) -> bool:
-    return length > 0 and start + length <= whole
+    return start >= 0 and length > 0 and start + length <= whole
 
 
-def _is_whole(value: Any, least: int) -> bool:
+def _is_whole(value: Any, least: int) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= LONGEST_SIDE
 
 
