@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -49,7 +50,7 @@ class Key:
     """JSON Schema of the value, for editors."""
     each: Check | None = None
     """If the value is a list: the check of each item."""
-    section: type[Ui] | None = None
+    section: type[Ui | Scene] | None = None
     """If the value is a section of its own: the class of its keys."""
 
 
@@ -107,6 +108,52 @@ class Ui:
 
 def _usual_ui() -> Ui:
     return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)
+
+
+_COLOR = re.compile(r"#[0-9a-fA-F]{6}")
+_FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+
+
+def _color(value: object) -> str:
+    """A color of the form `#rrggbb`, in small letters."""
+    found = values.as_text(value, 'a color such as "#ffffff", in quotes')
+    if not _COLOR.fullmatch(found):
+        raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
+    return found.lower()
+
+
+def _folder(value: object) -> str:
+    """A folder below the project's."""
+    found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
+    if len(found) > 200 or not _FOLDER.fullmatch(found):
+        raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
+    return found
+
+
+def _pixels(default: int, meaning: str) -> Any:
+    return _whole(1, 4096, default, meaning)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """How a game is shown that is drawn by objects (docs/objects.md)."""
+
+    width: int = _pixels(600, "Width of the picture, in pixels of its own; the page makes it larger or smaller.")
+    height: int = _pixels(400, "Its height.")
+    background: str = _key(
+        _color,
+        "#ffffff",
+        "Color behind all objects, as #rrggbb in quotes.",
+        {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
+    )
+    coordinates: str = _key(
+        values.one_of("relative", "pixels"),
+        "relative",
+        "Whether x, y and points are shares of the picture, from 0 to 1, or pixels of it.",
+        {"enum": ["relative", "pixels"]},
+    )
+    pixel_art: bool = _flag(False, "Whether images keep hard edges when they are made larger.")
+    assets: str = _key(_folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"})
 
 
 def _action(value: object) -> object:
@@ -181,6 +228,15 @@ class Trial:
         "make environments of their own.",
         {"enum": ["none", "watch", "advise", "environments"]},
     )
+    scene: Scene | None = field(
+        default=None,
+        metadata=_about(
+            values.section("width: 600"),
+            "The game is drawn by objects that render() returns, in a picture of this size. Without it, by frames.",
+            {"$ref": "#/$defs/Scene"},
+            section=Scene,
+        ),
+    )
     options: dict[str, Any] = field(
         default_factory=dict,
         metadata=_about(
@@ -195,7 +251,7 @@ class Trial:
         return _document(self)
 
 
-def _document(section: Trial | Ui) -> dict[str, Any]:
+def _document(section: Trial | Ui | Scene) -> dict[str, Any]:
     document = {
         key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))
     }
@@ -203,13 +259,13 @@ def _document(section: Trial | Ui) -> dict[str, Any]:
 
 
 def _plain(value: Any, section: bool) -> Any:
-    if section:
+    if section and value is not None:
         return _document(value)
     return list(value) if isinstance(value, tuple) else value
 
 
-def keys(section: type[Trial | Ui]) -> tuple[Key, ...]:
-    """The keys of `Trial` or `Ui`, in order."""
+def keys(section: type[Trial | Ui | Scene]) -> tuple[Key, ...]:
+    """The keys of `Trial`, `Ui` or `Scene`, in order."""
     found = []
     for each in dataclasses.fields(section):
         if not each.metadata:
@@ -219,7 +275,7 @@ def keys(section: type[Trial | Ui]) -> tuple[Key, ...]:
     return tuple(found)
 
 
-def names(section: type[Trial | Ui]) -> frozenset[str]:
+def names(section: type[Trial | Ui | Scene]) -> frozenset[str]:
     """The names of the keys as they stand in the file."""
     return frozenset(key.name for key in keys(section))
 
@@ -260,13 +316,15 @@ def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
     return rest | {RATE_CHANGE: section[RATE_CHANGE_MISSPELT]}, []
 
 
-def _section(model: type[Trial | Ui], section: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
+def _section(
+    model: type[Trial | Ui | Scene], section: dict[str, Any], path: Keys
+) -> tuple[dict[str, Any], list[Problem]]:
     """The good values by attribute, and the problems."""
     found: dict[str, Any] = {}
     problems: list[Problem] = []
     for key in keys(model):
         value, here = section.get(key.name), (*path, key.name)
-        if value is None or value == "" or (key.section and value == {}):
+        if value is None or value == "" or (key.section is Ui and value == {}):
             continue
         value, wrong = _value(key.check, value, here)
         if key.each and not wrong:

@@ -18,7 +18,7 @@ from hippodrome.config.project_keys import NAMES, STEPS, TRIAL_SECTIONS, Root
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
-from protocol.trial import RATE_CHANGE_MISSPELT, Trial, names
+from protocol.trial import RATE_CHANGE_MISSPELT, Trial, Ui, names
 from protocol.trial import check as check_trial
 from protocol.values import show
 
@@ -87,7 +87,7 @@ def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
         known = names(section) | ({RATE_CHANGE_MISSPELT} if section is Trial else set())
         # other keys of ui are controls of the project's own
         unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
-        yield from (one for one in unknown if section is Trial or meant_for(one) is not None)
+        yield from (one for one in unknown if section is not Ui or meant_for(one) is not None)
 
 
 def _copy(data: Any, depth: int = 5) -> Any:

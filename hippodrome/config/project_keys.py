@@ -19,7 +19,7 @@ from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
 from hippodrome.model.step_order import FINAL
 from protocol import values
-from protocol.trial import Trial, Ui, names
+from protocol.trial import Scene, Trial, Ui, names
 from protocol.values import Plain, as_text, number_in, show
 
 MAX_STEPS = 500
@@ -279,7 +279,11 @@ SECTIONS: dict[Keys, type[Model]] = {
     ("project", "events"): Events,
     ("project", "ssl"): Ssl,
 }
-TRIAL_SECTIONS: dict[Keys, type[Trial | Ui]] = {("trial",): Trial, ("trial", "ui"): Ui}
+TRIAL_SECTIONS: dict[Keys, type[Trial | Ui | Scene]] = {
+    ("trial",): Trial,
+    ("trial", "ui"): Ui,
+    ("trial", "scene"): Scene,
+}
 NAMES: dict[Keys, frozenset[str]] = {
     **{path: names(section) for path, section in TRIAL_SECTIONS.items()},
     **{path: model.names() for path, model in SECTIONS.items()},

@@ -9,7 +9,7 @@ from typing import Any
 
 from hippodrome.config.project_keys import SECTIONS, Root
 from protocol import trial
-from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial, Ui
+from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Scene, Trial, Ui
 
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
@@ -24,7 +24,7 @@ def config_schema() -> dict[str, Any]:
     """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
     schema = Root.model_json_schema()
     definitions = schema["$defs"]
-    definitions |= {section.__name__: _of_trial(section) for section in (Trial, Ui)}
+    definitions |= {section.__name__: _of_trial(section) for section in (Trial, Ui, Scene)}
     schema["properties"]["trial"] = {"$ref": "#/$defs/Trial"}
     properties = definitions["Trial"]["properties"]
     spelt = f"HIPPO's spelling of {RATE_CHANGE}."
@@ -41,7 +41,7 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
 
 
-def _of_trial(section: type[Trial | Ui]) -> dict[str, Any]:
+def _of_trial(section: type[Trial | Ui | Scene]) -> dict[str, Any]:
     """A section of `trial`, as pydantic describes those of `project`."""
     properties = {
         key.name: {

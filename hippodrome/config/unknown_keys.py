@@ -12,6 +12,10 @@ _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""
 
 
+_ELSEWHERE = {section: names for section, names in NAMES.items() if section != ("trial", "scene")}
+"""Where a key may have been meant to stand. The names in a scene, such as width, may be those of anything else."""
+
+
 def explain(path: Keys) -> tuple[str, list[Keys]]:
     """What to say about an unknown key, and the path it was meant for, if there is a good guess."""
     section, key = path[:-1], str(path[-1])
@@ -20,7 +24,7 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
     if home is not None:
         place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
-    for home in (section, *NAMES):
+    for home in (section, *_ELSEWHERE):
         near = _nearest(key, home, 0.6 if home == section else 0.8)
         if near:
             meant = (*home, near)
@@ -37,7 +41,7 @@ def meant_for(path: Keys) -> Keys | None:
     home = _home(key)
     if home is not None:
         return (*home, key)
-    for home in (section, *NAMES):
+    for home in (section, *_ELSEWHERE):
         near = _nearest(key, home, _LIKELY if home == section else _LIKELY_ELSEWHERE)
         if near:
             return (*home, near)
@@ -48,7 +52,7 @@ def _home(key: str) -> Keys | None:
     """The section that has this key."""
     if key == FINAL or key.isdecimal():
         return STEPS
-    return next((home for home, known in NAMES.items() if key in known), None)
+    return next((home for home, known in _ELSEWHERE.items() if key in known), None)
 
 
 def _nearest(key: str, home: Keys, cutoff: float) -> str | None:

@@ -98,6 +98,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
             "recordObservations": False,
             "lossless": False,
             "gym": "none",
+            "scene": None,
             "options": {},
         },
     }

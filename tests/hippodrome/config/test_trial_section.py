@@ -33,6 +33,16 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
     "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
     "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
+    "scene": st.fixed_dictionaries(
+        {},
+        optional={
+            "width": st.integers(0, 9),
+            "background": st.sampled_from(["#FFF", "#00FF00"]),
+            "coordinates": st.sampled_from(["relative", "pixels", "world"]),
+            "pixelArt": FLAGS,
+            "assets": st.sampled_from(["assets", "./images/", "../other"]),
+        },
+    ),
     "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
 }
 SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: each | ODD for key, each in KEYS.items()})
