@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import math
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from trial.agent import callbacks, signatures
+from trial.agent import callbacks, environments, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
 from trial.pictures import frames
@@ -25,6 +25,8 @@ _USUAL = frozenset({"observation", "reward", "done", "info"})  # the dict of HIP
 _KNOWN = _USUAL | {"terminated", "truncated", "action"}
 _OLD_GYM = Path(__file__).with_name("old_gym")
 _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
+_OF_ENV = ("step", "render", "reset", "close")
+"""What the environment does itself if a class Agent has no such method."""
 
 
 class AgentError(Exception):
@@ -52,9 +54,19 @@ class Agent:
         self.env: Any = None
 
     def start(self, game: str) -> Any:
-        """Make the environment named `game` (any Gymnasium id; Atari names, old ones too, load ale_py)."""
+        """Make the environment named `game`.
+
+        That is any Gymnasium id (Atari names, old ones too, load ale_py), or a module such as
+        `pettingzoo.butterfly.cooperative_pong_v6`, which has `parallel_env` or `env`.
+        """
         import gymnasium  # noqa: PLC0415 - an agent of the researcher's may do without
 
+        if environments.is_module(game) and game not in gymnasium.registry:
+            try:
+                self.env = environments.made_by_module(game)
+            except environments.PlayersUnknown as error:
+                raise AgentError(str(error)) from None
+            return self.env
         if game.startswith("ALE/") or (game not in gymnasium.registry and _OLD_ATARI.match(game)):
             import ale_py  # noqa: PLC0415
 
@@ -97,8 +109,10 @@ def load(folder: Path) -> Any:
     made = getattr(module, "Agent", None)
     if isinstance(made, type):
         missing = _missing(made)
-        if missing:
-            raise AgentError(f"Agent in {path.name} has no {', '.join(missing)}")
+        misspelt = {name: near for name in missing for near in _nearly(name, made)}
+        if misspelt or "start" in missing:
+            hint = "".join(f"; is {near} meant to be {name}?" for name, near in misspelt.items())
+            raise AgentError(f"Agent in {path.name} has no {', '.join(misspelt or missing)}{hint}")
         return made()
     missing = _missing(module)
     if len(missing) == len(_METHODS):
@@ -108,8 +122,14 @@ def load(folder: Path) -> Any:
     return module
 
 
-def _missing(methods: type | ModuleType) -> list[str]:
+def _missing(methods: Any) -> list[str]:
     return [name for name in _METHODS if not callable(getattr(methods, name, None))]
+
+
+def _nearly(name: str, made: type) -> list[str]:
+    """A method of the class whose name differs in a letter."""
+    others = [other for other in dir(made) if not other.startswith("_") and callable(getattr(made, other, None))]
+    return difflib.get_close_matches(name, set(others) - set(_METHODS), n=1, cutoff=0.88)
 
 
 class AgentAdapter:
@@ -125,8 +145,10 @@ class AgentAdapter:
         self._agent: Any = None
         self._returned: Any = None  # by start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
-        self._unusual_step: Callable[[int], Any] | None = None
+        self._unusual_step: Callable[[Any], Any] | None = None
         self._unusual_render: Callable[[], Any] | None = None
+        self._of_env: dict[str, Callable[..., Any]] = {}  # methods that the agent leaves to the environment
+        self._feedback: tuple[Callable[..., Any], bool] | None = None
         self._word = signatures.NO_WORD  # the newest since the last step
         self._env_says_action = False
         self.action_space: tuple[str, ...] = action_space or ()
@@ -141,22 +163,62 @@ class AgentAdapter:
         """The environment, as far as it is known: what `start` returned, or the agent's attribute `env`."""
         return self._returned if self._returned is not None else getattr(self._agent, "env", None)
 
+    @property
+    def agent(self) -> Any:
+        """The researcher's agent, once it has started."""
+        return self._agent
+
+    @property
+    def agent_module(self) -> Any:
+        """The module that agent.py has become; None without one."""
+        return sys.modules.get("agent") if (self._folder / "agent.py").is_file() else None
+
+    @property
+    def configured(self) -> tuple[str, ...]:
+        """The names of the actions in config.yml."""
+        return self._configured or ()
+
     def start(self) -> None:
         """Load the agent and start its game; `action_space` is known afterwards."""
+        self.begin()
+        self.name_actions()
+
+    def begin(self) -> None:
+        """Load the agent and start its game. Who plays it, and with which actions, is seen afterwards."""
         agent = load(self._folder)
-        self._signatures = _signatures(agent)
+        self._signatures |= _signatures(agent, ("start",))
         config = hippo_config(os.environ)
-        self._returned = self._signatures["start"].call(
-            agent.start, {signatures.GAME: self._game, signatures.CONFIG: config}
-        )
-        self._agent = agent
+        returned = self._signatures["start"].call(agent.start, {signatures.GAME: self._game, signatures.CONFIG: config})
+        missing = _missing(agent)
+        if missing:
+            returned = environments.playable(returned)
+        self._of_env = _forwarded(missing, returned)
+        self._returned, self._agent = returned, agent
+        self._signatures |= _signatures(agent, _OF_ENV, self._of_env)
         if self._signatures["step"] != signatures.usual("step"):
             self._unusual_step = lambda action: self._call("step", action=action)
-        if self._signatures["render"] != signatures.usual("render"):
+        elif "step" in self._of_env:
+            self._unusual_step = self._of_env["step"]
+        if self._signatures["render"] != signatures.usual("render") or "render" in self._of_env:
             self._unusual_render = lambda: self._call("render")
+
+    def name_actions(self) -> None:
+        """Find out what the actions of the environment's one player are called. Raises AgentError if that fails."""
         self.action_space = self._configured or _action_names(self.env)
 
-    def _call(self, method: str, *, action: int | None = None, seed: int | None = None) -> Any:
+    @property
+    def steps_itself(self) -> bool:
+        """Whether the researcher's code takes the actions, and not the environment."""
+        return not isinstance(self._agent, Agent) and "step" not in self._of_env
+
+    @property
+    def renders_by_player(self) -> bool:
+        """Whether `render` takes a player and draws the view of that one."""
+        return signatures.PLAYER in self._signatures["render"].order
+
+    def _call(
+        self, method: str, *, action: Any = None, seed: int | None = None, player: Any = environments.ONLY
+    ) -> Any:
         """Call a method with what it takes. Raises AgentError if it takes the environment, and that is not known."""
         env = self.env
         if env is None and self._signatures[method].needs_env:
@@ -168,10 +230,12 @@ class AgentAdapter:
             signatures.SEED: seed,
             signatures.OPTIONS: None,
             signatures.MODE: "rgb_array",
+            signatures.PLAYER: player,
         }
         if method == "step":
             self._word = signatures.NO_WORD
-        return self._signatures[method].call(getattr(self._agent, method), given)
+        function = self._of_env.get(method) or getattr(self._agent, method)
+        return self._signatures[method].call(function, given)
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
         """Begin an episode: its first observation and info, if the agent returns them, and whether it took the seed."""
@@ -198,27 +262,52 @@ class AgentAdapter:
             return replace(outcome, action=None)
         return outcome
 
+    def step_with(self, actions: Mapping[Any, Any]) -> Any:
+        """What `step` returns for the actions of several players, which are given as they are."""
+        return self._agent.step(actions) if self._unusual_step is None else self._unusual_step(actions)
+
+    def draw(self, player: Any = environments.ONLY) -> Any:
+        """What `render` returns, for this player if it takes one."""
+        return self._call("render", player=player)
+
     def render(self) -> frames.Frame:
         return frames.as_frame(self._agent.render() if self._unusual_render is None else self._unusual_render())
 
-    def feedback(self, word: str) -> None:
-        """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens."""
+    def feedback(self, word: str, player: Any = environments.ONLY) -> None:
+        """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.
+
+        A method `feedback(word, player)` hears whose participant said it too.
+        """
         self._word = word
         listen = getattr(self._agent, "feedback", None)
         if callable(listen):
-            listen(word)
+            if self._feedback is None or self._feedback[0] != listen:
+                self._feedback = listen, signatures.names(listen, "player")
+            listen(word, player=player) if self._feedback[1] else listen(word)
 
     def close(self) -> None:
         if self._agent is not None:
             self._call("close")
 
 
-def _signatures(agent: Any) -> dict[str, Signature]:
-    """How its methods are called. Raises AgentError if one cannot be."""
+def _signatures(
+    agent: Any, methods: Sequence[str], of_env: Mapping[str, Callable[..., Any]] | None = None
+) -> dict[str, Signature]:
+    """How these methods are called. Raises AgentError if one cannot be."""
+    others = of_env or {}
     try:
-        return {name: signatures.read(name, getattr(agent, name)) for name in _METHODS}
+        return {name: signatures.read(name, others.get(name) or getattr(agent, name)) for name in methods}
     except UnfitSignature as error:
         raise AgentError(str(error)) from None
+
+
+def _forwarded(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
+    """The methods of what `start` returned that stand for those that the class lacks. Raises AgentError."""
+    lacking = [name for name in missing if not callable(getattr(returned, name, None))]
+    if lacking:
+        why = "" if returned is None else f", and neither has what start() returned ({type(returned).__name__})"
+        raise AgentError(f"Agent in agent.py has no {', '.join(lacking)}{why}")
+    return {name: getattr(returned, name) for name in missing}
 
 
 def read_step_result(result: Any) -> StepResult:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
-CONFIG = "config"
-"""What a parameter is given. CONFIG: the section `trial` as HIPPO's trial has it.
+CONFIG, PLAYER = "config", "player"
+"""What a parameter is given. CONFIG: the section `trial` as HIPPO's trial has it. PLAYER: whose picture is to be drawn.
 WORD: the newest word of feedback since the last step, or the text None."""
 
 NO_WORD = "None"
@@ -24,13 +24,14 @@ _NAMES = {
     "action": ACTION,
     "reward": WORD, "feedback": WORD, "human_feedback": WORD, "humanfeedback": WORD,
     "seed": SEED, "options": OPTIONS, "mode": MODE, "game": GAME,
+    "player": PLAYER, "player_id": PLAYER, "agent": PLAYER, "agent_id": PLAYER,
     "config": CONFIG,
 }  # fmt: skip
 
 _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "start": ((GAME,), (CONFIG,), ()),
     "step": ((ACTION,), (ENV, ACTION), (ACTION, WORD), (ENV, ACTION, WORD)),
-    "render": ((), (ENV,), (MODE,), (ENV, MODE)),
+    "render": ((), (ENV,), (MODE,), (PLAYER,), (ENV, MODE), (ENV, PLAYER)),
     "reset": ((), (ENV,)),
     "close": ((), (ENV,)),
 }
@@ -39,7 +40,7 @@ _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
 _SHOWN = {
     "start": "start(game)",
     "step": "step(action) or step(env, action)",
-    "render": "render() or render(env)",
+    "render": "render(), render(env) or render(player)",
     "reset": "reset(), reset(seed) or reset(env)",
     "close": "close() or close(env)",
 }
@@ -88,6 +89,14 @@ def read(method: str, function: Callable[..., Any]) -> Signature:
         plain = inspect.Signature([p.replace(annotation=p.empty) for p in parameters])
         raise UnfitSignature(f"{method}{plain} cannot be called; write {_SHOWN[method]}")
     return Signature(order, named)
+
+
+def names(function: Callable[..., Any], parameter: str) -> bool:
+    """Whether the function has a parameter of this name."""
+    try:
+        return parameter in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False
 
 
 def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str, str], list[inspect.Parameter]]:

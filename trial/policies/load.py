@@ -1,0 +1,57 @@
+"""Makes a policy of what `trial.players` says of a player."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from trial.policies.policy import Policy, PolicyError
+from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
+
+SAMPLE = "sample:"
+"""Before a file: actions are drawn by the softmax of its output, instead of the best one being taken."""
+AGENT = "agent:"
+
+
+def load(
+    spec: str,
+    folder: Path,
+    agent_module: Any,
+    action_count: int,
+    observation_space: Any = None,
+    *,
+    player: str = "player_1",
+    idle: int = 0,
+) -> Policy:
+    """The policy for one player: `random`, `idle`, `agent:Class`, `FILE.onnx` or `sample:FILE.onnx`.
+
+    `folder` is that of agent.py, `agent_module` the module that agent.py has become (None without one), and
+    `observation_space` the player's space, if it is known. Files are tried with one observation of zeros.
+    Raises PolicyError with a sentence, and whatever the researcher's class raises.
+    """
+    if spec == "random":
+        return RandomPolicy(action_count)
+    if spec == "idle":
+        return IdlePolicy(action_count, idle)
+    if spec.startswith(AGENT):
+        return of_class(spec, agent_module, player, action_count)
+    if spec.endswith(".onnx"):
+        from trial.policies import onnx  # noqa: PLC0415 - numpy and onnxruntime, which most projects do without
+
+        name = spec.removeprefix(SAMPLE)
+        return onnx.load(spec, _file(folder, name), action_count, observation_space, sample=spec != name)
+    raise PolicyError(
+        f"{spec!r} is no player; write human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
+    )
+
+
+def _file(folder: Path, name: str) -> Path:
+    """The file of this name below the folder. Raises PolicyError if there is none."""
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise PolicyError(f"{name} leads out of the project's folder")
+    if not path.is_file():
+        near = sorted(other.relative_to(folder).as_posix() for other in folder.glob("policies/**/*.onnx"))
+        hint = f"; there are {', '.join(near[:5])}" if near else ""
+        raise PolicyError(f"there is no file {name}{hint}")
+    return path

@@ -1,0 +1,128 @@
+"""Policies without a model: a random action, the idle action, and a class of agent.py."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from random import Random
+from typing import Any
+
+from trial.policies.policy import Mask, PolicyError, legal
+
+
+class RandomPolicy:
+    """Takes a random legal action, each as likely as the others."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._random = Random(0)  # noqa: S311 - a game
+
+    def act(self, _observation: Any, _info: Mapping[str, Any], mask: Mask | None) -> int:
+        return self._random.choice(legal(self._count, mask))
+
+    def reset(self, seed: int) -> None:
+        self._random.seed(seed)
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def description(self) -> Mapping[str, Any]:
+        return {"kind": "policy", "policy": "random"}
+
+
+class IdlePolicy:
+    """Takes the idle action, or the first legal one where that is not legal."""
+
+    def __init__(self, count: int, idle: int) -> None:
+        self._count, self._idle = count, idle
+
+    def act(self, _observation: Any, _info: Mapping[str, Any], mask: Mask | None) -> int:
+        allowed = legal(self._count, mask)
+        return self._idle if self._idle in allowed else allowed[0]
+
+    def reset(self, seed: int) -> None:
+        """Nothing changes."""
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def description(self) -> Mapping[str, Any]:
+        return {"kind": "policy", "policy": "idle"}
+
+
+class AgentPolicy:
+    """A class of agent.py with `act(observation, info)`; `act` may take the mask as a third argument.
+
+    `reset(seed)` and `close()` are called if the class has them. Its `__init__` may have a parameter `player`.
+    """
+
+    def __init__(self, spec: str, made: Any, count: int) -> None:
+        self._spec, self._made, self._count = spec, made, count
+        self._act: Callable[..., Any] = made.act
+        self._takes_mask = _takes(made.act, 3)
+        self._reset = getattr(made, "reset", None)
+        self._reset_takes_seed = callable(self._reset) and _takes(self._reset, 1)
+
+    def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
+        more = (mask,) if self._takes_mask else ()
+        return checked(self._act(observation, info, *more), self._count, mask)
+
+    def reset(self, seed: int) -> None:
+        if callable(self._reset):
+            self._reset(*((seed,) if self._reset_takes_seed else ()))
+
+    def close(self) -> None:
+        close = getattr(self._made, "close", None)
+        if callable(close):
+            close()
+
+    def description(self) -> Mapping[str, Any]:
+        return {"kind": "policy", "policy": self._spec}
+
+
+def checked(action: Any, count: int, mask: Mask | None) -> int:
+    """The action as an index. Raises PolicyError if it is none, or is not legal now."""
+    try:
+        if isinstance(action, bool):
+            raise TypeError
+        index = int(action)
+        if index != action:
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        raise PolicyError(f"act() returned {str(action)[:40]!r}, which is no action; return its number") from None
+    if not 0 <= index < count:
+        raise PolicyError(f"act() returned action {index}; there are 0 to {count - 1}")
+    if index not in legal(count, mask):
+        raise PolicyError(f"act() returned action {index}, which action_mask forbids now")
+    return index
+
+
+def of_class(spec: str, module: Any, player: str, count: int) -> AgentPolicy:
+    """The policy `agent:Name` for this player. Raises PolicyError if agent.py has no fit class of this name."""
+    name = spec.partition(":")[2]
+    made = getattr(module, name, None)
+    if module is None:
+        raise PolicyError(f"{spec} is a class of agent.py, and there is no agent.py")
+    if not isinstance(made, type):
+        others = [key for key, value in vars(module).items() if isinstance(value, type) and hasattr(value, "act")]
+        hint = f"; classes with act() there: {', '.join(others)}" if others else ""
+        raise PolicyError(f"there is no class {name} in agent.py{hint}")
+    if not callable(getattr(made, "act", None)):
+        raise PolicyError(f"class {name} in agent.py has no act(observation, info)")
+    return AgentPolicy(spec, made(player=player) if _names_player(made) else made(), count)
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether it can be called with so many values in order."""
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _names_player(made: type) -> bool:
+    try:
+        return "player" in inspect.signature(made).parameters
+    except (TypeError, ValueError):
+        return False

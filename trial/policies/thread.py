@@ -1,0 +1,87 @@
+"""A policy's thread: it asks the policy for actions, so that a slow one never holds up the event loop or the game."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from trial.policies.policy import Mask, Policy
+
+Done = Callable[[int, int | None, Exception | None], None]
+"""Takes the id of a question, and the action or else the exception that the policy raised."""
+
+
+class PolicyThread:
+    """Asks one policy, one question after another, on a thread of its own. To be called from the event loop.
+
+    `done` is called there too, once for each question, in their order. The thread is a daemon: a policy that never
+    comes back holds up nothing but its own answers, and cannot keep the process alive.
+    """
+
+    def __init__(self, policy: Policy, done: Done, *, name: str = "policy") -> None:
+        self.policy = policy
+        self._done = done
+        self._loop = asyncio.get_running_loop()
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._closed = False
+        self._reset_error: Exception | None = None  # of the latest reset; the thread's own
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def ask(self, ask_id: int, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> None:
+        """Ask for an action; `done(ask_id, action, error)` follows, unless the thread was closed meanwhile."""
+
+        def answer() -> None:
+            try:
+                if self._reset_error is not None:
+                    raise self._reset_error
+                action, error = self.policy.act(observation, info, mask), None
+            except BaseException as problem:  # noqa: BLE001 - the researcher's code may raise anything
+                action, error = None, _plain(problem)
+            self._tell(ask_id, action, error)
+
+        self._jobs.put(answer)
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode: questions asked from now on belong to it. If that fails, they all get its error."""
+
+        def begin() -> None:
+            try:
+                self.policy.reset(seed)
+                self._reset_error = None
+            except BaseException as problem:  # noqa: BLE001 - as above
+                self._reset_error = _plain(problem)
+
+        self._jobs.put(begin)
+
+    def close(self) -> None:
+        """End the thread after its present question. No answer is told any more."""
+        if not self._closed:
+            self._closed = True
+            self._jobs.put(None)
+
+    def _tell(self, ask_id: int, action: int | None, error: Exception | None) -> None:
+        def tell() -> None:
+            if not self._closed:
+                self._done(ask_id, action, error)
+
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(tell)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            if not self._closed:
+                job()
+        with contextlib.suppress(BaseException):  # the game is over; nothing depends on how a policy ends
+            self.policy.close()
+
+
+def _plain(problem: BaseException) -> Exception:
+    """SystemExit in a researcher's code is a failure like another."""
+    if isinstance(problem, Exception):
+        return problem
+    return RuntimeError(repr(problem)).with_traceback(problem.__traceback__)
