@@ -29,7 +29,19 @@ ROOMS = {
         *("ports", "model", "log", "storage", "certificates", "limits", "http", "servers", "participants", "config"),
         *("aws", "metrics", "registry"),
     ),
-    "trial": ("settings", "pictures", "core", "recordings", "agent", "policies", "wire", "gym", "programs", "server", "check"),
+    "trial": (
+        "settings",
+        "pictures",
+        "core",
+        "recordings",
+        "agent",
+        "policies",
+        "wire",
+        "gym",
+        "programs",
+        "server",
+        "check",
+    ),
     "deploy": ("aws", "core", "code", "cost", "stack", "study", "operate", "lifecycle"),
 }
 """Rooms and modules of a package: each imports only from itself and from those before it."""

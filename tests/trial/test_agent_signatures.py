@@ -158,7 +158,11 @@ def test_some_functions_are_no_agent(tmp_path: Path) -> None:
             "step(action, *, noise) cannot be called; write step(action) or step(env, action)",
         ),
         ("reset(self)", "reset(self, a, b)", "reset(a, b) cannot be called; write reset(), reset(seed) or reset(env)"),
-        ("render(self)", "render(self, a, b, c)", "render(a, b, c) cannot be called; write render(), render(env) or render(player)"),
+        (
+            "render(self)",
+            "render(self, a, b, c)",
+            "render(a, b, c) cannot be called; write render(), render(env) or render(player)",
+        ),
         ("start(self, game)", "start(self, game, more)", "start(game, more) cannot be called; write start(game)"),
     ],
 )

@@ -80,6 +80,11 @@ class JointAdapter:
         return self._adapter.env
 
     @property
+    def callbacks(self) -> frozenset[str]:
+        """The names of the callbacks that the agent has."""
+        return self._adapter.callbacks
+
+    @property
     def agent(self) -> Any:
         """The researcher's agent."""
         return self._adapter.agent
