@@ -7,7 +7,7 @@ give dictionaries by player. Players are known by text here; the environment's o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -80,8 +80,8 @@ class JointAdapter:
         return self._adapter.env
 
     @property
-    def callbacks(self) -> frozenset[str]:
-        """The names of the callbacks that the agent has."""
+    def callbacks(self) -> Mapping[str, Callable[..., Any]]:
+        """The callbacks that the agent has."""
         return self._adapter.callbacks
 
     @property
