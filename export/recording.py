@@ -40,6 +40,7 @@ class Converted:
     frames: int = 0
     rows: int = 0
     complete: bool = False
+    callbacks: int = 0
     episodes: list[dict[str, Any]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
@@ -120,6 +121,8 @@ def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, sh
         }
         writer.add_key_value_metadata({"hippodrome": json.dumps(about)})
     done.problems[:] = _summed(done.problems + rows.problems)
+    if done.callbacks and done.episodes:
+        done.episodes[0]["callbacks"] = done.callbacks  # in all of the file
     for episode in done.episodes:
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
     return done
@@ -194,6 +197,9 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
 
 def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
     """Keep the books of episodes: one begins with `reset`, and ends with `end`, or not at all."""
+    if kind == "callback":
+        done.callbacks += 1
+        return
     if kind != "break":  # it follows an episode's end, and takes nothing from it
         done.complete = kind == "end"
     number = line.get("episode")

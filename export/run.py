@@ -170,6 +170,9 @@ def _run(
             written += tables.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
         if options.wanted.recordings:
             written += tables.write(folder / "episodes", tables.EPISODES, tables.episodes(state), either)
+            if any(found.get("callbacks") for _, _, found in state.episodes()):
+                lines = tables.callbacks(state, folder)
+                written += tables.write(folder / "callbacks", tables.CALLBACKS, lines, either)
         only_csv = tables.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
         written += tables.write(folder / "problems", tables.PROBLEMS, found, only_csv)
@@ -235,7 +238,7 @@ def _sound_minari(folder: Path) -> bool:
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Tables of an earlier run that this one did not write would be out of date; half-written files are of no use."""
-    for name in ("answers", "answers-long", "episodes", "problems"):
+    for name in ("answers", "answers-long", "episodes", "callbacks", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:
                 path.unlink()

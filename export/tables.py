@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -410,6 +411,59 @@ def episodes(state: State) -> Iterator[list[Any]]:
             when(found["ended"]),
             path,
         ]
+
+
+CALLBACKS = (
+    Column("participant"),
+    Column("studyStep"),
+    Column("attempt", "whole"),
+    Column("trial"),
+    Column("episode", "whole"),
+    Column("step", "whole"),
+    Column("time", "time"),
+    Column("callback"),
+    Column("name"),
+    Column("value"),
+    Column("error"),
+    Column("skipped", "whole"),
+    Column("file"),
+)
+
+
+def callbacks(state: State, folder: Path) -> Iterator[list[Any]]:
+    """One row per line that a callback of the agent left. `folder` holds the converted recordings."""
+    import pyarrow.parquet as pq
+
+    wanted = ["kind", "trial", "episode", "step", "time", "error", "other"]
+    for path, several in groupby(state.episodes(), lambda row: row[1]):
+        rows = list(several)
+        if not any(found.get("callbacks") for _, _, found in rows):
+            continue
+        person, _, first = rows[0]
+        with pq.ParquetFile(folder / path) as file:
+            for batch in file.iter_batches(batch_size=_BATCH, columns=wanted):
+                for row in batch.to_pylist():
+                    if row["kind"] == "callback":
+                        yield [person.number, first["step"], first["attempt"], *_callback(row), path]
+
+
+def _callback(row: Mapping[str, Any]) -> list[Any]:
+    """From `trial` to `skipped`. What the recording's line has beside its common fields is JSON in `other`."""
+    try:
+        more = json.loads(row["other"] or "{}")
+    except ValueError:  # no JSON any more, once an id was taken out
+        more = {"value": row["other"]}
+    value, skipped = more.get("value"), more.get("skipped")
+    return [
+        None if row["trial"] is None else clean(row["trial"]),
+        row["episode"],
+        row["step"],
+        row["time"],
+        *(clean(more[name]) if isinstance(more.get(name), str) else None for name in ("callback", "name")),
+        None if value is None else fit(value, "text"),
+        None if row["error"] is None else clean(row["error"]),
+        skipped if isinstance(skipped, int) else None,
+    ]
 
 
 def identities(state: State, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:

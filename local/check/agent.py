@@ -160,7 +160,14 @@ class _Reading:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Diagnostic]:
-        return self._early() + self._failures(status) + self._arrows() + self._slow() + self._not_on_aws()
+        return [
+            *self._early(),
+            *self._failures(status),
+            *self._callbacks(),
+            *self._arrows(),
+            *self._slow(),
+            *self._not_on_aws(),
+        ]
 
     @property
     def played(self) -> bool:
@@ -233,6 +240,25 @@ class _Reading:
         remark = report["call"] == "close"
         message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
         return [self._at(place, message, remark=remark)]
+
+    def _callbacks(self) -> list[Diagnostic]:
+        """What callbacks raise, and one that takes too long. Neither ends a game, but data are lacking then."""
+        told = self._report.get("callbacks") or {}
+        found = []
+        for error in told.get("errors", ()):
+            place = (self._name(error["file"]), error["line"]) if error["file"] else self._place_of(error["name"])
+            text = f"{error['name']}() fails: {short(error['text'])}{remedy(error['type'], error['text'])}"
+            found.append(self._at(place, text))
+        if told.get("late"):
+            text = (
+                f"{told['late']}() takes longer than callbackSeconds ({self._config.trial.callback_seconds:g} s); "
+                "callbacks are skipped until it has returned"
+            )
+            found.append(self._at(self._place_of(told["late"]), text, remark=True))
+        return found
+
+    def _place_of(self, method: str) -> tuple[str, int | None]:
+        return self._label or AGENT, _line_of(self._code / AGENT, method)
 
     def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
         """The agent does not keep the contract of docs/agent.md."""

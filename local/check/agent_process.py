@@ -16,6 +16,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
@@ -24,6 +25,8 @@ from local.check.pace import Pace
 from protocol import environment as variables
 from protocol import handover
 from trial.agent.agent import AgentAdapter
+from trial.agent.callbacks import About, Callbacks
+from trial.agent.calls import PLAYER
 from trial.server import warm
 from trial.settings import trial_section
 
@@ -65,11 +68,12 @@ def _try(report: Path) -> None:
     if document:
         os.environ.__class__ = _Early
 
-    def reset() -> None:
+    def reset() -> Any:
         os.environ.__class__ = plain
         if document:
             warm.set_environment(os.environ, handover.parse(document.encode()))
-        player.reset(1)
+        progress.callbacks.session_begins()
+        return player.reset(1)
 
     progress = _Progress(report, folder)
     if not progress.call("start", player.start):
@@ -83,8 +87,21 @@ def _try(report: Path) -> None:
     if count is not None and len(player.action_space) > int(count):
         first = int(getattr(space, "start", 0))
         progress.foreign = _foreign_actions(env, range(first, first + int(count)))
+    progress.callbacks = _callbacks(player, progress, config.callback_seconds)
     if _play(player, progress, reset, config.max_episodes) and progress.call("close", player.close):
         progress.over()
+
+
+def _callbacks(player: AgentAdapter, progress: _Progress, seconds: float) -> Callbacks:
+    """The agent's callbacks, which are told what happens as on a server."""
+    return Callbacks(
+        player.callbacks,
+        About("check", "check", None),
+        lambda: player.env,
+        seconds=seconds,
+        stamp=dict,
+        failed=progress.callback_failed,
+    )
 
 
 def _foreign_actions(env: Any, actions: range) -> list[int]:
@@ -103,20 +120,26 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
     return found
 
 
-def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], most: int) -> bool:
+def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most: int) -> bool:
     """Play up to the end of the last episode, or of the time; False if something failed.
 
     Each action comes once in turn, then they are at random.
     """
+    callbacks = progress.callbacks
     random = Random(1)  # noqa: S311 - the same each time
     until = math.inf
     for episode in range(1, most + 1):
-        reset = first_reset if episode == 1 else lambda seed=episode: player.reset(seed)
-        if not (progress.call("reset", reset) and progress.call("render", player.render)):
+        reset = first_reset if episode == 1 else partial(player.reset, episode)
+        if not progress.call("reset", reset):
             return False
+        observation, info, _ = progress.result
+        if not progress.call("render", player.render):
+            return False
+        callbacks.episode_began(episode, {PLAYER: observation}, {PLAYER: info})
         ended = False
         while not ended:
             if progress.steps >= PLAY_STEPS or time.monotonic() > until:
+                callbacks.session_ended()
                 return True
             actions = len(player.action_space)
             progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
@@ -129,9 +152,13 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], None], mos
             if not progress.call("render", player.render):
                 return False
             progress.pace.took(time.monotonic() - began)
+            seen = {PLAYER: outcome.observation}, {PLAYER: outcome.info}
+            callbacks.stepped({PLAYER: progress.action}, {PLAYER: outcome.reward}, *seen)
             if progress.steps == 1:
                 until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
         progress.episodes = episode
+        callbacks.episode_ended("terminated" if outcome.terminated else "truncated")
+    callbacks.session_ended()
     return True
 
 
@@ -143,6 +170,8 @@ class _Progress:
         self.episodes = self.steps = self.action = 0
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
+        self.callbacks: Any = None
+        self._callback_errors: list[dict[str, Any]] = []
         self.pace = Pace()
         self.result: Any = None
         self._ours = _installed_modules()
@@ -157,6 +186,10 @@ class _Progress:
             return False
         return True
 
+    def callback_failed(self, name: str, error: BaseException) -> None:
+        """A callback of the agent has raised."""
+        self._callback_errors.append({"name": name, **_told(error, self._folder)})
+
     def over(self) -> None:
         """All has been tried."""
         self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
@@ -164,6 +197,8 @@ class _Progress:
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
         far["pace"] = asdict(self.pace)
+        if self.callbacks is not None:
+            far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
         part = self._report.with_suffix(".part")
         part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
         part.replace(self._report)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,7 @@ def record(
     step: str = "3",
     close: bool = True,
     picture: Callable[[int], np.ndarray] | None = None,
+    callbacks: Sequence[Mapping[str, Any]] = (),
     **more: Any,
 ) -> bytes:
     """A recording as the trial writes it, made by the trial's own code."""
@@ -122,6 +123,8 @@ def record(
                 info={"t": np.int64(number), "nan": float("nan")}, **seen, **more,
             )  # fmt: skip
         line("end", episode=episode, steps=frames, score=1.0, why="terminated", messages=[])
+        for each in callbacks:
+            line("callback", episode=episode, step=frames, **each)
     if close:
         made.close()
     else:

@@ -106,6 +106,36 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     assert not [name for name in on_disk if name.endswith(".part")]
 
 
+def test_what_callbacks_recorded_is_a_table(place: Place) -> None:
+    (user,) = crowd(place.put, place.tmp, 1, callbacks=[
+        {"callback": "on_tick", "name": "lean", "value": {"left": 0.5}},
+        {"callback": "on_tick", "name": "said", "value": 'text, "quoted"'},
+        {"callback": "on_tick", "name": "on_tick", "error": "ValueError: no such thing"},
+        {"callback": "on_tick", "name": "on_tick", "skipped": 7},
+    ])  # fmt: skip
+    assert place.done()["counts"]["problems"] == 0, "what comes after an episode's end does not cut it off"
+    found = place.rows("callbacks")
+    (path,) = {row.pop("file") for row in found}
+    assert (place.out / path).is_file()
+    assert found[0] == {
+        "participant": user, "studyStep": "3", "attempt": "1", "trial": "t-1", "episode": "1", "step": "5",
+        "time": "2026-11-21T14:46:40.000009Z", "callback": "on_tick", "name": "lean", "value": '{"left":0.5}',
+        "error": "", "skipped": "",
+    }  # fmt: skip
+    assert [(row["name"], row["value"], row["error"], row["skipped"]) for row in found[1:]] == [
+        ("said", 'text, "quoted"', "", ""),
+        ("on_tick", "", "ValueError: no such thing", ""),
+        ("on_tick", "", "", "7"),
+    ]
+    assert pq.read_table(place.out / "callbacks.parquet")["skipped"].to_pylist() == [None, None, None, 7]
+
+
+def test_without_callbacks_there_is_no_table_of_them(place: Place) -> None:
+    crowd(place.put, place.tmp, 1)
+    place.done()
+    assert not list(place.out.glob("callbacks.*"))
+
+
 def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
     before = os.umask(0o022)
     try:

@@ -234,12 +234,6 @@ def test_an_agent_without_callbacks_has_none():
 # ---- on a real server
 
 CALLBACKS = """
-import time
-from pathlib import Path
-
-def _all(self, session, *more):
-    pass
-
 class Agent(Agent):
     on_session_start = lambda self, session: "begun"
     on_session_end = lambda self, session: "ended"

@@ -145,6 +145,8 @@ class Callbacks:
         self._started = False
         self._thread: _Thread | None = None
         self.replaying = False
+        self.first_late: str | None = None
+        """The first callback for which the game did not wait any longer."""
 
     def __bool__(self) -> bool:
         return bool(self._found)
@@ -231,7 +233,9 @@ class Callbacks:
             return
         call = _Call(self._notes, name, self._now.episode, self._now.ticks)
         session = self._session(call)
-        self._thread.run(name, lambda: call.run(method, session, arguments), self._seconds)
+        returned = self._thread.run(name, lambda: call.run(method, session, arguments), self._seconds)
+        if not returned and self.first_late is None:
+            self.first_late = name
 
     def _session(self, call: _Call) -> Session:
         about, now = self.about, self._now
@@ -349,12 +353,13 @@ class _Thread:
         """The name of the callback that has not returned."""
         threading.Thread(target=self._run, name="callbacks", daemon=True).start()
 
-    def run(self, name: str, work: Callable[[], None], seconds: float) -> None:
-        """Do the work, and wait for it at most so long. Nothing else may be running."""
+    def run(self, name: str, work: Callable[[], None], seconds: float) -> bool:
+        """Do the work, and wait for it at most so long; whether it was done then. Nothing else may be running."""
         job = _Job(work, threading.Event())
         self.running = name
         self._jobs.put(job)
         job.awaited = job.returned.wait(seconds)
+        return job.awaited
 
     def close(self) -> None:
         self._jobs.put(None)

@@ -395,6 +395,41 @@ def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
     assert line.startswith(said)
 
 
+def test_callbacks_that_fail_are_mistakes_and_the_game_is_played_all_the_same(folder: Path) -> None:
+    source = folder / "agent.py"
+    start = len(source.read_text().splitlines())
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        return session.observatons\n"
+        "    def on_episode_end(self):\n        pass\n"
+    )
+    raising, uncallable = tried(folder)
+    assert raising.startswith(f"agent.py:{start + 2}: on_tick() fails: AttributeError: 'Session' object has no")
+    assert uncallable == (
+        f"agent.py:{start + 3}: on_episode_end() fails: TypeError: Agent.on_episode_end() takes 1 positional argument "
+        "but 2 were given"
+    )
+
+
+def test_a_callback_that_hangs_is_remarked(folder: Path) -> None:
+    source = folder / "agent.py"
+    start = len(source.read_text().splitlines())
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        import time\n        time.sleep(999)\n"
+    )
+    assert tried(folder) == [
+        f"agent.py:{start + 1}: remark: on_tick() takes longer than callbackSeconds (0.5 s); callbacks are skipped "
+        "until it has returned"
+    ]
+
+
+def test_callbacks_that_are_fine_are_not_remarked(folder: Path) -> None:
+    source = folder / "agent.py"
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        session.record('t', session.ticks)\n"
+    )
+    assert tried(folder) == []
+
+
 def test_an_agent_that_fails_late_is_seen(folder: Path) -> None:
     agent(folder, "self.n += 1", "self.n += 1; assert self.n != 25, 'late'")
     (line,) = tried(folder)
