@@ -156,14 +156,16 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
 
 def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
     """Problems of step files that the project names and the bucket lacks."""
+    named = [*project.steps, *project.pages_in_game]
     if project.page_folder == STEPS_FOLDER:
         there = {entry.key for entry in platform.documents.list(f"{project.id}/{STEPS_FOLDER}/")}
     else:
-        there = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in project.steps})
-    for step in project.steps:
+        there = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in named})
+    for step in named:
+        section = "project.steps" if step in project.steps else "trial"
         for file in step.files:
             if project.page_key(file) not in there:
-                yield f"project.steps.{step.key}: {file}.html has not been uploaded"
+                yield f"{section}.{step.key}: {file}.html has not been uploaded"
 
 
 def sign_links(platform: Platform, asked: object) -> list[str]:

@@ -6,13 +6,15 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from protocol import values
-from protocol.values import Check, Keys
+from protocol import keyboard, values
+from protocol.values import Check, Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
@@ -21,6 +23,8 @@ MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
 LONGEST_NAME = 64
 """Characters of the name of an action, or of a control of the project's own."""
+LONGEST_BREAK = 600
+"""Seconds."""
 HIGHEST_RATE = 240
 """Frames per second that no project may exceed."""
 
@@ -52,6 +56,8 @@ class Key:
     """If the value is a list: the check of each item."""
     section: type[Ui | Scene] | None = None
     """If the value is a section of its own: the class of its keys."""
+    entries: Callable[[Any, Keys], tuple[Any, list[Problem]]] | None = None
+    """If the value is a map of names of the project's own: what is good of it at this path, and what is wrong."""
 
 
 def _about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
@@ -156,6 +162,86 @@ class Scene:
     assets: str = _key(_folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"})
 
 
+_PAGE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
+
+
+def page(value: object) -> str:
+    """A file in the folder of pages, without `.html`. Raises ValueError with what to write."""
+    found = values.as_text(value, "the name of a file in the steps folder")
+    stem = found.removesuffix(".html")
+    if "/" in found or "\\" in found:
+        raise ValueError(f"must be the name of a file in the steps folder, without folders, not {values.show(found)}")
+    if stem == "game":
+        raise ValueError("a page cannot be called game.html; rename it")
+    if not _PAGE.fullmatch(stem) or ".." in stem:
+        letters = "letters (a to z), digits, spaces, dots, dashes and underscores"
+        raise ValueError(f"file names may hold {letters}; rename {values.show(found)}")
+    return stem
+
+
+def _break(value: object) -> float | str:
+    """The seconds of a break, or the page that is shown in it."""
+    if isinstance(value, str) and number_in(value) is None and value.strip():
+        return page(value)
+    try:
+        return values.number(0, LONGEST_BREAK)(value)  # type: ignore[return-value]
+    except ValueError as error:
+        raise ValueError(f"{error}; or the name of a file in the steps folder") from None
+
+
+def _actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
+    """What the keys do: `{key: action}`, or such a map for each player."""
+    if not value or not all(isinstance(each, dict) for each in value.values()):
+        return _one_players_keys(value, path)
+    checked = {str(player): _one_players_keys(each, (*path, player)) for player, each in value.items()}
+    return {player: found for player, (found, _) in checked.items()}, [
+        one for _, many in checked.values() for one in many
+    ]
+
+
+def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+    found: dict[str, str] = {}
+    problems: list[Problem] = []
+    known: dict[frozenset[str], str] = {}
+    for name, action in value.items():
+        here = (*path, name)
+        key, wrong = _value(lambda text: keyboard.combination(str(text)), name, here)
+        named, wrong_action = _value(_KEYS_ACTION, action, here)
+        problems += wrong + wrong_action
+        if wrong or wrong_action:
+            continue
+        same = known.setdefault(frozenset(keyboard.parts(key)), name)
+        if same != name:
+            problems.append(Problem(here, f"is the same as {keyboard.shown(same)}; keep one of them"))
+        found[key] = named
+    return found, _few(value, problems, path)
+
+
+def _labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+    found: dict[str, str] = {}
+    problems: list[Problem] = []
+    for name, label in value.items():
+        here = (*path, name)
+        action, wrong = _value(_KEYS_ACTION, name, here)
+        text, wrong_text = _value(_LABEL, label, here)
+        problems += wrong + wrong_text
+        if not wrong and not wrong_text:
+            found[action] = text
+    return found, _few(value, problems, path)
+
+
+def _few(value: Mapping[str, Any], problems: list[Problem], path: Keys) -> list[Problem]:
+    if len(value) <= MAX_KEYS:
+        return problems
+    return [*problems, Problem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
+
+
+MAX_KEYS = 100
+"""Keys of one player, and labels."""
+_KEYS_ACTION = keyboard.an_action(LONGEST_NAME)
+_LABEL = values.text("the text of a button", LONGEST_NAME)
+
+
 def _action(value: object) -> object:
     """The name of an action. A number is a name too, in YAML and in JSON."""
     return _ACTION(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
@@ -173,11 +259,64 @@ class Trial:
         1, 10_000, 1, "Environment steps for which an action stays in force unless another comes; 1 is no buffer."
     )
     max_episodes: int = _whole(1, 1_000_000, 20, "Episodes until the trial is over.")
-    between_episodes: float = _key(
-        values.number(0, 600),
+    between_episodes: float | str = _key(
+        _break,
         3,
-        "Seconds of the break between two episodes, with the score and a countdown; 0 is none.",
-        {"type": "number", "minimum": 0, "maximum": 600},
+        "Seconds of the break between two episodes, with the score and a countdown; 0 is none. Or a file of steps/, "
+        "which is shown until the participant goes on.",
+        {"anyOf": [{"type": "number", "minimum": 0, "maximum": LONGEST_BREAK}, {"type": "string"}]},
+    )
+    instructions: str | None = _key(
+        page,
+        None,
+        "A file of steps/ that the game page shows before the game, and again in a pause.",
+        {"type": "string"},
+    )
+    reset_freeze: float = _key(
+        values.number(0, 60),
+        0,
+        "Seconds for which each episode shows its first picture, with a countdown; keys do nothing.",
+        {"type": "number", "minimum": 0, "maximum": 60},
+    )
+    max_steps: int = _whole(0, 10**9, 0, "Steps after which an episode is truncated; 0 is no limit.")
+    episode_seconds: float = _key(
+        values.number(0, 86_400),
+        0,
+        "Seconds of play after which an episode is truncated; the page shows the time left. 0 is no limit.",
+        {"type": "number", "minimum": 0, "maximum": 86_400},
+    )
+    keys: dict[str, Any] = field(
+        default_factory=dict,
+        metadata=_about(
+            values.section("ArrowLeft: left"),
+            "What the keys of the keyboard do: an action by KeyboardEvent.key, or several joined by +; or such a map "
+            "for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
+            {
+                "type": "object",
+                "additionalProperties": {
+                    "anyOf": [
+                        {"type": ["string", "integer"]},
+                        {"type": "object", "additionalProperties": {"type": ["string", "integer"]}},
+                    ]
+                },
+            },
+            entries=_actions_of_keys,
+        ),
+    )
+    labels: dict[str, str] = field(
+        default_factory=dict,
+        metadata=_about(
+            values.section("left: Go left"),
+            "Texts of the buttons, by action.",
+            {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
+            entries=_labels,
+        ),
+    )
+    input: str = _key(
+        values.one_of("held", "single"),
+        "held",
+        "Whether an action goes on while its keys are held, or each press of a key is one action.",
+        {"enum": ["held", "single"]},
     )
     game: str | None = _key(
         values.text("the name of an environment"),
@@ -246,6 +385,24 @@ class Trial:
         ),
     )
 
+    @property
+    def between_seconds(self) -> float:
+        """The seconds of a break; infinite if the participant ends it."""
+        return math.inf if isinstance(self.between_episodes, str) else self.between_episodes
+
+    @property
+    def pages(self) -> Mapping[str, str]:
+        """The files of the folder of pages that the game page shows, by the key that names each."""
+        named = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
+        return {key: page for key, page in named.items() if isinstance(page, str)}
+
+    def keys_of(self, player: str) -> Mapping[str, str]:
+        """The actions of a player's keys by combination (`protocol.keyboard`); empty if the actions' names decide."""
+        if any(isinstance(each, dict) for each in self.keys.values()):
+            found: Mapping[str, str] = self.keys.get(player, {})
+            return found
+        return self.keys
+
     def document(self) -> dict[str, Any]:
         """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""
         return _document(self)
@@ -301,7 +458,11 @@ def check(section: object) -> tuple[Trial, list[Problem]]:
     trial, problems = Trial(**found), problems + wrong
     given = {key.name for key in keys(Trial) if key.attribute in found}
     bad = {path[0] for path, _, _ in problems}
-    rules: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (_frame_rates, _different_actions)
+    rules: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
+        _frame_rates,
+        _different_actions,
+        _actions_that_exist,
+    )
     compared = [problem for rule in rules for problem in rule(trial, given)]
     return trial, problems + [problem for problem in compared if bad.isdisjoint(problem.compared)]
 
@@ -329,6 +490,8 @@ def _section(
         value, wrong = _value(key.check, value, here)
         if key.each and not wrong:
             value, wrong = _items(key.each, value, here)
+        elif key.entries and not wrong:
+            value, wrong = key.entries(value, here)
         elif key.section and not wrong:
             inner, wrong = _section(key.section, value, here)
             value = key.section(**inner)
@@ -391,6 +554,25 @@ def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
         hint = f"; set {other} too" if default else ""
         sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
         yield Problem((key,), sentence, (lower, upper))
+
+
+def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """Keys and labels name actions of actionSpace, if that is given."""
+    names = [action.lower() for action in trial.action_space]
+    if not names:
+        return
+    by_player = any(isinstance(each, dict) for each in trial.keys.values())
+    keys = [((), trial.keys)] if not by_player else [((player,), each) for player, each in trial.keys.items()]
+    named = [(("keys", *place, key), action) for place, each in keys for key, action in each.items()]
+    named += [(("labels", action), action) for action in trial.labels]
+    for path, action in named:
+        if action in names:
+            continue
+        near = difflib.get_close_matches(action, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"the actions are {values.printable(', '.join(names), 100)}"
+        yield Problem(
+            path, f"there is no action {values.show(action)} in actionSpace; {hint}", ("actionSpace", path[0])
+        )
 
 
 def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:

@@ -45,14 +45,22 @@ class Config:
     trial: Trial
     steps: tuple[StepFiles, ...]
     events: Events
+    game_pages: tuple[StepFiles, ...] = ()
+    """The pages that the game page shows; the key of each is the key of `trial` that names it."""
     remarks: tuple[Diagnostic, ...] = ()
 
     @classmethod
-    def of(cls, checked: Checked, steps: list[StepFiles], remarks: Iterable[Diagnostic] = ()) -> Config:
+    def of(
+        cls,
+        checked: Checked,
+        steps: list[StepFiles],
+        game_pages: Iterable[StepFiles] = (),
+        remarks: Iterable[Diagnostic] = (),
+    ) -> Config:
         """What was checked and found free of mistakes."""
         project = checked.root.project
         events = resolve_events(project.events, [step.key for step in steps], project.steps)
-        return cls(project, checked.trial, tuple(steps), events, tuple(remarks))
+        return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks))
 
     def registration(self) -> dict[str, Any]:
         """The project as it is registered: a dict that JSON can hold, in camelCase with every default filled in."""
@@ -63,6 +71,7 @@ class Config:
             "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
+            "gamePages": {each.key: each.variants for each in self.game_pages},
             "trial": self.trial.document(),
         }
 
@@ -70,6 +79,11 @@ class Config:
     def game_steps(self) -> tuple[StepFiles, ...]:
         """The steps that take place on the participant's server."""
         return tuple(step for step in self.steps if step.type.on_server)
+
+    @property
+    def groups(self) -> int:
+        """How many groups of participants there are; 0 if there are none."""
+        return max((page.variants for page in (*self.steps, *self.game_pages)), default=0)
 
     @property
     def own_pages(self) -> list[Path]:
@@ -80,7 +94,7 @@ class Config:
         """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
         parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.game_steps]
-        parts += [f"{step.page} in {step.variants} groups" for step in self.steps if step.variants]
+        parts += [f"{step.page} in {step.variants} groups" for step in (*self.steps, *self.game_pages) if step.variants]
         start, stop = self.events.start_server_step, self.events.stop_server_step
         if start and stop:
             limit = f"at most {self.project.max_runtime} minutes"

@@ -70,6 +70,8 @@ def read_project(folder: Path) -> Config:
     source = read_source(folder)
     checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
     steps, missing_files = _step_files(folder, checked)
+    game_pages, more_missing = _game_pages(folder, checked, steps)
+    missing_files += more_missing
     mistakes = [source.diagnostic(m.path, m.message, line=m.line) for m in (*checked.mistakes, *missing_files)]
     mistakes += [source.diagnostic(m.path, m.message, line=m.line) for m in source.parsed.mistakes]
     agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
@@ -82,7 +84,7 @@ def read_project(folder: Path) -> Config:
         checked.root = checked.root.model_copy(update={"project": project})
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
-    return Config.of(checked, steps, in_order([*source.remarks(), *agent]))
+    return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
 
 
 def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:
@@ -124,3 +126,15 @@ def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[M
         except StepFileError as error:
             mistakes.append(Mistake((*STEPS, key), str(error)))
     return steps, mistakes
+
+
+def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:
+    """The pages that the game page shows with their files, and what is wrong with files."""
+    found: list[StepFiles] = []
+    mistakes: list[Mistake] = []
+    for key, page in checked.trial.pages.items() if any(step.type.on_server for step in steps) else ():
+        try:
+            found.append(StepFiles(key, page, *open_folder(folder).find(page)))
+        except StepFileError as error:
+            mistakes.append(Mistake(("trial", key), str(error)))
+    return found, mistakes

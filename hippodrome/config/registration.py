@@ -23,7 +23,7 @@ from hippodrome.ports import PORTS
 MESSAGE = "message"  # the "file" of problems in a registration
 LIMIT_VARIANTS = 1000
 
-_OURS = ("taskDefinition", "serverPort", "pageFolder")  # what is added, and no config.yml may say
+_OURS = ("taskDefinition", "serverPort", "pageFolder", "gamePages")  # what is added, and no config.yml may say
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
@@ -50,13 +50,13 @@ def parse_registration(data: object) -> dict[str, Any]:
     if mistakes:
         checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
     task = {key: data[key] for key in _OURS if key in data}
-    checked.mistakes += _task_findings(task)
+    checked.mistakes += [*_task_findings(task), *_page_findings(task.get("gamePages", {}), checked.trial.pages)]
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))
     kept = visited(checked.step_keys, checked.root.project.steps)
     config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept])
-    return config.registration() | task
+    return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
 
 
 def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
@@ -68,6 +68,15 @@ def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
         yield Mistake(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
     if task.get("pageFolder", STEPS_FOLDER) not in (STEPS_FOLDER, ""):
         yield Mistake(("pageFolder",), f'must be {STEPS_FOLDER}, or "" for pages right below the project\'s id')
+
+
+def _page_findings(variants: object, pages: Mapping[str, str]) -> Iterator[Mistake]:
+    if not isinstance(variants, dict) or not variants.keys() <= pages.keys():
+        yield Mistake(("gamePages",), "must be a map of the keys of trial that name a page")
+        return
+    for key, number in variants.items():
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= LIMIT_VARIANTS:
+            yield Mistake(("gamePages", key), f"must be a number of groups, 0 to {LIMIT_VARIANTS}")
 
 
 def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:

@@ -12,6 +12,8 @@ from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
 STEPS_FOLDER: Literal["steps"] = "steps"
+GAME_PAGES = ("instructions", "betweenEpisodes")
+"""The keys of `trial` that may name a page."""
 LEGACY_PORT = 5000  # for registrations of earlier versions, which name no port
 MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRuntime is at least this plus the project's
 
@@ -87,6 +89,9 @@ class Project(Record, frozen=True):
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
+    game_pages: Mapping[str, int] = msgspec.field(
+        default_factory=dict
+    )  # variants, by the key of trial that names a page
     page_folder: Literal["steps", ""] = (
         STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
     )
@@ -103,6 +108,12 @@ class Project(Record, frozen=True):
     def game_steps(self) -> list[str]:
         """The keys of the steps that take place on the participant's server; the trial stores their answers."""
         return [step.key for step in self.steps if step.type.on_server]
+
+    @property
+    def pages_in_game(self) -> list[Step]:
+        """The pages that game steps show, each as a step whose key is the key of `trial` that names it."""
+        named = {key: self.trial.get(key) for key in GAME_PAGES} if self.game_steps else {}
+        return [Step(key, page, self.game_pages.get(key, 0)) for key, page in named.items() if isinstance(page, str)]
 
     @property
     def size(self) -> AwsSetup:
@@ -133,7 +144,9 @@ class Project(Record, frozen=True):
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
         """The participant's group at this step if it has variants, else in the study; None if there are no groups."""
-        variants = (step.variants if step else 0) or max((s.variants for s in self.steps), default=0)
+        variants = (step.variants if step else 0) or max(
+            (page.variants for page in (*self.steps, *self.pages_in_game)), default=0
+        )
         return ids.group(self.id, user_id, variants) if variants else None
 
     def file(self, user_id: str, step: Step) -> str:

@@ -172,6 +172,13 @@ $content
     "restart": '<input type="hidden" name="hippodrome-action" value="restart">\n',
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
     "link": '<p><a class="button" href="$link">$text</a></p>\n',
+    "reading": """
+<section id="reading" tabindex="-1" aria-label="To read" hidden>
+<p class="result" id="reading-score"></p>
+$texts
+<p><button type="button" id="reading-button"></button></p>
+</section>""",
+    "text": '<div class="page" id="text-$key" hidden>\n$content\n</div>',
     "stages": """<ol class="stages">
 <li id="stage-queued"$queued_now>Your request has been received</li>
 <li id="stage-starting"$starting_now>A computer is starting for you</li>

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.model.project import Project, Step
@@ -56,6 +56,9 @@ class GameView:
     action: str
     ticket: str
     sources: str  # what the game may connect to, as in a Content-Security-Policy
+    # by the key of `trial` that names it, a researcher's page with its values
+    texts: Mapping[str, tuple[str, Mapping[str, Any]]] = field(default_factory=dict)
+    files: str | None = None  # where the project's files are served, if it is not /steps/{projectId}/
 
 
 # Pages
@@ -105,7 +108,7 @@ def fragment(view: StepView) -> str:
 
 
 def game_page(view: GameView) -> Page:
-    """The page of a game step: waiting and playing."""
+    """The page of a game step: waiting and playing. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     state = str(view.state.get("state", "queued"))
     over = is_over(view.state)
@@ -134,6 +137,7 @@ def game_page(view: GameView) -> Page:
         step=view.step.key,
         ticket=view.ticket,
         data=script_json(data),
+        reading=_reading(view, nonce),
     )
     text = frame(
         view.project,
@@ -227,5 +231,18 @@ def _stages(state: str) -> Html:
 
 
 def _prepared(view: StepView) -> Fragment:
-    hosts = tuple(allowed_sources(view.project.allowed_hosts))
-    return fragments.prepare(view.source, view.files or f"/steps/{view.project.id}/", hosts)
+    return _prepare(view.project, view.source, view.files)
+
+
+def _prepare(project: Project, source: str, files: str | None) -> Fragment:
+    hosts = tuple(allowed_sources(project.allowed_hosts))
+    return fragments.prepare(source, files or f"/steps/{project.id}/", hosts)
+
+
+def _reading(view: GameView, nonce: str) -> Html:
+    """The researcher's pages that the game page shows. They stand last: no id in them hides one of the page's own."""
+    shown = [
+        fill("text", key=key, content=Html(_prepare(view.project, source, view.files).render(values, nonce)))
+        for key, (source, values) in view.texts.items()
+    ]
+    return fill("reading", texts=Html("\n".join(shown))) if shown else Html()

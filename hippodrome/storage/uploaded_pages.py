@@ -25,7 +25,7 @@ def located(documents: Documents, project: Project) -> tuple[Project, list[str]]
 
     `{id}/` comes first, since HIPPO's script has just written there; then `{id}/steps/`.
     """
-    pages = sorted({step.page for step in project.steps if step.type.has_files})
+    pages = sorted({step.page for step in (*project.steps, *project.pages_in_game) if step.type.has_files})
     top = at_top(documents, project.id, pages)
     below = {entry.key for entry in documents.list(f"{project.id}/{STEPS_FOLDER}/")}
     names = {"": _names(top, project.id, ""), STEPS_FOLDER: _names(below, project.id, STEPS_FOLDER)}
@@ -39,7 +39,8 @@ def located(documents: Documents, project: Project) -> tuple[Project, list[str]]
         if groups and step.page in names[folder]:
             problems.append(_both(step, groups))
         steps.append(msgspec.structs.replace(step, variants=groups))
-    return msgspec.structs.replace(project, steps=steps, page_folder=folder), problems
+    in_game = {page.key: _groups(names[folder], page) for page in project.pages_in_game}
+    return msgspec.structs.replace(project, steps=steps, game_pages=in_game, page_folder=folder), problems
 
 
 def _names(keys: Iterable[str], project_id: str, folder: str) -> set[str]:

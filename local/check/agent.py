@@ -87,8 +87,7 @@ def try_agent(
     `say` is told how far it has played, a line for each group. What fails in one group is not looked for in the others.
     """
     folder = folder.resolve()
-    most = max((step.variants for step in config.steps), default=0)
-    groups: list[int | None] = [*range(most)] or [None]
+    groups: list[int | None] = [*range(config.groups)] or [None]
     found: list[Diagnostic] = []
     for group in groups:
         with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
@@ -130,7 +129,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
 
 
 def _has_groups(config: Config) -> bool:
-    return any(step.variants for step in config.steps)
+    return config.groups > 0
 
 
 def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:

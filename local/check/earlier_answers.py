@@ -18,7 +18,15 @@ class EarlierAnswers:
     def __init__(self, folder: Path, config: Config | None, name: str) -> None:
         self._folder = folder
         steps = list(config.steps) if config else []
-        place = next((n for n, step in enumerate(steps) if name in [file.name for file in step.files]), 0)
+        in_game = [file.name for page in (config.game_pages if config else ()) for file in page.files]
+        place = next(
+            (
+                at
+                for at, step in enumerate(steps)
+                if name in [file.name for file in step.files] or (step.type.on_server and name in in_game)
+            ),
+            0,
+        )
         self._steps = steps[:place]
 
     def answers(self, group: int | None) -> list[dict[str, dict[str, Any]]]:

@@ -94,10 +94,9 @@ def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | 
     """The files of the pages in the study's order, and the groups that may see each."""
     if config is None:
         return {name: [None] for name in names if name.endswith(".html")}
-    most = max((step.variants for step in config.steps), default=0)
-    everybody: list[int | None] = [*range(most)] or [None]
+    everybody: list[int | None] = [*range(config.groups)] or [None]
     pages: dict[str, list[int | None]] = {}
-    for step in config.steps:
+    for step in (*config.steps, *config.game_pages):
         for group, file in enumerate(step.files):
             pages[file.name] = [group] if step.variants else everybody
     return pages

@@ -231,7 +231,7 @@ def state(
 
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:
     scores = {"score": tidy(score), "episodeScore": tidy(episode_score)}
-    return scores if next_in is None else scores | {"nextIn": round(next_in, 3)}
+    return scores if next_in is None or math.isinf(next_in) else scores | {"nextIn": round(next_in, 3)}
 
 
 def not_offered(message: Message, ui: Collection[str]) -> str | None:

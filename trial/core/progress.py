@@ -65,7 +65,7 @@ class Progress:
     """One trial's progress. The caller steps and resets the environment and reports the results.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
-    Between two episodes is a break of `betweenEpisodes` seconds, unless the game is held: the caller measures the time,
+    Between two episodes is a break of `betweenEpisodes`, unless the game is held: the caller measures the time,
     takes no step meanwhile, and calls `go_on`.
     """
 
@@ -250,7 +250,7 @@ class Progress:
         if self.episode >= self.config.max_episodes:
             self._end("finished" if self._good_episodes else "failed")
             return
-        if self.playing and self.config.between_episodes > 0:
+        if self.playing and self.config.between_seconds > 0:
             self.state = PlayState.BREAK
             self.controls.clear()  # keys that are held now are meant for the episode that is over
         else:

@@ -26,6 +26,7 @@ in `trial/core/progress.py` and `trial/core/controls.py`, which know one set of 
 from __future__ import annotations
 
 import logging
+import math
 import traceback
 from collections.abc import Callable, Hashable, Mapping
 from enum import Enum
@@ -344,7 +345,7 @@ class Trial:
         if left is not None:
             self._timing.rest()
             if left > 0.0:
-                self.wake_at = self._now + left
+                self.wake_at = self._now + left if left < math.inf else None
                 return False
             progress.go_on()
         elif progress.needs_reset:
@@ -366,11 +367,11 @@ class Trial:
                 self.progress.reset()
 
     def _break_left(self) -> float | None:
-        """Seconds until the next episode; None if this is no break."""
+        """Seconds until the next episode, infinite if the player begins it; None if this is no break."""
         if not self.progress.on_break:
             self._timing.break_over()
             return None
-        return self._timing.break_left(self._now, self.config.between_episodes)
+        return self._timing.break_left(self._now, self.config.between_seconds)
 
     def _begin_episode(self) -> None:
         unfinished = self._unfinished

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import timedelta
 
 from hippodrome import http
@@ -13,6 +14,7 @@ from hippodrome.model.server import Server, State
 from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.sources import rendering, source_of
 from hippodrome.participants.steps.visit import Visit
 from hippodrome.ports import Topic
 from hippodrome.servers.replacement import next_attempt, requestable_attempt
@@ -49,7 +51,14 @@ class GameStep:
         )
         if request.wants_json:
             return http.as_json(200, {"page": _page_for_program(view, request.method), "css": frame.style(), **state})
-        page = pages.game_page(view)
+        sources = {page.key: source_of(self._services, visit, page) for page in project.pages_in_game}
+        view = replace(
+            view,
+            texts={key: (source.text, source.values) for key, source in sources.items()},
+            files=request.steps_folder(project.id),
+        )
+        with rendering(visit, *sources.values()):
+            page = pages.game_page(view)
         return http.html(200, page.html, page.headers)
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:

@@ -17,6 +17,27 @@ __all__ = ["folder"]
 # What is accepted
 
 
+def test_pages_in_the_game_are_found_with_their_groups(folder: Path) -> None:
+    found = read(folder, small(trial="instructions: briefing\nbetweenEpisodes: survey.html\n"))
+    assert [(page.key, page.page, page.variants) for page in found.game_pages] == [
+        ("instructions", "briefing", 3),
+        ("betweenEpisodes", "survey", 0),
+    ]
+    assert found.game_pages[1].files == (folder / "steps" / "survey.html",)
+    assert found.registration()["gamePages"] == {"instructions": 3, "betweenEpisodes": 0}
+    assert found.groups == 3
+
+
+def test_a_page_in_the_game_that_is_not_there_is_named(folder: Path) -> None:
+    text = small(trial="instructions: brief\n")
+    assert one(folder, text) == "trial.instructions: there is no brief.html in steps/"
+
+
+def test_a_study_without_a_game_needs_no_pages_of_one(folder: Path) -> None:
+    text = "project: {id: paper, steps: {1: consent, 2: survey}}\ntrial: {instructions: nowhere}"
+    assert read(folder, text).game_pages == ()
+
+
 def test_a_hippo_project_is_read(folder: Path) -> None:
     found = read(folder, HIPPO)
     assert found.project.id == "paddle-feedback-2"
@@ -77,10 +98,18 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "maxServerHours": None,
         "warmServers": 0,
         "signedLinks": False,
+        "gamePages": {},
         "trial": {
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,
             "betweenEpisodes": 3,
+            "instructions": None,
+            "resetFreeze": 0,
+            "maxSteps": 0,
+            "episodeSeconds": 0,
+            "keys": {},
+            "labels": {},
+            "input": "held",
             "game": "CartPole-v1",
             "dataFile": "episode",
             "s3upload": True,
@@ -97,7 +126,9 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
             },
             "recordObservations": False,
             "lossless": False,
+            "callbackSeconds": 0.5,
             "gym": "none",
+            "scene": None,
             "scene": None,
             "options": {},
         },

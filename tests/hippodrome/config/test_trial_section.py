@@ -18,13 +18,18 @@ STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
 NUMBERS = st.sampled_from([-1, 0, 1, 2, 0.5, 30, 90, 240, 241, 600, 601, 10_000, 10_001, 10**6, 10**6 + 1, 10**9])
 NAMES = st.lists(st.sampled_from(["up", "Up", " up", "noop", "left", "a" * 64, "a" * 65, "İ" * 64, "ß", 3]), max_size=4)
 FLAGS = st.sampled_from([True, False, None, "", "yes", "off", "maybe", 1])
+ACTIONS = st.sampled_from(["up", "Up", 3, "", None, {"a": "up"}, {"Esc": "up"}, {"a": {}}])
 ODD = st.sampled_from(
     [None, "", "x", " 3 ", "0.5", True, [], {}, ["up"], {"left": True}, float("nan"), float("inf"), 10**400]
 )
 KEYS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(
-        ("maxEpisodes", "actionBufferLifespan", "betweenEpisodes", "frameRateStepSize", "callbackSeconds"), NUMBERS
-    ),
+    **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "frameRateStepSize", "callbackSeconds"), NUMBERS),
+    **dict.fromkeys(("maxSteps", "resetFreeze", "episodeSeconds"), NUMBERS),
+    "betweenEpisodes": NUMBERS | st.sampled_from(["pause", "pause.html", "../pause", "game"]),
+    "instructions": st.sampled_from(["rules", "rules.html", "a/b", "game", "é", 3]),
+    "keys": st.dictionaries(st.sampled_from(["a", "A", "Space", "a+b", "Left", "Tab", "p"]), NAMES.map(str) | ACTIONS),
+    "labels": st.dictionaries(st.sampled_from(["up", "Up", "left", ""]), st.sampled_from(["Go", "", 3, "x" * 65])),
+    "input": st.sampled_from(["held", "single", "both"]),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
     **dict.fromkeys(
         (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS
@@ -126,12 +131,15 @@ def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) 
         assert (told["betweenEpisodes"], made.between_episodes) == (seconds, seconds)
 
 
-@pytest.mark.parametrize("value", ["x", True, [], {}, float("nan"), None])
+@pytest.mark.parametrize("value", [True, [], {}, float("nan"), None])
 def test_a_break_of_no_length_is_named(value: Any) -> None:
     if value is None:
         assert trial_section({"betweenEpisodes": value}).between_episodes == 3
         return
-    with pytest.raises(SettingsError, match=r"trial.betweenEpisodes: must be a number from 0 to 600"):
+    with pytest.raises(
+        SettingsError,
+        match=r"trial.betweenEpisodes: must be a number from 0 to 600, not .*; or the name of a file in the steps folder",
+    ):
         trial_section({"betweenEpisodes": value})
 
 

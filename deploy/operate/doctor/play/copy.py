@@ -105,7 +105,7 @@ def page_files(documents: Documents, of: Project) -> dict[str, str]:
     found = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
     if of.page_folder == STEPS_FOLDER:
         return found
-    pages = {of.page_key(file): f"{file}.html" for step in of.steps for file in step.files}
+    pages = {of.page_key(file): f"{file}.html" for step in (*of.steps, *of.pages_in_game) for file in step.files}
     return {key: name for key, name in found.items() if name not in pages.values()} | pages
 
 

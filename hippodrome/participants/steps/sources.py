@@ -1,0 +1,65 @@
+"""A researcher's page for one participant: its text, and the values that it may use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from hippodrome.log import logger
+from hippodrome.model import ids
+from hippodrome.model.project import Step
+from hippodrome.participants import fragments
+from hippodrome.participants.page_error import CONTENT_NOT_FOUND, PageError
+from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.visit import Visit
+
+
+@dataclass(frozen=True, slots=True)
+class PageSource:
+    """A page's text and its values."""
+
+    file: str
+    text: str
+    values: Mapping[str, Any]
+
+
+def source_of(services: StepServices, visit: Visit, page: Step) -> PageSource:
+    """Read the page that this participant sees. Raises `PageError` if it was not uploaded."""
+    project = visit.project
+    file = project.file(visit.user_id, page)
+    text = services.project_cache.page(project, file)
+    if text is None:
+        logger.error("step page missing", extra={"project": project.id, "file": file})
+        said = "It was not uploaded. Please tell whoever invited you."
+        raise PageError(500, "This page is missing", said, CONTENT_NOT_FOUND)
+    return PageSource(file, text, _values(services, visit, page, fragments.records_mentioned(text)))
+
+
+@contextmanager
+def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
+    """Turn a `FragmentError` of these pages into the `PageError` that says so."""
+    try:
+        yield
+    except fragments.FragmentError as error:
+        files = ", ".join(source.file for source in sources)
+        logger.error("step page broken", extra={"project": visit.project.id, "file": files, "line": error.line})
+        raise PageError(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
+
+
+def _values(services: StepServices, visit: Visit, page: Step, mentioned: frozenset[str]) -> Mapping[str, Any]:
+    """The values that a page may use. Records are read only if the page mentions them."""
+    project, user_id, repository = visit.project, visit.user_id, services.repository
+    values: dict[str, Any] = {
+        "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
+        "participant": {"userId": user_id},
+        "group": project.group(user_id, page),
+        "completion_code": ids.completion_code(project.secret, user_id),
+    }
+    if "participant" in mentioned:
+        known = repository.participant(project.id, user_id)
+        values["participant"] = {**(known.link if known else {}), "userId": user_id}
+    named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
+    values["answers"] = {key: services.answers.read(project.id, user_id, key) for key in named}
+    return values

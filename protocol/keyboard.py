@@ -1,0 +1,110 @@
+"""Keys of the keyboard as config.yml names them: by `KeyboardEvent.key`, several held at once joined by `+`.
+
+Source of the names: https://www.w3.org/TR/uievents-key/. A letter is the same key with Shift and without.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+
+from protocol.values import Check, Plain, as_text, printable, show
+
+MOST_AT_ONCE = 4
+"""Keys that may be joined."""
+
+_SPACE = " "
+_NAMED = frozenset(
+    {"ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Enter", "Shift"}
+    | {"Home", "End", "PageUp", "PageDown", "Insert", "Delete", "Backspace"}
+)
+_RESERVED = {
+    "Tab": "it moves the focus to the next button, which people without a mouse need",
+    "Escape": "browsers leave the full screen with it",
+    **dict.fromkeys(("Control", "Alt", "AltGraph", "Meta", "OS", "Fn"), "browsers take it for their own commands"),
+    **dict.fromkeys(("ContextMenu", "PrintScreen", "CapsLock", "NumLock", "ScrollLock"), "it is the system's own"),
+    **{f"F{number}": "browsers have commands of their own for it" for number in range(1, 25)},
+}
+_OTHER_NAMES = {
+    **{name.lower().removeprefix("arrow"): name for name in ("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown")},
+    "spacebar": "Space",
+    "return": "Enter",
+    "esc": "Escape",
+    "ctrl": "Control",
+    "del": "Delete",
+    "plus": "+",
+    "comma": ",",
+    "period": ".",
+    "minus": "-",
+    "slash": "/",
+}
+_CODE = re.compile(r"(?:Key([A-Z])|(?:Digit|Numpad)([0-9]))")  # KeyboardEvent.code
+
+
+def key_name(text: str) -> str:
+    """The key as `KeyboardEvent.key` has it, a letter always small; `Space` is " ". Raises ValueError."""
+    if text in (_SPACE, "Space"):
+        return _SPACE
+    if len(text) == 1 and text.isprintable():
+        lower = text.lower()
+        return lower if len(lower) == 1 else text
+    if text in _NAMED:
+        return text
+    meant = text if text in _RESERVED else _meant(text)
+    if meant in _RESERVED:
+        raise ValueError(f"{meant} cannot be a key of the game: {_RESERVED[meant]}")
+    names = "names are those of KeyboardEvent.key: ArrowLeft, a, Space"
+    raise ValueError(f"there is no key {show(text)}; {f'did you mean {meant}?' if meant else names}")
+
+
+def _meant(text: str) -> str | None:
+    code = _CODE.fullmatch(text)
+    if code:
+        return (code[1] or code[2]).lower()
+    names = {name.lower(): name for name in (*_NAMED, *_RESERVED, "Space")}
+    folded = text.strip().lower()
+    if folded in names or folded in _OTHER_NAMES:
+        return names.get(folded) or _OTHER_NAMES[folded]
+    near = difflib.get_close_matches(folded, names, n=1, cutoff=0.7)
+    return names[near[0]] if near else None
+
+
+def parts(combined: str) -> tuple[str, ...]:
+    """The keys that are joined by `+`, as written; `+` alone and at the end is the key itself."""
+    if combined == "+":
+        return ("+",)
+    if combined.endswith("++"):
+        return (*parts(combined[:-2]), "+")
+    return tuple(part.strip() or _SPACE for part in combined.split("+"))
+
+
+def combination(text: str) -> str:
+    """The keys in a text, each as `key_name` has it, joined by `+`. Raises ValueError with what to write."""
+    given = parts(text if text == _SPACE else text.strip() or _SPACE)
+    found = [key_name(part) for part in given]
+    if len(set(found)) < len(found):
+        raise ValueError("names the same key twice")
+    if len(found) > MOST_AT_ONCE:
+        raise ValueError(f"joins {len(found)} keys; {MOST_AT_ONCE} at most, since few keyboards report more at once")
+    return "+".join(found)
+
+
+def shown(combined: str) -> str:
+    """The combination as it may stand in a sentence."""
+    return printable("+".join("Space" if part == _SPACE else part for part in parts(combined)))
+
+
+def an_action(longest: int) -> Check:
+    """A check for the name of an action, of up to `longest` characters; it is returned in small letters."""
+
+    def check(value: object) -> str:
+        if isinstance(value, int) and not isinstance(value, bool):
+            value = str(value)
+        if isinstance(value, Plain) and not isinstance(value.value, bool):
+            value = value.text
+        found = as_text(value, "the name of an action").lower()
+        if len(found) > longest:
+            raise ValueError(f"must be at most {longest} characters long, not {len(found)}")
+        return found
+
+    return check

@@ -1,0 +1,126 @@
+"""Keys of the keyboard, as config.yml names them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol import keyboard, trial
+
+
+def found(**section: Any) -> trial.Trial:
+    checked, problems = trial.check(section)
+    assert problems == []
+    return checked
+
+
+def said(**section: Any) -> list[str]:
+    _, problems = trial.check(section)
+    return [f"{trial.values.where_of(problem.path)}: {problem.sentence}" for problem in problems]
+
+
+@pytest.mark.parametrize(
+    ("written", "key"),
+    [
+        ("ArrowLeft", "ArrowLeft"),
+        ("Space", " "),
+        (" ", " "),
+        ("A", "a"),
+        ("1", "1"),
+        ("+", "+"),
+        ("ArrowLeft+ArrowUp", "ArrowLeft+ArrowUp"),
+        ("ArrowLeft + Space", "ArrowLeft+ "),
+        ("a++", "a++"),
+        ("ß", "ß"),
+    ],
+)
+def test_a_key_is_called_as_the_browser_calls_it(written: str, key: str) -> None:
+    assert keyboard.combination(written) == key
+    assert keyboard.combination(key) == key
+
+
+def test_the_parts_of_a_combination() -> None:
+    assert keyboard.parts("ArrowLeft+ ") == ("ArrowLeft", " ")
+    assert keyboard.parts("a++") == ("a", "+")
+
+
+@pytest.mark.parametrize(
+    ("written", "why"),
+    [
+        ("Left", 'there is no key "Left"; did you mean ArrowLeft?'),
+        ("arrowleft", 'there is no key "arrowleft"; did you mean ArrowLeft?'),
+        ("KeyW", 'there is no key "KeyW"; did you mean w?'),
+        ("Digit1", 'there is no key "Digit1"; did you mean 1?'),
+        ("Spacebar", 'there is no key "Spacebar"; did you mean Space?'),
+        ("Foo", 'there is no key "Foo"; names are those of KeyboardEvent.key: ArrowLeft, a, Space'),
+        ("Tab", "Tab cannot be a key of the game: it moves the focus to the next button, which people without a mouse need"),
+        ("F5", "F5 cannot be a key of the game: browsers have commands of their own for it"),
+        ("esc", "Escape cannot be a key of the game: browsers leave the full screen with it"),
+        ("ArrowLeft+Ctrl", "Control cannot be a key of the game: browsers take it for their own commands"),
+        ("a+A", "names the same key twice"),
+        ("a+b+c+d+e", "joins 5 keys; 4 at most, since few keyboards report more at once"),
+    ],
+)  # fmt: skip
+def test_what_is_no_key_of_a_game_is_said_with_what_was_meant(written: str, why: str) -> None:
+    assert said(keys={written: "left"}) == [f"keys.{written}: {why}"]
+
+
+@given(st.text(max_size=12))
+def test_any_text_is_a_combination_or_a_sentence(text: str) -> None:
+    try:
+        once = keyboard.combination(text)
+    except ValueError as error:
+        assert str(error)
+    else:
+        assert keyboard.combination(once) == once
+
+
+def test_keys_are_for_all_players_or_by_player() -> None:
+    for_all = found(keys={"ArrowLeft": "Left", "a": "left", "ArrowLeft+ArrowUp": "leftup"})
+    assert for_all.keys_of("player_1") == {"ArrowLeft": "left", "a": "left", "ArrowLeft+ArrowUp": "leftup"}
+    by_player = found(keys={"player_0": {"a": "left"}, "player_1": {"Space": 1}})
+    assert [by_player.keys_of(f"player_{number}") for number in range(3)] == [{"a": "left"}, {" ": "1"}, {}]
+
+
+def test_two_names_of_one_combination_are_refused() -> None:
+    assert said(keys={"a+b": "left", "b+A": "right"}) == ["keys.b+A: is the same as a+b; keep one of them"]
+    assert said(keys={"Space": "left", " ": "right"}) == ["keys. : is the same as Space; keep one of them"]
+
+
+def test_keys_and_labels_of_actions_that_do_not_exist_are_said() -> None:
+    assert said(actionSpace=["left", "right"], keys={"a": "lef", "b": "Right"}, labels={"up": "Up"}) == [
+        'keys.a: there is no action "lef" in actionSpace; did you mean left?',
+        'labels.up: there is no action "up" in actionSpace; the actions are left, right',
+    ]
+    assert said(actionSpace=["left"], keys={"p": {"a": "down"}}) == [
+        'keys.p.a: there is no action "down" in actionSpace; the actions are left'
+    ]
+    assert said(keys={"a": "anything"}) == []  # the environment may name its actions itself
+
+
+def test_keys_are_a_map_of_names() -> None:
+    assert said(keys=["a"]) == [
+        'keys: must be a section: indented lines such as "ArrowLeft: left" below it, not a list'
+    ]
+    assert said(keys={"a": "left", "player_1": {"a": "left"}})[-1] == (
+        "keys.player_1: must be the name of an action, not a map"
+    )
+    assert said(keys={chr(200 + number): "left" for number in range(101)})[-1] == (
+        "keys: must have at most 100 lines, not 101"
+    )
+
+
+def test_a_page_of_the_game_is_a_file_of_the_folder_of_pages() -> None:
+    checked = found(instructions="rules.html", betweenEpisodes="pause")
+    assert checked.pages == {"instructions": "rules", "betweenEpisodes": "pause"}
+    assert checked.between_seconds == float("inf")
+    assert found(betweenEpisodes="2.5").between_seconds == 2.5
+    where = "must be the name of a file in the steps folder, without folders"
+    assert said(instructions="../rules", betweenEpisodes="a/b") == [
+        f'betweenEpisodes: {where}, not "a/b"',
+        f'instructions: {where}, not "../rules"',
+    ]
+    assert said(instructions="game") == ["instructions: a page cannot be called game.html; rename it"]
