@@ -30,7 +30,7 @@ def test_pages_in_the_game_are_found_with_their_groups(folder: Path) -> None:
 
 def test_a_page_in_the_game_that_is_not_there_is_named(folder: Path) -> None:
     text = small(trial="instructions: brief\n")
-    assert one(folder, text) == "trial.instructions: there is no brief.html in steps/"
+    assert one(folder, text) == "trial.instructions: there is no brief.html in steps/; did you mean briefing?"
 
 
 def test_a_study_without_a_game_needs_no_pages_of_one(folder: Path) -> None:
@@ -128,7 +128,6 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
             "lossless": False,
             "callbackSeconds": 0.5,
             "gym": "none",
-            "scene": None,
             "scene": None,
             "options": {},
         },
