@@ -1,0 +1,64 @@
+"""COACH: an agent that takes "good" and "bad" as advice on how to behave better than it does now.
+
+The algorithm is the real-time form of Convergent Actor-Critic by Humans: James MacGlashan, Mark K. Ho, Robert Loftin,
+Bei Peng, Guan Wang, David L. Roberts, Matthew E. Taylor and Michael L. Littman, "Interactive Learning from
+Policy-Dependent Human Feedback" (ICML 2017, arXiv:1701.06049). Its ideas that are here:
+
+* What people say depends on what the learner usually does: the same action is good from a beginner, and nothing
+  special later. Such feedback is an advantage: how much better an action is than the present policy. So it takes the
+  critic's place in an actor-critic, and no reward is needed.
+* The policy climbs its gradient: after a word, each parameter moves along the gradient of log(policy), times the word.
+* An eligibility trace keeps the gradients of the steps before, so that a word also counts for what has led there.
+* People are slow: the trace holds the step that the person saw some steps ago (`delay`), not the newest.
+
+The policy is a softmax of preferences, which are linear in features of the state.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+
+class Coach:
+    """The learner. A word counts `rate`; the trace keeps `decay` of itself each step, and is `delay` steps late."""
+
+    def __init__(self, features: int, actions: int, rate: float, decay: float, delay: int) -> None:
+        self._rate, self._decay = rate, decay
+        self._weights = np.zeros((actions, features))
+        self._trace = np.zeros_like(self._weights)
+        self._unjudged: deque[tuple[np.ndarray, int]] = deque()
+        self._delay = delay
+
+    def probabilities(self, features: np.ndarray) -> np.ndarray:
+        """With which probability it takes each action in a state of these features."""
+        preferences = self._weights @ features
+        weights = np.exp(preferences - preferences.max())
+        return weights / weights.sum()
+
+    def choose(self, features: np.ndarray, chance: np.random.Generator) -> int:
+        """An action, drawn from the policy."""
+        return int(chance.choice(len(self._weights), p=self.probabilities(features)))
+
+    def took(self, features: np.ndarray, action: int) -> None:
+        """Remember what was done. It enters the trace when the person can have judged it."""
+        self._trace *= self._decay
+        self._unjudged.append((features, action))
+        if len(self._unjudged) > self._delay:
+            self._trace += self._gradient(*self._unjudged.popleft())
+
+    def begin(self) -> None:
+        """A new episode: words are no longer about the one before."""
+        self._trace[:] = 0
+        self._unjudged.clear()
+
+    def hear(self, word: float) -> None:
+        """Learn from a word: 1 is good, -1 is bad."""
+        self._weights += self._rate * word * self._trace
+
+    def _gradient(self, features: np.ndarray, action: int) -> np.ndarray:
+        """The gradient of log(probability of the action) by the weights, as the policy is now."""
+        towards = -self.probabilities(features)
+        towards[action] += 1
+        return np.outer(towards, features)

@@ -1,0 +1,47 @@
+"""The garden: a robot drives to its station, around the flowers. The rules, without a picture and without Gymnasium."""
+
+from __future__ import annotations
+
+import numpy as np
+
+WIDTH, HEIGHT = 8, 5
+START, STATION = (0, 0), (7, 0)
+FLOWERS = frozenset((column, 0) for column in range(1, 7))
+"""As in the simulated grid of the COACH paper, the straight way leads through what is to be avoided."""
+MOVES = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
+AT_STATION, ON_FLOWERS = 5.0, -1.0
+LONGEST = 40
+"""Steps after which an episode ends."""
+
+Place = tuple[int, int]
+
+
+class Garden:
+    def reset(self) -> Place:
+        self.place, self.steps = START, 0
+        return self.place
+
+    def step(self, move: int) -> tuple[Place, float, bool, bool]:
+        """Drive a field; the fence stops it. Returns place, reward, terminated, truncated."""
+        self.steps += 1
+        self.place = beside(self.place, move)
+        reward = AT_STATION if self.place == STATION else ON_FLOWERS if self.place in FLOWERS else 0.0
+        return self.place, reward, self.place == STATION, self.steps >= LONGEST
+
+
+def beside(place: Place, move: int) -> Place:
+    """Where a move leads."""
+    right, up = list(MOVES.values())[move]
+    return min(max(place[0] + right, 0), WIDTH - 1), min(max(place[1] + up, 0), HEIGHT - 1)
+
+
+def features(place: Place) -> np.ndarray:
+    """What the learner knows of a place: the field itself, its column and its row.
+
+    What it learns on one field also counts, half as much each, in the same column and in the same row.
+    """
+    found = np.zeros(WIDTH * HEIGHT + WIDTH + HEIGHT)
+    column, row = place
+    found[row * WIDTH + column] = 1
+    found[WIDTH * HEIGHT + column] = found[WIDTH * HEIGHT + WIDTH + row] = 0.5
+    return found
