@@ -20,7 +20,8 @@ import numpy as np
 from trial.policies.observations import MASK, Array, Encoding, Shape, encodings, fitted, shown, without_mask, zero
 from trial.policies.policy import Mask, PolicyError, legal
 
-PACKAGE = "onnxruntime"
+PACKAGE = "onnxruntime==1.32.0"
+"""What runs the files, in the version that was tested (requirements/dev.txt)."""
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
 """Inputs that are no observation, by their value where one observation comes at a time."""
@@ -163,7 +164,7 @@ def _session(spec: str, file: Path) -> Any:
         import onnxruntime  # noqa: PLC0415 - a server without such a policy does without
     except ImportError:
         raise PolicyError(
-            f"{spec} needs the package {PACKAGE}, which is not installed; write {PACKAGE} into requirements.txt"
+            f"{spec} needs the package onnxruntime, which is not installed; write {PACKAGE} into requirements.txt"
         ) from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -288,8 +289,10 @@ def _fit(spec: str, values: Array, port: _Port) -> Array:
 def _drawn(values: Array, allowed: list[int], random: Random) -> int:
     """An action, each as likely as the softmax of the values says."""
     chosen = values[allowed]
-    weights = np.exp(chosen - chosen.max())
-    return random.choices(allowed, weights.tolist())[0]
+    best = chosen.max()
+    if not np.isfinite(best):  # all of these are as good as one another
+        return random.choice([action for action, value in zip(allowed, chosen, strict=True) if value == best])
+    return random.choices(allowed, np.exp(chosen - best).tolist())[0]
 
 
 def _sha256(file: Path) -> str:

@@ -1,0 +1,98 @@
+"""ONNX files for tests: small policies, made by the package `onnx` in the forms that researchers export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+Shape = Sequence[int | str]
+_IR, _OPSET = 8, 17  # what onnxruntime has read since 2022
+
+
+def save(
+    file: Path,
+    nodes: Sequence[Any],
+    inputs: Sequence[tuple[str, Shape]],
+    outputs: Sequence[tuple[str, Shape]],
+    values: dict[str, Any] | None = None,
+    *,
+    types: dict[str, int] | None = None,
+) -> Path:
+    """Write a graph. `values` are its constants, `types` those of inputs and outputs that are no floats."""
+    kinds = types or {}
+    graph = helper.make_graph(
+        list(nodes),
+        "policy",
+        [helper.make_tensor_value_info(name, kinds.get(name, TensorProto.FLOAT), shape) for name, shape in inputs],
+        [helper.make_tensor_value_info(name, kinds.get(name, TensorProto.FLOAT), shape) for name, shape in outputs],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in (values or {}).items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
+    onnx.checker.check_model(model)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    onnx.save(model, str(file))
+    return file
+
+
+def linear(file: Path, weights: Any, *, name: str = "obs", shape: Shape | None = None, output: str = "output") -> Path:
+    """`output = obs @ weights`: one column of weights for each action."""
+    matrix = np.asarray(weights, np.float32)
+    sizes = shape or ("batch", matrix.shape[0])
+    flat = helper.make_node("Reshape", [name, "rows"], ["flat"])
+    product = helper.make_node("MatMul", ["flat", "weights"], [output])
+    rows = np.array([-1, matrix.shape[0]], np.int64)
+    return save(
+        file,
+        [flat, product],
+        [(name, sizes)],
+        [(output, ("batch", matrix.shape[1]))],
+        {"weights": matrix, "rows": rows},
+    )
+
+
+def constant(file: Path, values: Any, *, size: int = 2, dtype: int = TensorProto.FLOAT) -> Path:
+    """Gives these values for every observation of `size` numbers."""
+    row = np.asarray(values)
+    nodes = [
+        helper.make_node("ReduceSum", ["obs"], ["sum"], keepdims=0),
+        helper.make_node("Mul", ["sum", "zero"], ["nothing"]),
+        helper.make_node("Cast", ["nothing"], ["none"], to=dtype),
+        helper.make_node("Add", ["none", "values"], ["output"]),
+    ]
+    return save(
+        file,
+        nodes,
+        [("obs", ("batch", size))],
+        [("output", row.shape)],
+        {"zero": np.float32(0), "values": row},
+        types={"output": dtype},
+    )
+
+
+def counter(
+    file: Path, *, state: tuple[str, str] = ("state_in_0", "state_out_0"), seq_lens: Shape | None = (1,)
+) -> Path:
+    """A recurrent policy of three actions: it takes action 0, 1, 2, 2, … and forgets at a reset."""
+    nodes = [
+        helper.make_node("Add", [state[0], "one"], [state[1]]),
+        helper.make_node("Sub", ["centers", state[0]], ["distance"]),
+        helper.make_node("Abs", ["distance"], ["far"]),
+        helper.make_node("Neg", ["far"], ["near"]),
+        helper.make_node("ReduceSum", ["obs"], ["sum"], keepdims=0),
+        helper.make_node("Mul", ["sum", "zero"], ["nothing"]),
+        helper.make_node("Add", ["near", "nothing"], ["output"]),
+    ]
+    inputs: list[tuple[str, Shape]] = [("obs", ("batch", 2)), (state[0], ("batch", 1))]
+    values = {
+        "one": np.ones((1, 1), np.float32),
+        "centers": np.array([[0, 1, 2]], np.float32),
+        "zero": np.float32(0),
+    }
+    if seq_lens is not None:
+        inputs.append(("seq_lens", seq_lens))
+    return save(file, nodes, inputs, [("output", ("batch", 3)), (state[1], ("batch", 1))], values)
