@@ -164,6 +164,31 @@ def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None
     player.close()
 
 
+def test_the_agent_shown_with_several_players_keeps_the_contract(tmp_path: Path) -> None:
+    import types
+
+    from trial.agent.agent import AgentAdapter
+    from trial.agent.joint import JointAdapter
+    from trial.agent.starting import start
+    from trial.policies.load import load
+
+    agent, partner = code("docs/players.md", "python")
+    (tmp_path / "agent.py").write_text(agent)
+    adapter = start(AgentAdapter(tmp_path, "mine", ("noop", "up", "down")))
+    assert isinstance(adapter, JointAdapter)
+    module = types.ModuleType("agent")
+    exec(partner, vars(module))
+    policy = load("agent:Partner", tmp_path, module, 3)
+    now, _ = adapter.reset(1)
+    policy.reset(1)
+    steps = 0
+    while not now.over:
+        taken = policy.act(now.observations["right"], now.infos.get("right", {}), None)
+        now, steps = adapter.step({"left": 2, "right": taken}), steps + 1
+        assert now.rewards == {"left": 2.0, "right": 1.0}
+    assert (steps, adapter.pictures().shape) == (100, (90, 160, 3))  # type: ignore[union-attr]
+
+
 def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_path: Path) -> None:
     from hippodrome.config import read_project, remarks
     from local.check.agent import try_agent
