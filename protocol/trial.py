@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from protocol import keyboard, values
+from protocol import players as who
+from protocol.players import GYM_PLAYER
 from protocol.values import Check, Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
@@ -376,6 +378,60 @@ class Trial:
             section=Scene,
         ),
     )
+    players: dict[str, Any] = field(
+        default_factory=dict,
+        metadata=_about(
+            who.players,
+            "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
+            "gym://name. One such map for each group, by its number, if groups differ. An environment with one player "
+            "needs none: it is human.",
+            {
+                "type": "object",
+                "additionalProperties": {
+                    "anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]
+                },
+            },
+        ),
+    )
+    frame_skip: int = _whole(1, 1000, 1, "Policies choose anew at one step in so many.")
+    policy_seconds: float = _key(
+        values.number(0, 600),
+        10,
+        "With pace: turns, the seconds that a policy may think; then the idle action is taken.",
+        {"type": "number", "minimum": 0, "maximum": 600},
+    )
+    seed: int | None = _key(
+        values.whole(0, 2**31 - 1_000_001),
+        None,
+        "Seed of the first episode; each one after it has the next number. Without it, each has a random one.",
+        {"type": "integer", "minimum": 0, "maximum": 2**31 - 1_000_001},
+    )
+    pace: str = _key(
+        values.one_of("realtime", "turns"),
+        "realtime",
+        "Whether a step is taken at each frame, or as soon as all have chosen who are to act.",
+        {"enum": ["realtime", "turns"]},
+    )
+    turn_seconds: float = _key(
+        values.number(0, 86_400),
+        0,
+        "With pace: turns, the seconds in which a participant must choose; 0 is no limit.",
+        {"type": "number", "minimum": 0, "maximum": 86_400},
+    )
+    turn_ends: str = _key(
+        values.one_of("idle", "random", "episode"),
+        "idle",
+        "What happens when turnSeconds are over: the idle action, a random possible one, or the episode ends.",
+        {"enum": ["idle", "random", "episode"]},
+    )
+    idle_action: str | dict[str, str] | None = field(
+        default=None,
+        metadata=_about(
+            who.idle_action,
+            "Name of the action of no key, or one for each player. Default: noop, if there is one, else the first.",
+            {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
+        ),
+    )
     options: dict[str, Any] = field(
         default_factory=dict,
         metadata=_about(
@@ -402,6 +458,12 @@ class Trial:
             found: Mapping[str, str] = self.keys.get(player, {})
             return found
         return self.keys
+
+    def players_of(self, group: int | None) -> dict[str, str]:
+        """What plays each player in this group; empty if the section does not say."""
+        if who.by_group(self.players):
+            return dict(self.players.get(str(group), {}))
+        return dict(self.players)
 
     def document(self) -> dict[str, Any]:
         """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""
@@ -462,6 +524,7 @@ def check(section: object) -> tuple[Trial, list[Problem]]:
         _frame_rates,
         _different_actions,
         _actions_that_exist,
+        _programs,
     )
     compared = [problem for rule in rules for problem in rule(trial, given)]
     return trial, problems + [problem for problem in compared if bad.isdisjoint(problem.compared)]
@@ -582,3 +645,15 @@ def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
         if first.setdefault(name, index) != index:
             sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
             yield Problem(("actionSpace", index), sentence, ("actionSpace",))
+
+
+def _programs(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """A program that plays needs a way in."""
+    if trial.gym == "advise":
+        return
+    tables = trial.players.values() if who.by_group(trial.players) else [trial.players]
+    for table in tables:
+        for name, plays in table.items():
+            if plays.startswith(GYM_PLAYER):
+                yield Problem(("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",))
+                return

@@ -26,7 +26,7 @@ from protocol import environment as variables
 from protocol import handover
 from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import About, Callbacks
-from trial.agent.calls import PLAYER
+from trial.core.players import PLAYER
 from trial.server import warm
 from trial.settings import trial_section
 

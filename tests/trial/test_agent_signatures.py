@@ -14,8 +14,9 @@ import pytest
 from trial.agent import signatures
 from trial.agent.agent import AgentAdapter, AgentError, read_step_result
 from trial.agent.calls import AgentCalls
+from trial.core.actions import Action
 from trial.core.effects import StepCall
-from trial.core.progress import Action
+from trial.core.players import PLAYER
 from trial.recordings import recording
 
 AGENT = """
@@ -240,7 +241,9 @@ def test_what_else_is_in_the_dict_is_kept() -> None:
 def line_of(folder: Path, returned: str, more: str = "") -> dict[str, Any]:
     player = started(folder, "return 0, 1.0, False, {}", f"return {returned}", AGENT + more)
     calls = AgentCalls(player, dict, record_observations=False)
-    step = StepCall(limit=1, action=Action(1, "left", True), feedback=(), messages=0, fields={"episode": 1, "step": 1})
+    step = StepCall(
+        limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={"episode": 1, "step": 1}
+    )
     return json.loads(calls.run(step).line)
 
 
@@ -268,7 +271,7 @@ def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
         tmp_path, "return 0, 1.0, False, {}", 'return {"done": False, "small": 1, "large": "x" * 2_000_000, "last": 2}'
     )
     calls = AgentCalls(player, dict, record_observations=False)
-    step = StepCall(limit=1, action=Action(1, "left", True), feedback=(), messages=0, fields={})
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
         lines = [json.loads(calls.run(step).line) for _ in range(3)]
     assert [line["extra"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": 2}] * 3

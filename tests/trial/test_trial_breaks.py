@@ -6,6 +6,7 @@ from itertools import groupby
 
 import pytest
 
+from trial.core.players import PLAYER, alone
 from trial.core.progress import Break, Episode, PlayState, Progress
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
@@ -17,11 +18,11 @@ LONG = {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 600, "ui":
 
 
 def game_in_a_break(**keys):
-    game = Progress(trial_section({"maxEpisodes": 3, **keys}), SPACE)
+    game = Progress(trial_section({"maxEpisodes": 3, **keys}), alone(SPACE))
     game.start()
     game.began()
     game.act("left", True)
-    game.stepped(2.0, True, False)
+    game.stepped({PLAYER: 2.0}, True, False)
     return game
 
 
@@ -39,7 +40,7 @@ def test_the_break_shows_the_episode_that_is_over_and_then_the_next_begins():
 def test_keys_held_when_an_episode_ends_do_nothing_in_the_next():
     game = game_in_a_break()
     game.go_on()
-    assert not game.next_action().human
+    assert not game.next_actions()[PLAYER].human
 
 
 def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_act():
@@ -49,7 +50,7 @@ def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_a
     game.act("left", None)
     game.act("right", True)
     game.go_on()
-    assert [game.next_action().name for _ in range(2)] == ["right", "right"]
+    assert [game.next_actions()[PLAYER].name for _ in range(2)] == ["right", "right"]
 
 
 @pytest.mark.parametrize(
@@ -80,20 +81,20 @@ def test_a_reset_in_a_break_changes_nothing():
 def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
     assert game_in_a_break(maxEpisodes=1).over
     assert game_in_a_break(betweenEpisodes=0).playing
-    game = Progress(trial_section({}), SPACE)
+    game = Progress(trial_section({}), alone(SPACE))
     game.start()
     game.began()
-    game.stepped(1.0, False, False)
+    game.stepped({PLAYER: 1.0}, False, False)
     game.pause()
     game.reset()
     assert (game.state, game.episode) == (PlayState.PAUSED, 2)
 
 
 def test_a_participants_own_reset_is_followed_by_a_break_too():
-    game = Progress(trial_section({}), SPACE)
+    game = Progress(trial_section({}), alone(SPACE))
     game.start()
     game.began()
-    game.stepped(1.0, False, False)
+    game.stepped({PLAYER: 1.0}, False, False)
     game.reset()
     assert game.on_break
 

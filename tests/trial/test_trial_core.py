@@ -16,6 +16,7 @@ from trial.agent.agent import AgentError, read_step_result
 from trial.core import messages
 from trial.core.controls import Controls
 from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.players import PLAYER, alone
 from trial.core.progress import Break, CommandRefused, Episode, PlayState, Progress
 from trial.core.timing import Pacer
 from trial.recordings import recording
@@ -102,7 +103,7 @@ def test_controls_always_have_an_action(events, lifespan):
 
 
 def new_game(**keys):
-    return Progress(trial_section({"allowFrameRateChange": True, **keys}), SPACE)
+    return Progress(trial_section({"allowFrameRateChange": True, **keys}), alone(SPACE))
 
 
 EVENTS = st.one_of(
@@ -127,9 +128,9 @@ def test_game_goes_forward_only(events, limit, pause):
             game.began()
         elif event in ("step", "end"):
             if game.playing and not game.needs_reset:
-                choice = game.next_action()
+                choice = game.next_actions()[PLAYER]
                 assert choice.name == SPACE[choice.index]
-                game.stepped(1.0, event == "end", False)
+                game.stepped({PLAYER: 1.0}, event == "end", False)
                 steps += 1
         else:
             getattr(game, event)()
@@ -154,7 +155,7 @@ def test_every_episode_is_counted_and_the_last_ends_the_trial():
     game.start()
     for _ in range(2):
         game.began()
-        game.stepped(2.0, False, True)
+        game.stepped({PLAYER: 2.0}, False, True)
     assert game.state is PlayState.ENDED
     assert game.outcome == "finished"
     assert [(e.number, e.steps, e.score, e.why) for e in game.ended] == [
@@ -162,7 +163,7 @@ def test_every_episode_is_counted_and_the_last_ends_the_trial():
         (2, 1, 2.0, "truncated"),
     ]
     game.start()
-    game.stepped(1.0, True, False)
+    game.stepped({PLAYER: 1.0}, True, False)
     assert game.state is PlayState.ENDED
     assert game.score == 4.0
 
@@ -194,9 +195,9 @@ def test_an_episode_that_ends_well_forgives_the_failures_before_it():
     for why in ("failed", "failed", "good", "failed", "failed"):
         game.began()
         if why == "good":
-            game.stepped(1.0, True, False)
+            game.stepped({PLAYER: 1.0}, True, False)
         else:
-            game.stepped(1.0, False, False)
+            game.stepped({PLAYER: 1.0}, False, False)
             game.failed()
     assert not game.over
 
@@ -214,9 +215,9 @@ def test_a_press_while_the_game_is_held_does_nothing_when_it_goes_on():
     game.pause()
     game.act("left", None)
     game.start()
-    assert not game.next_action().human
+    assert not game.next_actions()[PLAYER].human
     game.act("left", None)
-    assert game.next_action().name == "left"
+    assert game.next_actions()[PLAYER].name == "left"
 
 
 def test_leaving_lets_go_of_the_keys():
@@ -226,7 +227,7 @@ def test_leaving_lets_go_of_the_keys():
     game.leave()
     assert game.state is PlayState.PAUSED
     game.start()
-    assert game.next_action().human is False
+    assert game.next_actions()[PLAYER].human is False
     with pytest.raises(CommandRefused):
         game.act("jump", None)
 

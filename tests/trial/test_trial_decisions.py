@@ -10,6 +10,7 @@ from testing.imports import imported
 from trial.core import messages
 from trial.core.effects import (
     AgentTimeout,
+    Begun,
     Call,
     Close,
     CloseRecording,
@@ -19,6 +20,7 @@ from trial.core.effects import (
     OpenRecording,
     RecordLine,
     ReplayCall,
+    Replayed,
     ResetCall,
     SaveAnswer,
     SendDone,
@@ -30,6 +32,7 @@ from trial.core.effects import (
     WriteLine,
 )
 from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.players import PLAYER, alone
 from trial.core.progress import Episode
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
@@ -63,7 +66,7 @@ class Driver:
         return self.effects
 
     def begin(self, recorded=None):
-        self.event("start", SPACE, recorded, self.now)
+        self.event("start", alone(SPACE), recorded, self.now)
         return self
 
     def connect(self, connection="tab", player="P1", window=None):
@@ -84,7 +87,7 @@ class Driver:
 
     def reset(self):
         assert isinstance(self.call, ResetCall)
-        return self.returns((b"reset", FRAME))
+        return self.returns(Begun(b"reset", FRAME))
 
     def step(self, reward=1.0, terminated=False):
         """Let the step come that is due, and take it."""
@@ -92,7 +95,7 @@ class Driver:
             self.wait(self.trial.wake_at - self.now)
         call = self.call
         call.heard = len(call.feedback)
-        return self.returns(StepTaken(reward, terminated, False, FRAME, b"step"))
+        return self.returns(StepTaken({PLAYER: reward}, terminated, False, FRAME, b"step"))
 
     def playing(self):
         """A client is connected and the game is on; no step was taken."""
@@ -125,8 +128,8 @@ CORE = [
 
 
 def test_the_core_imports_nothing_that_waits_or_tells_the_time():
-    allowed = {"__future__", "base64", "collections", "dataclasses", "enum", "functools", "io", "itertools", "json",
-               "logging", "math", "numpy", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
+    allowed = {"__future__", "base64", "collections", "dataclasses", "enum", "functools", "hashlib", "io", "itertools", "json",
+               "logging", "math", "numpy", "operator", "re", "struct", "traceback", "typing", "zlib", "trial", "protocol",
                "isal", "PIL"}  # fmt: skip
     for module in CORE:
         names = {name.partition(".")[0] for name in imported(module)}
@@ -138,20 +141,20 @@ def test_the_core_imports_nothing_that_waits_or_tells_the_time():
 
 def test_a_recording_is_opened_before_the_environment_is_reset():
     driver = Driver()
-    first = driver.trial.start(SPACE, None, 100.0)
+    first = driver.trial.start(alone(SPACE), None, 100.0)
     assert first == [OpenRecording(episode=1, seed=7, frame_rate=10, action_space=SPACE)]
     assert not driver.trial.ready
     (call,) = driver.trial.recording_opened(100.0)
     assert isinstance(call, ResetCall)
     assert (call.episode, call.seed) == (1, 7)
-    assert driver.trial.call_returned(call, (b"reset", FRAME), 100.1) == [WriteLine(b"reset")]
+    assert driver.trial.call_returned(call, Begun(b"reset", FRAME), 100.1) == [WriteLine(b"reset")]
     assert driver.trial.ready
     assert driver.trial.wake_at is None, "nothing happens until the player starts"
 
 
 def test_a_recording_that_cannot_be_opened_ends_the_trial_before_anything_is_played():
     driver = Driver()
-    driver.trial.start(SPACE, None, 100.0)
+    driver.trial.start(alone(SPACE), None, 100.0)
     effects = driver.trial.recording_failed(100.0)
     assert not [effect for effect in effects if isinstance(effect, Call)]
     assert effects[-1] == SaveAnswer(None)
@@ -294,11 +297,11 @@ def test_a_step_takes_what_the_keys_say_and_its_line_holds_the_messages():
     driver.now += 0.01
     driver.say(action="right", held=True)
     driver.wait(0.1)
-    assert (driver.call.action.name, driver.call.action.human) == ("right", True)
+    assert (driver.call.actions[PLAYER].name, driver.call.actions[PLAYER].human) == ("right", True)
     fields = driver.call.fields
     assert (fields["episode"], fields["step"], fields["frame"]) == (1, 2, 3)
     assert fields["messages"] == [{"ns": int(driver.now * 1e9) - 100_000_000, "action": "right", "held": True}]
-    driver.returns(StepTaken(1.0, False, False, FRAME, b"step"))
+    driver.returns(StepTaken({PLAYER: 1.0}, False, False, FRAME, b"step"))
     driver.wait(0.1)
     assert "messages" not in driver.call.fields, "each message stands in one line"
 
@@ -436,7 +439,7 @@ def test_a_call_that_comes_back_after_its_time_changes_nothing():
     driver = Driver().playing()
     late = driver.call
     driver.fails(AgentTimeout("no answer within 30 s"))
-    assert driver.event("call_returned", late, StepTaken(5.0, False, False, FRAME, b"late"), driver.now) == []
+    assert driver.event("call_returned", late, StepTaken({PLAYER: 5.0}, False, False, FRAME, b"late"), driver.now) == []
     assert driver.trial.progress.score == 0
 
 
@@ -467,7 +470,7 @@ def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
     driver = Driver().begin(recorded(STEPS, unheard=["good"]))
     assert isinstance(driver.call, ReplayCall)
     assert driver.call.unfinished.seed == 11
-    driver.returns(FRAME)
+    driver.returns(Replayed(FRAME))
     assert driver.records("resume") == [{"episode": 2, "steps": 2}]
     driver.connect()
     driver.say(command="start")
@@ -538,4 +541,4 @@ def test_closing_before_the_agent_has_started_ends_at_once():
     driver = Driver()
     driver.event("close", driver.now)
     assert driver.trial.done
-    assert driver.event("start", SPACE, None, driver.now) == []
+    assert driver.event("start", alone(SPACE), None, driver.now) == []

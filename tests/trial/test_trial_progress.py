@@ -2,8 +2,10 @@
 
 import pytest
 
+from trial.core.actions import Action
 from trial.core.controls import Controls
-from trial.core.progress import Action, CommandRefused, Episode, PlayState, Progress
+from trial.core.players import PLAYER, alone
+from trial.core.progress import CommandRefused, Episode, PlayState, Progress
 from trial.core.timing import Pacer
 from trial.settings import trial_section
 
@@ -11,7 +13,7 @@ SPACE = ("noop", "up", "left")
 
 
 def new_game(**keys):
-    return Progress(trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), SPACE)
+    return Progress(trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), alone(SPACE))
 
 
 def playing(**keys):
@@ -34,20 +36,20 @@ def test_a_game_begins_ready_at_its_first_episode():
 
 def test_steps_and_rewards_count_for_the_episode_and_the_trial():
     game = playing()
-    game.stepped(1.5, False, False)
-    game.stepped(2.0, False, True)
+    game.stepped({PLAYER: 1.5}, False, False)
+    game.stepped({PLAYER: 2.0}, False, True)
     assert counts(game) == (2, 0, 2, 1, 3.5, 0)
     assert game.needs_reset
     game.began()
-    game.stepped(-1.0, True, True)
+    game.stepped({PLAYER: -1.0}, True, True)
     assert game.ended == [Episode(1, 2, 3.5, "truncated"), Episode(2, 1, -1.0, "terminated")]
     assert counts(game) == (3, 0, 3, 2, 2.5, 0)
 
 
 def test_an_episode_that_is_played_again_stands_where_it_was():
     game = new_game()
-    game.stepped(1.0, False, False)
-    game.replayed(4, 2.5)
+    game.stepped({PLAYER: 1.0}, False, False)
+    game.replayed(4, {PLAYER: 2.5})
     assert counts(game) == (1, 4, 5, 0, 3.5, 2.5)
     assert not game.needs_reset
 
@@ -97,7 +99,7 @@ def test_a_good_episode_forgives_the_failures_before_it():
         if fails:
             game.failed()
         else:
-            game.stepped(1.0, True, False)
+            game.stepped({PLAYER: 1.0}, True, False)
         game.began()
     assert (game.over, game.outcome) == (True, "finished")
 
@@ -111,7 +113,7 @@ def test_a_reset_that_fails_is_tried_again_in_the_same_episode():
 
 def test_code_that_will_never_answer_ends_the_trial_at_once():
     game = playing()
-    game.stepped(1.0, False, False)
+    game.stepped({PLAYER: 1.0}, False, False)
     game.failed(fatal=True)
     assert (game.outcome, game.ended) == ("failed", [Episode(1, 1, 1.0, "failed")])
     game.failed(fatal=True)
@@ -121,7 +123,7 @@ def test_code_that_will_never_answer_ends_the_trial_at_once():
 @pytest.mark.parametrize(("how", "outcome"), [("reset", "finished"), ("failed", "failed")])
 def test_the_last_episode_ends_the_trial(how, outcome):
     game = playing(maxEpisodes=1)
-    game.stepped(1.0, False, False)
+    game.stepped({PLAYER: 1.0}, False, False)
     getattr(game, how)()
     assert (game.over, game.outcome, game.ended) == (True, outcome, [Episode(1, 1, 1.0, how)])
     assert counts(game) == (1, 1, 1, 1, 1.0, 1.0)
@@ -131,7 +133,7 @@ def test_a_reset_ends_an_episode_in_which_something_happened():
     game = playing()
     game.reset()
     assert (game.episode, game.ended) == (1, [])
-    game.stepped(1.0, False, False)
+    game.stepped({PLAYER: 1.0}, False, False)
     game.reset()
     assert (game.episode, game.ended, game.needs_reset) == (2, [Episode(1, 1, 1.0, "reset")], True)
 
@@ -141,11 +143,11 @@ def test_a_stop_ends_the_trial_and_lets_go_of_the_keys():
     game.act("up", True)
     game.stop()
     assert (game.state, game.outcome, game.ended) == (PlayState.ENDED, "stopped", [Episode(1, 0, 0.0, "stopped")])
-    assert game.controls.held == ()
+    assert game.controls[PLAYER].held == ()
     assert game.episodes_played == 0
     for again in (game.stop, game.start, game.pause, game.leave, game.reset, game.go_on):
         again()
-    game.stepped(1.0, True, False)
+    game.stepped({PLAYER: 1.0}, True, False)
     assert (game.state, game.outcome, len(game.ended), game.total_steps) == (PlayState.ENDED, "stopped", 1, 0)
 
 
@@ -163,13 +165,13 @@ def test_only_a_game_that_plays_can_be_paused():
 def test_a_break_lets_go_of_the_keys_and_forgets_those_that_came_and_went():
     game = playing(betweenEpisodes=5)
     game.act("up", True)
-    game.stepped(1.0, True, False)
+    game.stepped({PLAYER: 1.0}, True, False)
     assert (game.state, game.on_break, game.episode) == (PlayState.BREAK, True, 1)
-    assert game.controls.held == ()
+    assert game.controls[PLAYER].held == ()
     game.act("left", True)
     game.act("left", False)
     game.go_on()
-    assert (game.state, game.episode, game.next_action()) == (PlayState.PLAYING, 2, Action(0, "noop", False))
+    assert (game.state, game.episode, game.next_actions()[PLAYER]) == (PlayState.PLAYING, 2, Action(0, "noop"))
 
 
 @pytest.mark.parametrize(
@@ -193,15 +195,15 @@ def test_a_press_acts_only_while_the_game_plays_and_a_key_once_it_does():
     game = new_game(actionBufferLifespan=2)
     game.act("up", None)
     game.start()
-    assert game.next_action() == Action(0, "noop", False)
+    assert game.next_actions()[PLAYER] == Action(0, "noop")
     game.act("up", None)
-    assert [game.next_action() for _ in range(3)] == [Action(1, "up", True)] * 2 + [Action(0, "noop", False)]
+    assert [game.next_actions()[PLAYER] for _ in range(3)] == [Action(1, "up", "human")] * 2 + [Action(0, "noop")]
     game.pause()
     game.act("left", True)
     game.start()
-    assert game.next_action() == Action(2, "left", True)
+    assert game.next_actions()[PLAYER] == Action(2, "left", "human")
     game.act("left", False)
-    assert game.next_action() == Action(0, "noop", False)
+    assert game.next_actions()[PLAYER] == Action(0, "noop")
     with pytest.raises(CommandRefused):
         game.act("jump", True)
 

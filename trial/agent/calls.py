@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from trial.agent.agent import AgentAdapter, StepResult
 from trial.agent.callbacks import Callbacks
-from trial.core.effects import Call, FeedbackCall, ReplayCall, ResetCall, StepCall, StepTaken
-from trial.core.progress import Action, Episode
+from trial.core.effects import Begun, Call, FeedbackCall, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
+from trial.core.players import PLAYER, View
+from trial.core.progress import Episode
 from trial.core.unfinished import UnfinishedEpisode
-from trial.pictures.frames import Frame
 from trial.recordings import recording
 
 log = logging.getLogger("trial")
-
-
-PLAYER = "player_0"
-"""The player of an environment that has only one."""
 
 
 class Diverged(Exception):
@@ -26,10 +22,22 @@ class Diverged(Exception):
 
 
 class AgentCalls:
-    """Runs calls, on the agent's thread. `stamp` returns the first fields of each line of the recording."""
+    """Runs calls of an agent with one player, on the agent's thread.
 
-    def __init__(self, agent: AgentAdapter, stamp: Callable[[], dict[str, Any]], *, record_observations: bool) -> None:
+    `stamp` returns the first fields of each line of the recording. `views` is whether the core is told what the player
+    sees.
+    """
+
+    def __init__(
+        self,
+        agent: AgentAdapter,
+        stamp: Callable[[], dict[str, Any]],
+        *,
+        record_observations: bool,
+        views: bool = False,
+    ) -> None:
         self._agent = agent
+        self._views = views
         self._stamp = stamp
         self._record_observations = record_observations
         self.callbacks: Callbacks | None = None
@@ -45,9 +53,9 @@ class AgentCalls:
         if isinstance(call, ResetCall):
             return self._reset(call.episode, call.seed)
         assert isinstance(call, ReplayCall)
-        return self._replay(call.unfinished, call.default_action)
+        return self._replay(call.unfinished, call.default_actions[PLAYER])
 
-    def _reset(self, episode: int, seed: int) -> tuple[bytes, Frame]:
+    def _reset(self, episode: int, seed: int) -> Begun:
         if self.callbacks:
             self.callbacks.session_begins()
         first, info, seeded = self._agent.reset(seed)
@@ -57,9 +65,15 @@ class AgentCalls:
         fields: dict[str, Any] = {"episode": episode, "seed": seed if seeded else None, "info": recording.plain(info)}
         if self._record_observations:
             fields["observation"] = recording.observation(first)
-        return recording.line("reset", **self._stamp(), **fields), frame
+        return Begun(recording.line("reset", **self._stamp(), **fields), frame, self._view(info))
 
-    def _replay(self, unfinished: UnfinishedEpisode, default_action: int) -> Frame:
+    def _view(self, info: Mapping[str, Any]) -> View | None:
+        if not self._views:
+            return None
+        mask = mask_in(info)
+        return View(frozenset({PLAYER}), masks={} if mask is None else {PLAYER: mask})
+
+    def _replay(self, unfinished: UnfinishedEpisode, default_action: int) -> Replayed:
         if not self.callbacks:
             return self._take_again(unfinished, default_action)
         self.callbacks.session_begins()
@@ -69,7 +83,7 @@ class AgentCalls:
         finally:
             self.callbacks.replaying = False
 
-    def _take_again(self, unfinished: UnfinishedEpisode, default_action: int) -> Frame:
+    def _take_again(self, unfinished: UnfinishedEpisode, default_action: int) -> Replayed:
         first, info, seeded = self._agent.reset(unfinished.seed or 0)
         if not seeded or unfinished.seed is None:
             raise Diverged("the environment takes no seed")
@@ -85,7 +99,8 @@ class AgentCalls:
                 raise Diverged("it plays differently now")
             if self.callbacks:
                 self._tell_step(action, result)
-        return self._agent.render()
+            info = result.info
+        return Replayed(self._agent.render(), self._view(info))
 
     def _give_feedback(self, call: FeedbackCall) -> None:
         for word in call.feedback:
@@ -111,11 +126,11 @@ class AgentCalls:
         self.callbacks.stepped({PLAYER: action}, rewards, {PLAYER: result.observation}, {PLAYER: result.info})
 
     def _step(self, call: StepCall) -> StepTaken:
-        stamp, asked = self._stamp(), call.action
+        stamp, asked = self._stamp(), call.actions[PLAYER]
         self._give_feedback(call)
         result = self._agent.step(asked.index)
         frame = self._agent.render()
-        index, name, by = asked.index, asked.name, _origin(asked)
+        index, name, by = asked.index, asked.name, str(asked.by)
         if result.action is not None:
             names = self._agent.action_space
             index, by = result.action, "agent"
@@ -130,7 +145,7 @@ class AgentCalls:
             action=index,
             actionName=name,
             by=by,
-            **({"advice": asked.index} if asked.advised else {}),
+            **({"advice": asked.index} if asked.by == "advice" else {}),
             reward=result.reward,
             terminated=result.terminated,
             truncated=result.truncated,
@@ -138,7 +153,8 @@ class AgentCalls:
             **({"observation": recording.observation(result.observation)} if self._record_observations else {}),
             **(self._extra(result.extra) if result.extra else {}),
         )
-        return StepTaken(result.reward, result.terminated, result.truncated, frame, line)
+        view = self._view(result.info) if self._views else None
+        return StepTaken({PLAYER: result.reward}, result.terminated, result.truncated, frame, line, view)
 
     def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
         kept, too_large = recording.bounded_extra(values)
@@ -152,5 +168,11 @@ class AgentCalls:
         return {"extra": kept}
 
 
-def _origin(asked: Action) -> str:
-    return "human" if asked.human else "advice" if asked.advised else "none"
+def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:
+    """The `action_mask` of an info, as Gymnasium's environments give it: one value for each action."""
+    mask = info.get("action_mask")
+    try:
+        found = None if mask is None else [bool(one) for one in mask]
+    except (TypeError, ValueError):
+        return None
+    return found

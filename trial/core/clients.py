@@ -1,65 +1,71 @@
-"""The connections of all players, and what they have been sent. Pure: it emits effects."""
+"""The connections of all humans, and what they have been sent. Pure: it emits effects."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from trial.core import messages
-from trial.core.effects import Close, Effect, SendDone, SendFrame, SendMessage, SendState
+from trial.core.effects import Close, Effect, Pictures, SendDone, SendFrame, SendMessage, SendState
 from trial.core.flow_control import Window
 from trial.core.progress import Progress
-from trial.pictures.frames import Frame
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
 
 
 @dataclass(slots=True)
 class Client:
-    """A player's connection."""
+    """A human's connection, and the player of the environment that they play."""
 
     connection: Hashable
     window: Window
+    player: str
     sent: tuple[object, ...] = ()
     """The state that was sent last."""
 
 
 class Clients:
-    """Every player has one connection at most, and all of them are shown the same."""
+    """Every human has one connection at most. Each is shown their player's picture, score and turn."""
 
     def __init__(self, emit: Callable[[Effect], None]) -> None:
         self._emit = emit
-        self._by_player: dict[str, Client] = {}
-        self.frame: Frame | None = None
-        """The frame that is shown."""
+        self._by_human: dict[str, Client] = {}
+        self._places: dict[str, str] = {}  # the player of each human, as long as the trial goes on
+        self.pictures: Pictures | None = None
+        """What is shown."""
         self.frame_id = 0
 
-    def add(self, player: str, connection: Hashable, window: Window) -> Client:
-        """Add a connection. One that the player has already must have been removed."""
-        client = self._by_player[player] = Client(connection, window)
+    def add(self, human: str, connection: Hashable, window: Window, places: Sequence[str]) -> Client:
+        """Add a connection. One that the human has already must have been removed.
+
+        A human who comes first gets the first of the `places` that no other human has, or else the first.
+        """
+        if human not in self._places:
+            taken = self._places.values()
+            self._places[human] = next((place for place in places if place not in taken), places[0])
+        client = self._by_human[human] = Client(connection, window, self._places[human])
         return client
 
-    def replace(self, player: str) -> bool:
-        """Close the connection of a player who opens another one; whether there was any."""
-        client = self._by_player.pop(player, None)
+    def replace(self, human: str) -> Client | None:
+        """Close the connection of a human who opens another one; the one that was closed."""
+        client = self._by_human.pop(human, None)
         if client is not None:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
-        return client is not None
+        return client
 
-    def remove(self, connection: Hashable) -> str | None:
-        """Forget a connection that is closed, and return its player; None if it was replaced before."""
-        player = next((player for player, each in self._by_player.items() if each.connection == connection), None)
-        if player is not None:
-            del self._by_player[player]
-        return player
+    def remove(self, connection: Hashable) -> Client | None:
+        """Forget a connection that is closed; None if it was replaced before."""
+        human = next((human for human, each in self._by_human.items() if each.connection == connection), None)
+        return None if human is None else self._by_human.pop(human)
 
     def of(self, connection: Hashable) -> Client | None:
         """The client with this connection; None if it was replaced."""
-        return next((each for each in self._by_player.values() if each.connection == connection), None)
+        return next((each for each in self._by_human.values() if each.connection == connection), None)
 
-    def stalled(self, now: float) -> bool:
-        """Whether one of them has stopped acknowledging frames."""
-        return any(client.window.stalled(now) for client in self._by_player.values())
+    def stalled(self, now: float) -> list[Client]:
+        """Those that have stopped acknowledging frames."""
+        return [client for client in self._by_human.values() if client.window.stalled(now)]
 
     def send(self, client: Client, text: str) -> None:
         """Send a message to one client."""
@@ -67,44 +73,59 @@ class Clients:
 
     def send_all(self, text: str) -> None:
         """Send a message to all clients."""
-        for client in self._by_player.values():
+        for client in self._by_human.values():
             self.send(client, text)
 
-    def send_state(self, progress: Progress, next_in: float | None) -> None:
-        """Send the state to those clients that were sent another one. `next_in`: seconds of a break that are left."""
-        state = state_of(progress)
-        for client in self._by_player.values():
+    def send_state(self, progress: Progress, next_in: float | None, turn_ends_in: float | None = None) -> None:
+        """Send the state to those clients that were sent another one.
+
+        `next_in`: seconds of a break that are left. `turn_ends_in`: the same of a turn.
+        """
+        for client in self._by_human.values():
+            player = client.player
+            state = state_of(progress, player)
             if client.sent == state:
                 continue
             client.sent = state
             text = messages.state(
                 progress.state.value,
                 progress.episode,
-                progress.score,
+                progress.scores[player],
                 progress.frame_rate,
-                episode_score=progress.episode_score,
+                episode_score=progress.episode_scores[player],
                 next_in=next_in,
+                **turn_of(progress, player, turn_ends_in),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
-    def show(self, frame: Frame) -> None:
-        """Show all clients a new frame."""
-        self.frame = frame
+    def show(self, pictures: Pictures) -> None:
+        """Show each client its new picture."""
+        self.pictures = pictures
         self.frame_id = (self.frame_id + 1) & 0xFFFFFFFF
-        for client in self._by_player.values():
-            self._emit(SendFrame(client.connection, frame, self.frame_id))
+        for client in self._by_human.values():
+            self.show_again(client)
 
     def show_again(self, client: Client) -> None:
-        """Show a new client the present frame, if there is one."""
-        if self.frame is not None:
-            self._emit(SendFrame(client.connection, self.frame, self.frame_id))
+        """Show a client its present picture, if there is one."""
+        picture = self.pictures.get(client.player) if isinstance(self.pictures, Mapping) else self.pictures
+        if picture is not None:
+            self._emit(SendFrame(client.connection, picture, self.frame_id))
 
-    def send_done(self, episodes: int, score: float) -> None:
-        """Tell all clients that the trial is over and stored."""
-        for client in self._by_player.values():
-            self._emit(SendDone(client.connection, episodes, score))
+    def send_done(self, episodes: int, scores: Mapping[str, float], score: float) -> None:
+        """Tell all clients that the trial is over and stored. `score` is that of a player who is not in `scores`."""
+        for client in self._by_human.values():
+            self._emit(SendDone(client.connection, episodes, scores.get(client.player, score)))
 
 
-def state_of(progress: Progress) -> tuple[object, ...]:
+def state_of(progress: Progress, player: str) -> tuple[object, ...]:
     """What is sent to clients whenever one of these changes."""
-    return progress.state, progress.episode, progress.score, progress.frame_rate
+    state = (progress.state, progress.episode, progress.scores[player], progress.frame_rate)
+    return state if progress.turns is None else (*state, progress.to_act(player))
+
+
+def turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str, Any]:
+    """What a client is told of the turn: nothing in real time."""
+    if progress.turns is None:
+        return {}
+    mine = progress.to_act(player)
+    return {"to_act": mine, "turn_ends_in": ends_in if mine else None}

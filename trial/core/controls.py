@@ -6,11 +6,10 @@ import math
 from collections.abc import Sequence
 from itertools import combinations, permutations
 
+from trial.core.players import NOOP
+
 DIRECTIONS = frozenset({"up", "down", "left", "right", "fire"})
 """Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
-
-NOOP = "noop"
-"""The action of a step in which no key acts, if the environment has one of this name."""
 
 _COMBINED = 4  # keys that are combined at most; people do not hold more on purpose
 
@@ -19,10 +18,10 @@ class Controls:
     """Held keys and the press buffer of one player.
 
     `action_space` are the names of the environment's actions in their order; `lifespan` is the number of steps
-    that a single press acts for.
+    that a single press acts for. `default` is the action of no key: NOOP or the first, if it is not given.
     """
 
-    def __init__(self, action_space: Sequence[str], lifespan: int) -> None:
+    def __init__(self, action_space: Sequence[str], lifespan: int, default: int | None = None) -> None:
         self.names = tuple(action_space)
         self._index = {name: index for index, name in enumerate(self.names)}
         self._lifespan = lifespan
@@ -31,7 +30,7 @@ class Controls:
         self._unseen: set[str] = set()  # held, but no step has acted on them yet
         self._press: int | None = None
         self._press_left = 0.0
-        self.default = self._index.get(NOOP, 0)
+        self.default = self._index.get(NOOP, 0) if default is None else default
 
     def knows(self, name: str) -> bool:
         """Whether the name is an action, or a key that can be part of one."""
@@ -93,6 +92,22 @@ class Controls:
         index = self._combine(keys)
         return (self.default, False) if index is None else (index, True)
 
+    def choice(self, name: str, held: bool | None) -> int | None:
+        """What a press (`held` is None), or a key that goes down (True) or up (False), chooses turn by turn.
+
+        None if that is no action: keys that go up, that the keyboard repeats, or that act only together with others.
+        """
+        if held is None:
+            return self._index.get(name)
+        if not held:
+            self.release(name)
+            self._tapped.clear()
+            return None
+        if name in self._held:
+            return None
+        self._held.insert(0, name)
+        return self._combined_with(name, self._held[1:_COMBINED])
+
     def _combine(self, keys: list[str]) -> int | None:
         """The action named by the newest key and as many other held keys as possible.
 
@@ -100,11 +115,16 @@ class Controls:
         """
         keys = keys[:_COMBINED]
         for start, newest in enumerate(keys):
-            others = keys[start + 1 :]
-            for size in range(len(others), -1, -1):
-                for rest in combinations(others, size):
-                    for order in permutations((newest, *rest)):
-                        index = self._index.get("".join(order))
-                        if index is not None:
-                            return index
+            index = self._combined_with(newest, keys[start + 1 :])
+            if index is not None:
+                return index
+        return None
+
+    def _combined_with(self, newest: str, others: Sequence[str]) -> int | None:
+        for size in range(len(others), -1, -1):
+            for rest in combinations(others, size):
+                for order in permutations((newest, *rest)):
+                    index = self._index.get("".join(order))
+                    if index is not None:
+                        return index
         return None

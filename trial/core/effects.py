@@ -5,13 +5,19 @@ A connection is whatever the shell uses to name one; the core only compares it. 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from trial.core.progress import Action, Break, Episode
+from trial.core.actions import Action
+from trial.core.players import Player, View
+from trial.core.policies import AskPolicy, Observed
+from trial.core.progress import Break, Episode
 from trial.core.unfinished import UnfinishedEpisode
-from trial.pictures.frames import Frame
+from trial.pictures.picture import Picture
+
+Pictures = Picture | Mapping[str, Picture]
+"""One picture for all, or one for each human."""
 
 # ---- to a client
 
@@ -35,10 +41,10 @@ class SendState:
 
 @dataclass(frozen=True, slots=True)
 class SendFrame:
-    """Send a frame. It replaces a frame that has not been sent yet."""
+    """Send a picture. It replaces a picture that has not been sent yet."""
 
     connection: Hashable
-    frame: Frame
+    frame: Picture
     frame_id: int
 
 
@@ -76,7 +82,7 @@ class Call:
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class ResetCall(Call):
-    """Reset the environment. Returns `(line of the recording, frame)`."""
+    """Reset the environment. Returns a `Begun`."""
 
     episode: int
     seed: int
@@ -84,11 +90,11 @@ class ResetCall(Call):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class ReplayCall(Call):
-    """Take again all steps that an earlier server recorded of an episode. Returns the frame after the last of them."""
+    """Take again all steps that an earlier server recorded of an episode. Returns a `Replayed`."""
 
     unfinished: UnfinishedEpisode
-    default_action: int
-    """What was taken where no key acted."""
+    default_actions: Mapping[str, int]
+    """What was taken where nothing was chosen, by player."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -109,7 +115,8 @@ class FeedbackCall(Call):
 class StepCall(FeedbackCall):
     """Give the agent the words of feedback, then take one step. Returns a `StepTaken`."""
 
-    action: Action
+    actions: Mapping[str, Action]
+    """By player."""
     fields: Mapping[str, Any]
     """More for the step's line of the recording."""
 
@@ -123,14 +130,54 @@ class TellMoved:
 
 
 @dataclass(frozen=True, slots=True)
-class StepTaken:
-    """What came of a step: Gymnasium's reward, terminated and truncated, the new frame, the line of the recording."""
+class Begun:
+    """What came of a reset: the line of the recording, the first picture, and what the players see.
 
-    reward: float
+    `view` is None if all players act and may do everything.
+    """
+
+    line: bytes
+    pictures: Pictures
+    view: View | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StepTaken:
+    """What came of a step: rewards by player, whether the episode is over, the new picture, the line of the recording.
+
+    `view` is as in `Begun`.
+    """
+
+    rewards: Mapping[str, float]
     terminated: bool
     truncated: bool
-    frame: Frame
+    pictures: Pictures
     line: bytes
+    view: View | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What came of a replay: the present picture, and what the players see.
+
+    `observed` is what each policy acted upon in the steps that were taken again, in their order.
+    """
+
+    pictures: Pictures
+    view: View | None = None
+    observed: Mapping[str, Sequence[Observed]] = field(default_factory=dict)
+
+
+# ---- to the policies of players that are no humans
+
+
+@dataclass(frozen=True, slots=True)
+class ResetPolicy:
+    """Begin an episode for the player's policy. It observes again what it acted upon, and its actions are dropped."""
+
+    player: str
+    seed: int
+    observed: Sequence[Observed] = ()
 
 
 # ---- recordings and the answer
@@ -144,6 +191,8 @@ class OpenRecording:
     seed: int
     frame_rate: int
     action_space: tuple[str, ...]
+    players: tuple[Player, ...] = ()
+    """Who plays whom, if there are several players."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +248,8 @@ Effect = (
     | Close
     | Call
     | TellMoved
+    | AskPolicy
+    | ResetPolicy
     | OpenRecording
     | WriteLine
     | RecordLine

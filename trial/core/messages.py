@@ -201,8 +201,16 @@ def controls(
     episode_score: float,
     next_in: float | None = None,
     words: Collection[str] = (),
+    player: str | None = None,
+    players: Collection[str] = (),
+    to_act: bool | None = None,
+    turn_ends_in: float | None = None,
 ) -> str:
-    """The answer to a hello and to `requestUI`. It names the project's own controls only if there are some."""
+    """The answer to a hello and to `requestUI`.
+
+    It names the project's own controls only if there are some, players only if there are several, and `to_act` only
+    turn by turn.
+    """
     return json.dumps(
         {
             "UI": list(ui),
@@ -217,16 +225,37 @@ def controls(
             "maxEpisodes": max_episodes,
             **_scores(score, episode_score, next_in),
             **({"words": list(words)} if words else {}),
+            **({"player": player, "players": list(players)} if len(players) > 1 else {}),
+            **({"pace": "turns"} if to_act is not None else {}),
+            **_turn(to_act, turn_ends_in),
         }
     )
 
 
 def state(
-    state: str, episode: int, score: float, frame_rate: int, *, episode_score: float, next_in: float | None = None
+    state: str,
+    episode: int,
+    score: float,
+    frame_rate: int,
+    *,
+    episode_score: float,
+    next_in: float | None = None,
+    to_act: bool | None = None,
+    turn_ends_in: float | None = None,
 ) -> str:
-    """Where the trial stands, sent whenever one of these changes. `next_in`: seconds of a break that are left."""
+    """Where the trial stands, sent whenever one of these changes.
+
+    `next_in`: seconds of a break that are left. Turn by turn, `to_act`: whether it is the client's turn, and
+    `turn_ends_in`: seconds of it that are left.
+    """
     scores = _scores(score, episode_score, next_in)
-    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores})
+    turn = _turn(to_act, turn_ends_in)
+    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn})
+
+
+def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:
+    said: dict[str, Any] = {} if to_act is None else {"toAct": to_act}
+    return said if ends_in is None else said | {"turnEndsIn": round(ends_in, 3)}
 
 
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:

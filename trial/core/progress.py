@@ -1,13 +1,23 @@
-"""How far a trial is, and the rules of it: playing, pausing, episodes, frame rate, score. Pure; no clock."""
+"""How far a trial is, and the rules of it: playing, pausing, episodes, frame rate, scores, actions. Pure; no clock.
+
+Controls, actions and scores are kept by player (`trial/core/players.py`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 
 from protocol.trial import Trial
-from trial.core.controls import NOOP, Controls
+from trial.core.actions import Action
+from trial.core.controls import Controls
+from trial.core.players import NOOP, Mask, Player, View, allowed, legal, random_action
+from trial.core.policies import Policies
+from trial.core.seeds import policy_seed
+from trial.core.turns import Turns
+
+_NO_ACTION = "that action is not in this game's actionSpace"
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
@@ -31,23 +41,17 @@ class CommandRefused(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Action:
-    """The action of one step. `human`: a person asked for it; `advised`: a program did; otherwise it is the default."""
-
-    index: int
-    name: str
-    human: bool
-    advised: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Episode:
-    """An episode that is over. `why`: terminated, truncated, reset, stopped or failed."""
+    """An episode that is over. `why`: terminated, truncated, reset, stopped, failed, or turnSeconds (a turn's).
+
+    `score` is that of the first human; `scores` are those of all players, if there are several.
+    """
 
     number: int
     steps: int
     score: float
     why: str
+    scores: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +73,26 @@ class Progress:
     takes no step meanwhile, and calls `go_on`.
     """
 
-    def __init__(self, config: Trial, action_space: tuple[str, ...]) -> None:
+    def __init__(self, config: Trial, players: Iterable[Player]) -> None:
+        """`players` are those of the environment, in its order; one of them at least is a human."""
         self.config = config
-        self.action_space = action_space
-        self.controls = Controls(action_space, config.action_buffer_lifespan)
+        self.players = {player.name: player for player in players}
+        self.humans = tuple(name for name, player in self.players.items() if player.human)
+        self.first = self.humans[0]
+        """The human whose action and score stand first in the records."""
+        self.action_space = self.players[self.first].action_space
+        """Of the first human."""
+        self.controls = {
+            name: Controls(self.players[name].action_space, config.action_buffer_lifespan, self.players[name].idle)
+            for name in self.humans
+        }
+        turns = config.pace == "turns"
+        self.turns = Turns(config.turn_seconds) if turns else None
+        self.policies = Policies(
+            (player for player in self.players.values() if not player.human),
+            frame_skip=config.frame_skip,
+            seconds=config.policy_seconds if turns else None,
+        )
         self.state = PlayState.READY
         self.outcome: str | None = None
         self.frame_rate = config.starting_frame_rate
@@ -83,23 +103,47 @@ class Progress:
         self.total_steps = 0
         self.episodes_played = 0
         """Episodes in which at least one step was taken and that are over."""
-        self.score = 0.0
-        """Rewards of the whole trial."""
-        self.episode_score = 0.0
+        self.scores = dict.fromkeys(self.players, 0.0)
+        """Each player's rewards of the whole trial."""
+        self.episode_scores = dict.fromkeys(self.players, 0.0)
         self.needs_reset = True
         """The environment must be reset before the next step."""
         self.ended: list[Episode | Break] = []
         """Episodes and breaks that are over, in order; for the caller to take out."""
         self._failures = 0
         self._good_episodes = 0
-        self._advice: int | None = None
+        self._advice: dict[str, int] = {}
+        self._usual = {  # made once: a step of a single human takes one of these
+            name: tuple(
+                (Action(index, action), Action(index, action, "human"))
+                for index, action in enumerate(self.players[name].action_space)
+            )
+            for name in self.humans
+        }
+        self._view: View | None = None  # None: all act, and may do all
+        self._seed = 0  # of the episode
+
+    @property
+    def several(self) -> bool:
+        """Whether the environment has more than one player."""
+        return len(self.players) > 1
+
+    @property
+    def score(self) -> float:
+        """The first human's rewards of the whole trial."""
+        return self.scores[self.first]
+
+    @property
+    def episode_score(self) -> float:
+        """The first human's rewards of this episode."""
+        return self.episode_scores[self.first]
 
     def resume(self, ended: Sequence[Episode]) -> None:
         """Begin after these episodes, which an earlier server saw. Before anything is played."""
         for episode in ended:
             self.episodes_played += episode.steps > 0
             self.total_steps += episode.steps
-            self.score += episode.score
+            self._add(self.scores, episode.scores or {self.first: episode.score})
             self._good_episodes += episode.why != "failed"
             self.episode = episode.number + 1
         if ended and ended[-1].why == "stopped":
@@ -108,13 +152,18 @@ class Progress:
             self.episode = self.config.max_episodes
             self._end("finished" if self._good_episodes else "failed")
 
-    def replayed(self, steps: int, score: float) -> None:
+    def _add(self, scores: dict[str, float], more: Mapping[str, float]) -> None:
+        for player, score in more.items():
+            if player in scores:
+                scores[player] += score
+
+    def replayed(self, steps: int, scores: Mapping[str, float]) -> None:
         """The episode stands where an earlier server left it."""
         self.needs_reset = False
         self.steps = steps
         self.total_steps += steps
-        self.episode_score = score
-        self.score += score
+        self.episode_scores |= {player: score for player, score in scores.items() if player in self.players}
+        self._add(self.scores, scores)
 
     @property
     def playing(self) -> bool:
@@ -144,10 +193,14 @@ class Progress:
         """Hold the game. In a break: the next episode waits for `start` at its first picture."""
         self._hold("pause")
 
-    def leave(self) -> None:
-        """The player has gone, or another page of theirs plays now: hold the game, let go of the keys."""
+    def leave(self, player: str | None = None) -> None:
+        """The human has gone, or another page of theirs plays now: hold the game, let go of their keys.
+
+        Without `player`, all humans.
+        """
         self._hold("left")
-        self.controls.clear()
+        for name in self.humans if player is None else (player,):
+            self.controls[name].clear()
 
     def _hold(self, why: str) -> None:
         if self.on_break:
@@ -176,53 +229,190 @@ class Progress:
             rate = float(wish)
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
-    def act(self, name: str, held: bool | None, *, lasts: bool = False) -> None:
+    def act(self, name: str, held: bool | None, *, lasts: bool = False, player: str | None = None) -> None:
         """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for other names.
 
         With `lasts` it is an action that acts until the next one, also over pauses and episodes; one of an unknown
-        name ends the one before.
+        name ends the one before. Turn by turn, each press and each key that goes down is a choice; it does nothing if
+        it is not the player's turn. `player` is the first human if it is not given.
         """
+        controls = self.controls[player or self.first]
+        if self.turns is not None:
+            self._choose(player or self.first, name, held)
+            return
         if lasts:
-            self.controls.keep(name)
-        if not self.controls.knows(name) and not (lasts and name == NOOP):
-            raise CommandRefused("that action is not in this game's actionSpace")
+            controls.keep(name)
+        if not controls.knows(name) and not (lasts and name == NOOP):
+            raise CommandRefused(_NO_ACTION)
         if lasts:
             return
         if held is None:
             if self.playing:  # a press while the game is held would act later than it was meant
-                self.controls.press(name)
+                controls.press(name)
         elif held:
-            self.controls.hold(name)
+            controls.hold(name)
         else:
-            self.controls.release(name)
+            controls.release(name)
 
-    def next_action(self) -> Action:
-        """The action of the step that begins now. Advice is for this step, and counts if no key acts."""
-        index, human = self.controls.take()
-        advice, self._advice = self._advice, None
-        if advice is not None and not human:
-            return Action(advice, self.action_space[advice], human=False, advised=True)
-        return Action(index, self.action_space[index], human)
+    def _choose(self, player: str, name: str, held: bool | None) -> None:
+        """A press, or a key going down or up, turn by turn. Raises CommandRefused."""
+        assert self.turns is not None
+        controls = self.controls[player]
+        if not controls.knows(name):
+            raise CommandRefused(_NO_ACTION)
+        index = controls.choice(name, held)
+        if index is None or not self.playing or not self.turns.waits_for(player):
+            return
+        if not allowed(index, self._mask(player)):
+            raise CommandRefused("that move is not possible now")
+        self.turns.choose(player, Action(index, controls.names[index], "human"))
 
-    def advise(self, action: int) -> None:
-        """A program advises this action for the next step. Raises CommandRefused if there is no such action."""
-        if not 0 <= action < len(self.action_space):
-            raise CommandRefused(f"there is no action {action}; there are 0 to {len(self.action_space) - 1}")
-        self._advice = action
+    def _mask(self, player: str) -> Mask | None:
+        return None if self._view is None else self._view.masks.get(player)
+
+    def next_actions(self) -> Mapping[str, Action]:
+        """Each player's action of the step that begins now. Advice is for this step, and counts if no key acts."""
+        view, turns = self._view, self.turns
+        actions: dict[str, Action] = {}
+        for name, player in self.players.items():
+            if view is not None and name not in view.to_act:
+                actions[name] = Action(player.idle, player.action_space[player.idle], acts=False)
+            elif turns is not None:
+                actions[name] = turns.chosen[name]
+            elif player.human:
+                actions[name] = self._asked_for(player)
+            else:
+                actions[name] = self.policies.take(name, self._mask(name), self.steps)
+        if self._advice:
+            self._advice.clear()
+        return actions
+
+    def _asked_for(self, player: Player) -> Action:
+        """The action of a human in real time. One that is not possible now is not taken."""
+        name = player.name
+        index, human = self.controls[name].take()
+        advice = self._advice.get(name) if self._advice and not human else None
+        mask = self._mask(name)
+        if advice is not None and allowed(advice, mask):
+            return Action(advice, player.action_space[advice], "advice")
+        if mask is not None and not allowed(index, mask):
+            index, human = legal(index, player, mask), False
+        return self._usual[name][index][human]
+
+    # ---- turn by turn
+
+    def policies_choose(self, now: float) -> None:
+        """Turn by turn: take the choices of those policies that have answered, or whose time is over."""
+        turns = self.turns
+        for name in self._waiting():
+            if turns is not None and name in self.policies:
+                action = self.policies.choice(name, self._mask(name), now)
+                if action is not None:
+                    turns.choose(name, action)
+
+    def turn_over(self) -> None:
+        """The time of the turn is over: choose for the humans who did not, or end the episode (`turnEnds`).
+
+        What a program advises counts before that.
+        """
+        turns = self.turns
+        for name in self._waiting():
+            player, mask = self.players[name], self._mask(name)
+            if turns is None or not player.human:
+                continue
+            advice = self._advice.get(name)
+            if advice is not None and allowed(advice, mask):
+                turns.choose(name, Action(advice, player.action_space[advice], "advice"))
+            elif self.config.turn_ends == "episode":
+                self._good_episodes += 1
+                self._end_episode("turnSeconds")
+                return
+            elif self.config.turn_ends == "random":
+                index = random_action(player, mask, policy_seed(self._seed, f"{name}/{self.steps}"))
+                turns.choose(name, Action(index, player.action_space[index], "random"))
+            else:
+                index = legal(player.idle, player, mask)
+                turns.choose(name, Action(index, player.action_space[index]))
+
+    def _waiting(self) -> tuple[str, ...]:
+        turns = self.turns
+        return () if turns is None else tuple(name for name in self.players if turns.waits_for(name))
+
+    @property
+    def humans_waited_for(self) -> bool:
+        """Turn by turn: the game waits for a human."""
+        return any(self.players[name].human for name in self._waiting())
+
+    def policies_until(self) -> float | None:
+        """Turn by turn: when the time of a policy that the game waits for is over."""
+        return self.policies.until(self._waiting())
+
+    def to_act(self, player: str) -> bool:
+        """Turn by turn: whether it is the player's turn, and they have not chosen."""
+        return self.playing and self.turns is not None and self.turns.waits_for(player)
+
+    # ---- programs
+
+    def advise(self, action: int, player: str | None = None) -> None:
+        """A program advises this action for the next step, or chooses it for a player that it plays.
+
+        `player` is the one that a program plays, or the first human, if it is not given. Raises CommandRefused if there
+        is no such action or player.
+        """
+        known = self._player_of_program(player)
+        player = known.name
+        if not known.human and not known.by_program:
+            raise CommandRefused(f"the project has another policy for {player}")
+        if not 0 <= action < len(known.action_space):
+            raise CommandRefused(f"there is no action {action}; there are 0 to {len(known.action_space) - 1}")
+        if known.human:
+            self._advice[player] = action
+        else:
+            self.policies.advise(player, action)
+
+    def action_space_of(self, player: str | None) -> tuple[str, ...]:
+        """The names of the actions that `advise` takes. Raises CommandRefused if there is no such player."""
+        return self._player_of_program(player).action_space
+
+    def _player_of_program(self, player: str | None) -> Player:
+        """The player that a program names, or the one that it means if it names none. Raises CommandRefused."""
+        if player is None:
+            player = next((each.name for each in self.players.values() if each.by_program), self.first)
+        known = self.players.get(player)
+        if known is None:
+            raise CommandRefused(f"there is no such player; there are {', '.join(self.players)}")
+        return known
+
+    # ---- steps
+
+    def begins(self, seed: int) -> None:
+        """The environment is being reset with this seed."""
+        self._seed = seed
+        self.policies.begin()
 
     def began(self) -> None:
         """The environment has been reset: the episode stands at its first picture."""
-        self._advice = None
+        self._advice.clear()
         self.needs_reset = False
 
-    def stepped(self, reward: float, terminated: bool, truncated: bool) -> None:
+    def see(self, view: View | None, now: float) -> None:
+        """This is what the players see now. None: all of them act, and all actions are possible."""
+        self._view = view
+        if self.turns is not None:
+            to_act = frozenset(self.players) if view is None else view.to_act & self.players.keys()
+            self.turns.begin(to_act)
+            self.policies.turn(to_act, now)
+
+    def stepped(self, rewards: Mapping[str, float], terminated: bool, truncated: bool) -> None:
         """A step was taken."""
         if self.over:
             return
         self.steps += 1
         self.total_steps += 1
-        self.score += reward
-        self.episode_score += reward
+        scores, episode_scores = self.scores, self.episode_scores
+        for player, reward in rewards.items():
+            scores[player] += reward
+            episode_scores[player] += reward
         if terminated or truncated:
             self._failures = 0
             self._good_episodes += 1
@@ -241,7 +431,8 @@ class Progress:
             self._end_episode("failed")
 
     def _close_episode(self, why: str) -> None:
-        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why))
+        scores = dict(self.episode_scores) if self.several else {}
+        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why, scores))
         if self.steps > 0:
             self.episodes_played += 1
 
@@ -252,20 +443,21 @@ class Progress:
             return
         if self.playing and self.config.between_seconds > 0:
             self.state = PlayState.BREAK
-            self.controls.clear()  # keys that are held now are meant for the episode that is over
+            self._clear()  # keys that are held now are meant for the episode that is over
         else:
             self._next_episode()
 
     def _end_break(self, why: str, state: PlayState) -> None:
         self.ended.append(Break(self.episode, why))
-        self.controls.forget_taps()  # keys that go down in the break act in the next episode if they are held then
+        for controls in self.controls.values():
+            controls.forget_taps()  # keys that go down in the break act in the next episode if they are held then
         self.state = state
         self._next_episode()
 
     def _next_episode(self) -> None:
         self.episode += 1
         self.steps = 0
-        self.episode_score = 0.0
+        self.episode_scores = dict.fromkeys(self.players, 0.0)
         self.needs_reset = True
 
     def _end_all(self, break_why: str, outcome: str) -> None:
@@ -280,4 +472,9 @@ class Progress:
     def _end(self, outcome: str) -> None:
         self.state = PlayState.ENDED
         self.outcome = outcome
-        self.controls.clear()
+        self._clear()
+
+    def _clear(self) -> None:
+        """Let go of all keys."""
+        for controls in self.controls.values():
+            controls.clear()

@@ -55,6 +55,13 @@ class Timing:
             self._due = self._pacer.next(now, frame_rate)
         return self._due
 
+    def turn_due(self, frame_rate: int) -> float | None:
+        """When the next step is due turn by turn, if all have chosen; None: at once.
+
+        The rhythm only keeps it from coming before the step before was seen.
+        """
+        return None if self._last_step is None else self._last_step + 1.0 / frame_rate
+
     def stepped(self, now: float, frame_rate: int) -> None:
         """A step was taken."""
         self.seconds += 1.0 / frame_rate if self._last_step is None else now - self._last_step

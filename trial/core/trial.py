@@ -6,21 +6,22 @@ method returns, in their order. All times are seconds of one monotonic clock.
 
 Events in:
   already_played, start, agent_failed    what the store holds of the step, and whether the agent has started
-  connect, disconnect, receive           clients; each connection belongs to a player
+  connect, disconnect, receive           clients; each connection belongs to a human
   call_returned, call_failed             the agent's thread has finished the call that it was given
+  policy_acted, policy_failed            the policy of a player that is no human has answered
   recording_opened, recording_failed, answer_saved        the store
   advance                                the time `wake_at` has come
   close                                  the server must end
 
-Effects out: messages, states and frames for connections; one call at a time for the agent; lines for the recording; the
-answer; lines for the log.
+Effects out: messages, states and pictures for connections; one call at a time for the agent; questions for policies;
+lines for the recording; the answer; lines for the log.
 
 Phases: STARTING until the store was read and the agent has started, PLAYING, SAVING (the last lines, then recordings
 and the answer), then FINISHED (the answer is stored) or CLOSED (there is no answer: the server had to end, or the game
 could not begin).
 
-Several players: connections are kept by player, and every client is shown the same. What a player's keys do is decided
-in `trial/core/progress.py` and `trial/core/controls.py`, which know one set of keys so far.
+A player is a place of the environment (`trial/core/players.py`): a human plays it, or a policy. Each connection belongs
+to a human, and each human plays one player. Keys, actions and scores are kept by player in `trial/core/progress.py`.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ from __future__ import annotations
 import logging
 import math
 import traceback
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from typing import Any, Literal
 
 from trial.core import messages
-from trial.core.clients import Client, Clients, state_of
+from trial.core.clients import Client, Clients, state_of, turn_of
 from trial.core.effects import (
     AgentTimeout,
+    Begun,
     Call,
     CloseRecording,
     Effect,
@@ -43,9 +45,12 @@ from trial.core.effects import (
     Log,
     LogAgentError,
     OpenRecording,
+    Pictures,
     RecordLine,
     ReplayCall,
+    Replayed,
     ResetCall,
+    ResetPolicy,
     SaveAnswer,
     StepCall,
     StepTaken,
@@ -54,15 +59,18 @@ from trial.core.effects import (
 )
 from trial.core.flow_control import Window
 from trial.core.message_log import MessageLog
+from trial.core.players import Player, View, alone
+from trial.core.policies import FAILURES, Observed
 from trial.core.progress import Break, CommandRefused, Episode, Progress
+from trial.core.seeds import policy_seed
 from trial.core.timing import Timing
 from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
-from trial.pictures.frames import Frame
 from trial.settings import Settings
 
 LAST_CALL_SECONDS = 2.0
 """The time that a call of the agent has to come back once the server must end."""
 
+_POLICY_FAILURES_SAID = 20
 EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
 EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
 TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
@@ -92,7 +100,7 @@ class Trial:
         """The agent has callbacks, which are told of the end of each episode and of players who come and go."""
         self.wake_at: float | None = None
         """When `advance` is to be called if nothing else happens before; None: there is no need to."""
-        self.progress = Progress(self.config, self.config.action_space or ("noop",))
+        self.progress = Progress(self.config, alone(self.config.action_space or ("noop",)))
         self._new_seed = new_seed
         self._effects: list[Effect] = []
         self._clients = Clients(self._emit)
@@ -113,12 +121,13 @@ class Trial:
         self._break_shut_down = False
         self._last_lines_written = False
         self._met: set[str] = set()  # players whose participants have been here
+        self._said: set[str] = set()  # of policies, in the log
         self._now = 0.0
 
     @property
     def broken(self) -> bool:
         """The game could not even begin: there is no frame, and there will be no answer. Certain once it is `ready`."""
-        return self.progress.outcome == "failed" and self._clients.frame is None
+        return self.progress.outcome == "failed" and self._clients.pictures is None
 
     @property
     def finished(self) -> bool:
@@ -152,12 +161,12 @@ class Trial:
         self.progress.failed(fatal=True)
         return self.advance(now)
 
-    def start(self, action_space: tuple[str, ...], recorded: RecordedTrial | None, now: float) -> list[Effect]:
-        """The agent has started, and this is what earlier servers recorded of the step."""
+    def start(self, players: Sequence[Player], recorded: RecordedTrial | None, now: float) -> list[Effect]:
+        """The agent has started: these are the environment's players, and what earlier servers recorded of the step."""
         if self.phase is not Phase.STARTING:
             return []
         self.phase = Phase.PLAYING
-        self.progress = Progress(self.config, action_space)
+        self.progress = Progress(self.config, players)
         if recorded is not None:
             self.progress.resume(recorded.ended)
             self._unfinished = recorded.unfinished
@@ -166,23 +175,24 @@ class Trial:
 
     # ---- events: clients
 
-    def connect(self, player: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
-        """A player's client has connected, once the trial is `ready`. It replaces an earlier one of this player.
+    def connect(self, human: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
+        """A human's client has connected, once the trial is `ready`. It replaces an earlier one of this human.
 
         `window` knows the acknowledgements of this connection.
         """
         self._now = now
-        if self._clients.replace(player):
-            self._left(player)
-        client = self._clients.add(player, connection, window)
+        replaced = self._clients.replace(human)
+        if replaced is not None:
+            self._left(replaced)
+        client = self._clients.add(human, connection, window, self.progress.humans)
         self._note("connected")
         if self.finished:
             self._send_done()
             return self._take_effects()
-        self._tell_moved("on_return" if player in self._met else "on_join", player)
-        self._met.add(player)
-        self._clients.send(client, self._controls())
-        client.sent = state_of(self.progress)
+        self._tell_moved("on_return" if client.player in self._met else "on_join", client.player)
+        self._met.add(client.player)
+        self._clients.send(client, self._controls(client))
+        client.sent = state_of(self.progress, client.player)
         if self._failed_words is not None:
             self._clients.send(client, messages.error(self._failed_words))
         elif self._begun_again == self.progress.episode and not self.progress.steps:
@@ -191,12 +201,12 @@ class Trial:
         return self.advance(now)
 
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
-        """A connection is closed. The game is held until its player starts it again."""
+        """A connection is closed. The game is held until its human starts it again."""
         self._now = now
-        player = self._clients.remove(connection)
-        if player is None:
+        client = self._clients.remove(connection)
+        if client is None:
             return []
-        self._left(player)
+        self._left(client)
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
@@ -211,11 +221,15 @@ class Trial:
             self._clients.send(client, messages.error(str(error)))
         return self.advance(now)
 
-    def advise(self, action: int) -> None:
-        """A program that may do so advises an action for the next step. Raises CommandRefused."""
+    def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
+        """A program that may do so advises an action for the next step, or chooses it for a player that it plays.
+
+        `player` as in `Progress.advise`. Raises CommandRefused.
+        """
         if self.phase is not Phase.PLAYING:
             raise CommandRefused("no game is going on")
-        self.progress.advise(action)
+        self.progress.advise(action, player)
+        return self.advance(now) if self.progress.turns is not None else []
 
     # ---- events: the agent
 
@@ -231,10 +245,7 @@ class Trial:
         elif isinstance(call, ReplayCall):
             self._replayed(call.unfinished, result)
         else:
-            line, frame = result
-            self._emit(WriteLine(line))
-            self.progress.began()
-            self._show(frame)
+            self._began(result)
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
@@ -263,6 +274,24 @@ class Trial:
                 self._repeat_feedback(call.unfinished)
         return self.advance(now)
 
+    # ---- events: policies
+
+    def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
+        """The player's policy chose this action. An answer to an earlier question changes nothing."""
+        self._now = now
+        wrong = self.progress.policies.acted(player, ask_id, action)
+        if wrong is not None:
+            self._policy_failed(player, wrong)
+        # In real time the answer waits for the next step.
+        return self.advance(now) if wrong is not None or self.progress.turns is not None else []
+
+    def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
+        """The player's policy raised this error."""
+        self._now = now
+        if self.progress.policies.failed(player, ask_id):
+            self._policy_failed(player, "".join(traceback.format_exception_only(error)).strip()[:2000])
+        return self.advance(now)
+
     # ---- events: the store
 
     def recording_opened(self, now: float) -> list[Effect]:
@@ -270,9 +299,10 @@ class Trial:
         self._now, self._recording, self._opening = now, True, False
         unfinished, self._unfinished = self._unfinished, None
         if unfinished is not None and unfinished.steps:
-            default = self.progress.controls.default
+            self.progress.begins(self._seed)
+            default = {name: player.idle for name, player in self.progress.players.items()}
             self._start_call(
-                ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_action=default)
+                ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_actions=default)
             )
         else:
             if unfinished is not None:
@@ -352,7 +382,11 @@ class Trial:
             self._begin_episode()
         elif not progress.playing:
             self._timing.rest()
+            if progress.turns is not None:
+                progress.turns.hold(self._now)
             return False
+        elif progress.turns is not None:
+            return self._turn_if_over()
         else:
             return self._step_if_due()
         return True
@@ -375,22 +409,50 @@ class Trial:
 
     def _begin_episode(self) -> None:
         unfinished = self._unfinished
-        self._seed = self._new_seed() if unfinished is None or unfinished.seed is None else unfinished.seed
+        self._seed = self._next_seed() if unfinished is None or unfinished.seed is None else unfinished.seed
         if self._recording:
             self._reset()
             return
         self._opening = True
         progress = self.progress
-        self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space))
+        players = tuple(progress.players.values()) if progress.several else ()
+        self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space, players))
+
+    def _next_seed(self) -> int:
+        first = self.config.seed
+        return self._new_seed() if first is None else first + self.progress.episode - 1
 
     def _reset(self) -> None:
+        self.progress.begins(self._seed)
+        self._reset_policies({})
         self._start_call(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
 
-    def _replayed(self, unfinished: UnfinishedEpisode, frame: Frame) -> None:
+    def _reset_policies(self, observed: Mapping[str, Sequence[Observed]]) -> None:
+        for player in self.progress.policies.asked:
+            seed = policy_seed(self._seed, player.name)
+            self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
+
+    def _began(self, begun: Begun) -> None:
+        self._emit(WriteLine(begun.line))
+        self.progress.began()
+        self._see(begun.view)
+        self._show(begun.pictures)
+
+    def _see(self, view: View | None) -> None:
+        """The players see this, and those that are no humans are asked."""
+        progress = self.progress
+        progress.see(view, self._now)
+        if view is not None and progress.policies:
+            for ask in progress.policies.asks(view, progress.steps, self._now):
+                self._emit(ask)
+
+    def _replayed(self, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
         steps = len(unfinished.steps)
         self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
-        self.progress.replayed(steps, unfinished.score)
-        self._show(frame)
+        self._reset_policies(replayed.observed)
+        self.progress.replayed(steps, unfinished.scores or {self.progress.first: unfinished.score})
+        self._see(replayed.view)
+        self._show(replayed.pictures)
         self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
         self._repeat_feedback(unfinished)
 
@@ -404,10 +466,40 @@ class Trial:
             self.wake_at = due
             return False
         self._timing.skip()
-        if self._clients.stalled(self._now):
+        if self._paused_by_stalled():
+            return True
+        self._take_step()
+        return False
+
+    def _paused_by_stalled(self) -> bool:
+        """Pause if a page has stopped answering; whether that is so."""
+        stalled = self._clients.stalled(self._now)
+        for client in stalled:
             self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering")
-            self.progress.leave()
+            self.progress.leave(client.player)
+        return bool(stalled)
+
+    def _turn_if_over(self) -> bool:
+        """Take the step of this turn once all have chosen; whether there is another thing to do at this time."""
+        progress, turns, now = self.progress, self.progress.turns, self._now
+        assert turns is not None
+        turns.run(now)
+        progress.policies_choose(now)
+        ends_in = turns.ends_in(now) if progress.humans_waited_for else None
+        if ends_in is not None and ends_in <= 0.0:
+            progress.turn_over()
+            return True
+        if turns.waiting:
+            until = progress.policies_until()
+            ends = [until] if until is not None else []
+            self.wake_at = min([*ends, now + ends_in] if ends_in is not None else ends, default=None)
+            return False
+        due = self._timing.turn_due(progress.frame_rate)
+        if due is not None and now < due:
+            self.wake_at = due
+            return False
+        if self._paused_by_stalled():
             return True
         self._take_step()
         return False
@@ -427,7 +519,7 @@ class Trial:
         self._start_call(
             StepCall(
                 limit=self.settings.step_seconds,
-                action=progress.next_action(),
+                actions=progress.next_actions(),
                 feedback=self._messages.feedback,
                 messages=len(said),
                 fields=fields,
@@ -438,11 +530,14 @@ class Trial:
         self._emit(WriteLine(step.line))
         self._messages.recorded(call.messages, len(call.feedback))
         self._timing.stepped(self._now, self.progress.frame_rate)
-        self.progress.stepped(step.reward, step.terminated, step.truncated)
-        self._show(step.frame)
+        progress, ended = self.progress, len(self.progress.ended)
+        progress.stepped(step.rewards, step.terminated, step.truncated)
+        if len(progress.ended) == ended and (step.view is not None or progress.turns is not None):
+            self._see(step.view)
+        self._show(step.pictures)
 
-    def _show(self, frame: Frame) -> None:
-        self._clients.show(frame)
+    def _show(self, pictures: Pictures) -> None:
+        self._clients.show(pictures)
         self.ready = True
 
     def _start_call(self, call: Call) -> None:
@@ -471,7 +566,7 @@ class Trial:
         over = self.progress.ended.pop(0)
         fields: dict[str, Any] = {"episode": _number(over)}
         if not isinstance(over, Break):
-            fields |= {"steps": over.steps, "score": messages.tidy(over.score)}
+            fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
         fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
         self._emit(RecordLine("break" if isinstance(over, Break) else "end", fields))
         self._messages.recorded(call.messages, len(call.feedback))
@@ -496,7 +591,7 @@ class Trial:
                         "episode": progress.episode,
                         "steps": progress.steps,
                         "why": "shutdown",
-                        "score": messages.tidy(progress.episode_score),
+                        **_scores(progress.episode_score, progress.episode_scores if progress.several else {}),
                         "messages": self._messages.messages,
                     },
                 )
@@ -514,7 +609,7 @@ class Trial:
         progress = self.progress
         return {
             "episodes": progress.episodes_played,
-            "score": messages.tidy(progress.score),
+            **_scores(progress.score, progress.scores if progress.several else {}),
             "frames": progress.total_steps,
             "seconds": round(self._timing.seconds, 3),
             "trial": self.id,
@@ -528,6 +623,20 @@ class Trial:
         self._emit(LogAgentError(error))
         self._emit(RecordLine("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
 
+    def _policy_failed(self, player: str, words: str) -> None:
+        """Say in the log and in the recording that a policy has failed, once for each reason."""
+        plays = self.progress.players[player].plays
+        said = [f"the policy of {player} ({plays}) failed: {words}"]
+        if self.progress.policies.idles(player):
+            said.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")
+        for text in said:
+            if text in self._said or len(self._said) >= _POLICY_FAILURES_SAID:
+                continue
+            self._said.add(text)
+            self._emit(Log(logging.ERROR, text))
+            where = {"episode": self.progress.episode, "step": self.progress.steps, "player": player}
+            self._emit(RecordLine("error", {**where, "error": text}))
+
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)
         words = EPISODE_FAILED
@@ -537,10 +646,10 @@ class Trial:
 
     # ---- clients
 
-    def _left(self, player: str) -> None:
+    def _left(self, client: Client) -> None:
         self._note("disconnected")
-        self.progress.leave()
-        self._tell_moved("on_leave", player)
+        self.progress.leave(client.player)
+        self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
         if self.callbacks and self.phase is Phase.PLAYING and not self._agent_hangs:
@@ -562,7 +671,7 @@ class Trial:
         if message.frame_rate is not None:
             self.progress.change_frame_rate(message.frame_rate)
         if message.action is not None:
-            self.progress.act(message.action, message.held, lasts=message.lasts)
+            self.progress.act(message.action, message.held, lasts=message.lasts, player=client.player)
 
     def _command(self, client: Client, command: str) -> None:
         if command == "start":
@@ -570,7 +679,7 @@ class Trial:
         elif command == "pause":
             self.progress.pause()
         elif command == "requestUI":
-            self._clients.send(client, self._controls())
+            self._clients.send(client, self._controls(client))
         elif command in ("reset", "stop") and command not in self._commands:
             self._commands.append(command)
 
@@ -583,32 +692,42 @@ class Trial:
 
     def _send_state(self) -> None:
         if not self.finished:
-            self._clients.send_state(self.progress, self._break_left())
+            self._clients.send_state(self.progress, self._break_left(), self._turn_ends_in())
 
-    def _controls(self) -> str:
-        config, progress = self.config, self.progress
+    def _turn_ends_in(self) -> float | None:
+        turns = self.progress.turns
+        return None if turns is None else turns.ends_in(self._now)
+
+    def _controls(self, client: Client) -> str:
+        config, progress, player = self.config, self.progress, client.player
+        action_space = progress.players[player].action_space
         return messages.controls(
             ui=self._shown,
-            words=[word for word in messages.words_of(config) if word.lower() not in progress.action_space],
+            words=[word for word in messages.words_of(config) if word.lower() not in action_space],
             frame_rate=progress.frame_rate,
             min_frame_rate=config.min_frame_rate,
             max_frame_rate=config.max_frame_rate,
             frame_rate_step_size=config.frame_rate_step_size,
             allow_frame_rate_change=config.allow_frame_rate_change,
-            action_space=progress.action_space,
+            action_space=action_space,
             state=progress.state.value,
             episode=progress.episode,
             max_episodes=config.max_episodes,
-            score=progress.score,
-            episode_score=progress.episode_score,
+            score=progress.scores[player],
+            episode_score=progress.episode_scores[player],
             next_in=self._break_left(),
+            player=player,
+            players=tuple(progress.players),
+            **turn_of(progress, player, self._turn_ends_in()),
         )
 
     def _send_done(self) -> None:
         episodes, score = self.progress.episodes_played, self.progress.score
         if self._earlier_answers is not None:
             episodes, score = self._earlier_answers.get("episodes", 0), self._earlier_answers.get("score", 0)
-        self._clients.send_done(episodes, score)
+            self._clients.send_done(episodes, self._earlier_answers.get("scores") or {}, score)
+            return
+        self._clients.send_done(episodes, self.progress.scores, score)
 
     def _emit(self, effect: Effect) -> None:
         self._effects.append(effect)
@@ -616,6 +735,12 @@ class Trial:
     def _take_effects(self) -> list[Effect]:
         effects, self._effects = self._effects, []
         return effects
+
+
+def _scores(score: float, scores: Mapping[str, float]) -> dict[str, Any]:
+    """A score for the records, and those of all players if there are several."""
+    several = {player: messages.tidy(value) for player, value in scores.items()}
+    return {"score": messages.tidy(score), **({"scores": several} if several else {})}
 
 
 def _number(over: Episode | Break) -> int:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from trial.core.progress import Episode
 
 
 @dataclass(frozen=True, slots=True)
+class RecordedAction:
+    """One player's part of a step. `action` is None if it was not their turn; `observed` as in `Action`."""
+
+    action: int | None
+    reward: float
+    observed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedStep:
     """One step: the human's choice (None: no key acted), its results, and the agent's feedback before it.
 
-    `advice` is what a program advised, if that was taken.
+    `advice` is what a program advised, if that was taken; `players` are all players, if there are several.
     """
 
     human: int | None
@@ -19,6 +29,7 @@ class RecordedStep:
     reward: float
     feedback: tuple[str, ...] = ()
     advice: int | None = None
+    players: Mapping[str, RecordedAction] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -34,6 +45,15 @@ class UnfinishedEpisode:
     @property
     def score(self) -> float:
         return sum(step.reward for step in self.steps)
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """Of all players, if there are several."""
+        found: dict[str, float] = {}
+        for step in self.steps:
+            for player, part in step.players.items():
+                found[player] = found.get(player, 0.0) + part.reward
+        return found
 
 
 @dataclass(slots=True)

@@ -25,8 +25,8 @@ MOST = 8
 _UNREAD = 1000  # lines that wait for a program; one more ends its connection
 _UNREAD_BYTES = 16 * 1024**2  # the same of their bytes; a single line may be longer
 
-Advise = Callable[[int], None]
-"""Takes the number of an action. Raises CommandRefused."""
+Advise = Callable[[int, str | None], None]
+"""Takes the number of an action, and the player or None (`Progress.advise`). Raises CommandRefused."""
 
 
 class Watchers:
@@ -85,7 +85,7 @@ class Watching:
         self,
         websocket: ServerConnection,
         watchers: Watchers,
-        actions: Callable[[], tuple[str, ...]],
+        actions: Callable[[str | None], tuple[str, ...]],
         advise: Advise | None,
     ) -> None:
         self._websocket = websocket
@@ -121,7 +121,7 @@ class Watching:
                 self._sending = asyncio.create_task(self._send_lines())
             return True
         if method == "action_space":
-            names = self._actions()
+            names = self._actions(_player_in(params))
             return {"name": "Discrete", "n": len(names), "names": list(names)}
         if method == "advise":
             return self._advised(params)
@@ -133,10 +133,17 @@ class Watching:
         action = params.get("action") if isinstance(params, dict) else None
         if type(action) is not int:
             raise CommandRefused("action must be the number of an action")
-        self._advise(action)
+        self._advise(action, _player_in(params))
         return True
 
     async def _send_lines(self) -> None:
         with self._watchers.lines(self._websocket.transport.abort) as lines, contextlib.suppress(ConnectionClosed):
             while True:
                 await self._websocket.send((await lines.get()).decode().rstrip("\n"))
+
+
+def _player_in(params: Any) -> str | None:
+    player = params.get("player") if isinstance(params, dict) else None
+    if player is not None and not isinstance(player, str):
+        raise CommandRefused("player must be the name of a player")
+    return player

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import secrets
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 from trial.agent.agent import AgentAdapter
@@ -34,6 +34,7 @@ from trial.core.effects import (
     WriteLine,
 )
 from trial.core.messages import Message
+from trial.core.players import PLAYER, Player, PlayersError, who_plays
 from trial.core.trial import Trial
 from trial.programs.watch import Watchers
 from trial.recordings.recorder import Recorder
@@ -67,7 +68,12 @@ class TrialLoop:
         self._agent = agent
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
-        self._calls = AgentCalls(agent, self._recorder.stamp, record_observations=settings.trial.record_observations)
+        self._calls = AgentCalls(
+            agent,
+            self._recorder.stamp,
+            record_observations=settings.trial.record_observations,
+            views=settings.trial.pace == "turns",
+        )
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -115,16 +121,22 @@ class TrialLoop:
 
     # ---- clients
 
-    def connect(self, player: str, connection: Connection) -> None:
+    def connect(self, human: str, connection: Connection) -> None:
         """Show the trial to this client and do what it asks for."""
         connection.rate = self.core.progress.frame_rate
-        self._apply(self.core.connect(player, connection, connection.window, self._loop.time()))
+        self._apply(self.core.connect(human, connection, connection.window, self._loop.time()))
 
     def disconnect(self, connection: Connection) -> None:
         self._apply(self.core.disconnect(connection, self._loop.time()))
 
     def receive(self, connection: Connection, message: Message) -> None:
         self._apply(self.core.receive(connection, message, self._loop.time()))
+
+    # ---- programs
+
+    def advise(self, action: int, player: str | None) -> None:
+        """A program advises an action, or chooses it. Raises CommandRefused."""
+        self._apply(self.core.advise(action, player, self._loop.time()))
 
     # ---- events
 
@@ -134,8 +146,14 @@ class TrialLoop:
             self._apply(self.core.already_played(answers))
         elif await agent_ready:
             recorded = await self._recorder.recorded()
-            self._find_callbacks()
-            self._apply(self.core.start(self._agent.action_space, recorded, self._loop.time()))
+            try:
+                players = who_plays(self._settings.trial, {PLAYER: self._agent.action_space}, self._settings.group)
+            except PlayersError as error:
+                log.error("%s", error)
+                self._apply(self.core.agent_failed(self._loop.time()))
+            else:
+                self._find_callbacks(players)
+                self._apply(self.core.start(players, recorded, self._loop.time()))
         else:
             self._apply(self.core.agent_failed(self._loop.time()))
 
@@ -186,7 +204,7 @@ class TrialLoop:
     def _call(self, call: Call) -> None:
         self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
 
-    def _find_callbacks(self) -> None:
+    def _find_callbacks(self, players: Sequence[Player]) -> None:
         """The agent has started: see which callbacks it has."""
         settings, loop = self._settings, self._loop
         found = self._agent.callbacks
@@ -195,7 +213,13 @@ class TrialLoop:
         self.core.callbacks = True
         self._calls.callbacks = Callbacks(
             found,
-            About(self.core.id, self.core.step, settings.group),
+            About(
+                self.core.id,
+                self.core.step,
+                settings.group,
+                tuple(player.name for player in players),
+                tuple(player.name for player in players if player.human),
+            ),
             lambda: self._agent.env,
             seconds=settings.trial.callback_seconds,
             stamp=self._recorder.stamp,
@@ -216,7 +240,7 @@ class TrialLoop:
         callbacks = self._calls.callbacks
         if callbacks:
             self._worker.submit(
-                lambda: callbacks.player_moved(effect.callback, callbacks.about.humans[0]),
+                lambda: callbacks.player_moved(effect.callback, effect.player),
                 self._settings.step_seconds,
                 lambda *_: self._write_callbacks(),
             )

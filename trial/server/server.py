@@ -257,11 +257,11 @@ class Server:
         else:
             await self._environments.serve(websocket)
 
-    def _action_space(self) -> tuple[str, ...]:
-        return self._current().core.progress.action_space
+    def _action_space(self, player: str | None) -> tuple[str, ...]:
+        return self._current().core.progress.action_space_of(player)
 
-    def _advise(self, action: int) -> None:
-        self._current().core.advise(action)
+    def _advise(self, action: int, player: str | None) -> None:
+        self._current().advise(action, player)
 
     def _current(self) -> TrialLoop:
         if self._trial is None:

@@ -22,6 +22,14 @@ ACTIONS = st.sampled_from(["up", "Up", 3, "", None, {"a": "up"}, {"Esc": "up"}, 
 ODD = st.sampled_from(
     [None, "", "x", " 3 ", "0.5", True, [], {}, ["up"], {"left": True}, float("nan"), float("inf"), 10**400]
 )
+PLAYERS = st.sampled_from(["player_0", "player_1", "a" * 65])
+WHO = st.dictionaries(
+    PLAYERS,
+    st.sampled_from(
+        ["human", "random", "idle", "agent:Partner", "agent:2", "policies/x.onnx", "../x.onnx", "gym://x", "gym://", 3]
+    ),
+    max_size=3,
+)
 KEYS: dict[str, st.SearchStrategy[Any]] = {
     **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "frameRateStepSize", "callbackSeconds"), NUMBERS),
     **dict.fromkeys(("maxSteps", "resetFreeze", "episodeSeconds"), NUMBERS),
@@ -37,6 +45,11 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     "actionSpace": NAMES,
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
     "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
+    **dict.fromkeys(("frameSkip", "policySeconds", "seed", "turnSeconds"), NUMBERS),
+    "pace": st.sampled_from(["realtime", "turns", "fast"]),
+    "turnEnds": st.sampled_from(["idle", "random", "episode", "game"]),
+    "idleAction": st.sampled_from(["noop", "up", 3, "a" * 65]) | st.dictionaries(PLAYERS, st.just("up"), max_size=2),
+    "players": WHO | st.dictionaries(st.sampled_from(["0", "1", "x"]), WHO, max_size=2),
     "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
     "scene": st.fixed_dictionaries(
         {},

@@ -1,0 +1,126 @@
+"""Who plays whom: the players of an environment, and who or what chooses the actions of each. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from protocol.players import GYM_PLAYER, HUMAN
+from protocol.trial import Trial
+from protocol.values import show
+
+PLAYER = "player_0"
+"""The player of an environment that has one."""
+
+NOOP = "noop"
+"""The action of no key, if the environment has one of this name and `idleAction` names no other."""
+
+Mask = Sequence[Any]
+"""One value for each action: whether it is possible now."""
+
+
+class PlayersError(ValueError):
+    """The section `trial` and the environment's players do not fit. The message is for the researcher."""
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """A place of the environment. `plays` is what `trial.players` says: human, or what chooses its actions."""
+
+    name: str
+    action_space: tuple[str, ...]
+    plays: str = HUMAN
+    idle: int = 0
+    """The action of a step in which nothing was chosen."""
+
+    @property
+    def human(self) -> bool:
+        return self.plays == HUMAN
+
+    @property
+    def by_program(self) -> bool:
+        """A program at the trial's /gym chooses its actions."""
+        return self.plays.startswith(GYM_PLAYER)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What the players see after a reset or a step, by player. The core reads `to_act` and `masks` only."""
+
+    to_act: frozenset[str]
+    """The players whose actions the next step takes."""
+    observations: Mapping[str, Any] = field(default_factory=dict)
+    infos: Mapping[str, Any] = field(default_factory=dict)
+    masks: Mapping[str, Mask] = field(default_factory=dict)
+    """Which actions are possible now, for those players for which the environment says so."""
+
+
+def alone(action_space: tuple[str, ...], idle: str | None = None) -> tuple[Player, ...]:
+    """The players of an environment that has one, who is a human. Raises PlayersError."""
+    return (Player(PLAYER, action_space, HUMAN, _idle(PLAYER, action_space, idle)),)
+
+
+def who_plays(config: Trial, action_spaces: Mapping[str, tuple[str, ...]], group: int | None) -> tuple[Player, ...]:
+    """The players of the environment, in its order, each with what plays it in this group.
+
+    `action_spaces` has the environment's players in their order. Raises PlayersError.
+    """
+    if not action_spaces:
+        raise PlayersError("the environment has no players")
+    named = config.players_of(group)
+    names = tuple(action_spaces)
+    has = f"the environment has {_listed(names)}"
+    unknown = [name for name in named if name not in action_spaces]
+    if unknown:
+        raise PlayersError(f"trial.players names {_listed(unknown)}, but {has}")
+    lacking = [name for name in names if name not in named]
+    if (named and lacking) or (len(names) > 1 and not named):
+        missing = lacking if named else names[1:]
+        raise PlayersError(f"trial.players must say who plays {_listed(missing)}; {has}")
+    plays = {name: named.get(name, HUMAN) for name in names}
+    if HUMAN not in plays.values():
+        raise PlayersError("trial.players must name a human: at least one player")
+    idles = config.idle_action
+    if isinstance(idles, Mapping):
+        strange = [name for name in idles if name not in action_spaces]
+        if strange:
+            raise PlayersError(f"trial.idleAction names {_listed(strange)}, but {has}")
+    return tuple(
+        Player(name, space, plays[name], _idle(name, space, idles.get(name) if isinstance(idles, Mapping) else idles))
+        for name, space in action_spaces.items()
+    )
+
+
+def _idle(player: str, action_space: Sequence[str], name: str | None) -> int:
+    """The action of no key. Raises PlayersError."""
+    if name is None:
+        return action_space.index(NOOP) if NOOP in action_space else 0
+    if name.lower() not in action_space:
+        raise PlayersError(f"trial.idleAction is {show(name)}, but {player} has the actions {_listed(action_space)}")
+    return action_space.index(name.lower())
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = [show(name) for name in names[:20]]
+    return ", ".join(shown) + (" and others" if len(names) > len(shown) else "")
+
+
+def legal(action: int, player: Player, mask: Mask | None) -> int:
+    """The action, or if the mask forbids it the idle one, or if that is forbidden the first that is allowed."""
+    if allowed(action, mask):
+        return action
+    if allowed(player.idle, mask):
+        return player.idle
+    return next((index for index in range(len(player.action_space)) if allowed(index, mask)), player.idle)
+
+
+def allowed(action: int, mask: Mask | None) -> bool:
+    """Whether the mask allows the action. One that says nothing of it, or allows nothing, forbids nothing."""
+    return mask is None or action >= len(mask) or bool(mask[action]) or not any(mask)
+
+
+def random_action(player: Player, mask: Mask | None, seed: int) -> int:
+    """One of the actions that the mask allows; the same for the same seed."""
+    choice = [index for index in range(len(player.action_space)) if allowed(index, mask)]
+    return choice[seed % len(choice)] if choice else player.idle
