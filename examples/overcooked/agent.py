@@ -1,0 +1,90 @@
+"""Overcooked: the environment, and how it is drawn. Who cooks with whom stands in config.yml (`players`)."""
+
+import json
+import math
+import os
+
+from kitchen import CRAMPED, DOWN, LEFT, POT_HOLDS, RIGHT, UP, Overcooked
+
+TILE = 96
+"""Pixels of one tile; the kitchen has 5 x 4 tiles, and the scene in config.yml 480 x 384 pixels."""
+
+STEPS_PER_SECOND = 10
+"""`startingFrameRate` of config.yml: the clock counts by it."""
+
+WALK = 110
+"""Milliseconds in which a chef is seen to walk from one tile to the next."""
+
+COOK_STEPS = 30
+COLOURS = ("blue", "green")
+FACING = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
+HANDS = {UP: (0.0, -0.16), DOWN: (0.0, 0.22), LEFT: (-0.3, 0.12), RIGHT: (0.3, 0.12)}
+"""Where a chef who faces there holds a thing, in tiles from the middle."""
+
+
+class Agent:
+    def start(self, game):
+        """Make the environment and return it. Its `reset`, `step` and `close` are called as PettingZoo has them."""
+        options = json.loads(os.environ.get("TRIAL", "{}")).get("options", {})
+        layout, seconds = options.get("layout", CRAMPED), options.get("seconds", 90)
+        self.env = Overcooked(layout, max_steps=round(seconds * STEPS_PER_SECOND))
+        return self.env
+
+    def render(self):
+        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins."""
+        kitchen = self.env.kitchen()
+        objects = _room(kitchen) if self.env.steps_left == self.env.max_steps else []
+        for cell, (onions, timer) in kitchen.pots.items():
+            objects += _pot(cell, onions, timer)
+        objects += [_sprite(f"on {cell}", name, cell, depth=1) for cell, name in kitchen.lying.items()]
+        for number, chef in enumerate(kitchen.chefs):
+            objects += _chef(number, chef)
+        seconds = math.ceil(self.env.steps_left / STEPS_PER_SECOND)
+        return {"objects": objects, "hud": f"Soups: {self.env.soups} · {seconds} s"}
+
+
+def _sprite(name, frame, cell, **more):
+    """A picture of the atlas on a tile. Things that lie there, tables and floor have the same size."""
+    row, column = cell
+    at = {"x": column * TILE, "y": row * TILE, "width": TILE, "height": TILE}
+    return {"id": name, "type": "sprite", "image": "kitchen", "frame": frame, **at, **more}
+
+
+def _room(kitchen):
+    """Floor and tables: they never change."""
+    rows, columns = kitchen.size
+    cells = [(row, column) for row in range(rows) for column in range(columns)]
+    floor = [_sprite(f"floor {cell}", "floor", cell, depth=-2, permanent=True) for cell in cells]
+    return floor + [
+        _sprite(f"table {cell}", "counter" if name == "wall" else name, cell, depth=-1, permanent=True)
+        for cell, name in kitchen.fixed.items()
+        if name != "pot"
+    ]
+
+
+def _pot(cell, onions, timer):
+    """The pot as full as it is; while it cooks a bar grows."""
+    ready = onions == POT_HOLDS and timer == 0
+    found = [_sprite(f"pot {cell}", "pot-ready" if ready else f"pot-{onions}", cell)]
+    if onions == POT_HOLDS and not ready:
+        x, y, full = cell[1] * TILE + 12, cell[0] * TILE + TILE - 14, TILE - 24
+        done = full * (COOK_STEPS - timer) / COOK_STEPS
+        bar = {"type": "rectangle", "x": x, "y": y, "height": 8}
+        found += [
+            {"id": f"bar {cell}", **bar, "width": full, "color": "#2c2e34", "depth": 1},
+            {"id": f"done {cell}", **bar, "width": done, "color": "#6fd08c", "depth": 2, "tween": WALK},
+        ]
+    return found
+
+
+def _chef(number, chef):
+    """The chef walks smoothly, and what they hold with them: behind them while they face away."""
+    found = [_sprite(f"chef {number}", f"chef-{COLOURS[number]}-{FACING[chef.facing]}", chef.cell, depth=4, tween=WALK)]
+    if chef.holds:
+        right, down = HANDS[chef.facing]
+        size = 0.8 * TILE
+        held = _sprite(f"held {number}", chef.holds, chef.cell, depth=3 if chef.facing == UP else 5, tween=WALK)
+        held["x"] += right * TILE + (TILE - size) / 2
+        held["y"] += down * TILE + (TILE - size) / 2
+        found.append({**held, "width": size, "height": size})
+    return found

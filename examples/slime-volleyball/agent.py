@@ -1,0 +1,97 @@
+"""Slime volleyball: the environment, and how it is drawn. Who plays whom stands in config.yml (`players`)."""
+
+import json
+import math
+import os
+
+from slime_volleyball.core import constants, physics
+from volleyball import LEFT, PLAYERS, RIGHT, Volleyball
+
+WIDTH, HEIGHT = 960, 500
+"""Of the scene in config.yml, in pixels. `assets/court.png` is as large."""
+
+SCALE = WIDTH / constants.REF_W
+"""Pixels of one unit of the package."""
+
+SAND = 30
+"""Pixels from the bottom of the picture to the ground."""
+
+SLIMES = {LEFT: "slime-left", RIGHT: "slime-right"}
+NET, WHITE, BLACK = "#7a5230", "#ffffff", "#20242a"
+
+
+class Agent:
+    def start(self, game):
+        """Make the environment and return it. Its `reset`, `step` and `close` are called as PettingZoo has them."""
+        options = json.loads(os.environ.get("TRIAL", "{}")).get("options", {})
+        self.env = Volleyball(points=options.get("points", 5), seconds=options.get("seconds", 100))
+        return self.env
+
+    def render(self):
+        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins."""
+        places = self.env.places()
+        ball = places["ball"]
+        objects = [*(STILL if self.env.begins() else ()), *_ball(ball)]
+        for player in PLAYERS:
+            objects += _slime(player, places[player], ball)
+        if self.env.serve():
+            x, y = _at(0, 14)
+            objects.append(
+                {"id": "serve", "type": "text", "text": "Ready?", "x": x, "y": y, "origin": [0.5, 1], "size": 34}
+            )
+        scores = self.env.scores
+        left = math.ceil(self.env.seconds_left())
+        return {"objects": objects, "hud": f"Red {scores[LEFT]} : {scores[RIGHT]} Blue · {left} s"}
+
+
+def _at(x, y):
+    """A place of the package (from the net, from the ground's lower edge) in pixels of the scene."""
+    return WIDTH / 2 + x * SCALE, HEIGHT - SAND - (y - constants.REF_U) * SCALE
+
+
+def _sprite(name, image, box, **more):
+    x, y, width, height = box
+    return {"id": name, "type": "sprite", "image": image, "x": x, "y": y, "width": width, "height": height, **more}
+
+
+def _circle(name, place, radius, color, **more):
+    return {"id": name, "type": "circle", "x": place[0], "y": place[1], "radius": radius, "color": color, **more}
+
+
+def _slime(player, place, ball):
+    """The body is a sprite; its eye looks at the ball."""
+    x, y = _at(*place)
+    radius = physics.AGENT_RADIUS * SCALE
+    eye = x + (0.4 if player == LEFT else -0.4) * radius, y - 0.55 * radius
+    to_x, to_y = _at(*ball)[0] - eye[0], _at(*ball)[1] - eye[1]
+    far = math.hypot(to_x, to_y) or 1
+    pupil = eye[0] + to_x / far * 3, eye[1] + to_y / far * 3
+    return [
+        _sprite(player, SLIMES[player], (x - radius, y - radius, 2 * radius, radius), depth=1),
+        _circle(f"{player} eye", eye, 6, WHITE, depth=2),
+        _circle(f"{player} pupil", pupil, 3, BLACK, depth=3),
+    ]
+
+
+def _ball(place):
+    """It turns as it flies. Above the picture an arrow shows where it is."""
+    x, y = _at(*place)
+    size = 2 * physics.BALL_RADIUS * SCALE
+    if y > -size / 2:
+        return [_sprite("ball", "ball", (x, y, size, size), origin=[0.5, 0.5], angle=round(x * 3) % 360, depth=4)]
+    points = [[x - 9, 20], [x + 9, 20], [x, 6]]
+    return [{"id": "above", "type": "polygon", "points": points, "color": BLACK, "depth": 4}]
+
+
+def _still():
+    x, top = _at(0, constants.REF_WALL_HEIGHT)
+    wide = constants.REF_WALL_WIDTH * SCALE
+    net = {"x": x - wide / 2, "y": top, "width": wide, "height": HEIGHT - SAND - top, "color": NET}
+    return [
+        _sprite("court", "court", (0, 0, WIDTH, HEIGHT), depth=-2, permanent=True),
+        {"id": "net", "type": "rectangle", **net, "depth": -1, "permanent": True},
+        _circle("net top", (x, top), physics.FENCE_STUB_R * SCALE, NET, depth=-1, permanent=True),
+    ]
+
+
+STILL = _still()
