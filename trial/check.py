@@ -3,9 +3,11 @@
 FILE holds what of the section `trial` the agent is started with, as JSON. The agent is loaded, starts its game, begins
 an episode, draws it and takes one step, as in a server, but in a process of its own that is ended after SECONDS.
 
-Exit status 1 and a line that begins with `LACKS` if that fails because a package, a module or a system library is not
-there: it will not be there for any participant. All else is a warning and status 0, since a server may have what a
-build has not: a participant, a group, the rest of the section, more time and memory.
+Where several play, each policy is asked for one action too.
+
+Exit status 1 and a line that begins with `LACKS` if that fails because a package, a module, a system library or the
+file of a policy is not there: it will not be there for any participant. All else is a warning and status 0, since a
+server may have what a build has not: a participant, a group, the rest of the section, more time and memory.
 """
 
 from __future__ import annotations
@@ -17,13 +19,16 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from protocol import environment
 from trial.agent import tracebacks
 from trial.server import process_group
+
+if TYPE_CHECKING:
+    from trial.agent.joint import JointAdapter
 
 LACKS = "MISSING IN THE IMAGE: "
 """Begins the line that says what is missing."""
@@ -86,7 +91,7 @@ def _try(file: Path, report: Path) -> None:
     """Let the agent play a step, and write down what came of it."""
     folder = Path(os.environ[environment.AGENT_DIR]).resolve()
     try:
-        _play(folder, json.loads(file.read_text()).get("game"))
+        _play(folder, json.loads(file.read_text()))
         found: dict[str, Any] = {"well": True}
     except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
         said = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
@@ -97,18 +102,46 @@ def _try(file: Path, report: Path) -> None:
     part.replace(report)
 
 
-def _play(folder: Path, game: str | None) -> None:
+def _play(folder: Path, section: Mapping[str, Any]) -> None:
     from trial.agent.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
+    from trial.agent.starting import start  # noqa: PLC0415
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
 
-    player = AgentAdapter(
-        folder, game or DEFAULT_GAME, ("noop",)
-    )  # only the first action is taken, which every game has
-    player.start()
-    player.reset(1)
-    player.render()
-    player.step(0)
-    player.render()
+    # One player takes the first action alone, which every game has.
+    names = tuple(section.get("actionSpace") or ("noop",))
+    teams = _teams(section.get("players") or {})
+    adapter = AgentAdapter(folder, section.get("game") or DEFAULT_GAME, names)
+    player = start(adapter, tuple(map(str, teams[0])))
+    if isinstance(player, AgentAdapter):
+        player.reset(1)
+        player.render()
+        player.step(0)
+        player.render()
+    else:
+        _play_jointly(player, teams, folder)
+
+
+def _teams(players: Mapping[str, Any]) -> list[Mapping[str, str]]:
+    """Who plays whom, in each group."""
+    groups = [team for team in players.values() if isinstance(team, Mapping)]
+    return groups or [players]
+
+
+def _play_jointly(adapter: JointAdapter, teams: Sequence[Mapping[str, str]], folder: Path) -> None:
+    """One step, in which all who are to act take their first action and each policy is asked for one."""
+    from trial.policies.team import load_all  # noqa: PLC0415 - as above
+
+    now, _ = adapter.reset(1)
+    adapter.pictures()
+    for team in teams:
+        for player, policy in load_all({str(name): plays for name, plays in team.items()}, adapter, folder).items():
+            policy.reset(1)
+            if player in now.to_act:
+                policy.act(now.observations.get(player), now.infos.get(player, {}), now.masks.get(player))
+            policy.close()
+    first = {player: now.masks[player].index(True) if player in now.masks else 0 for player in now.to_act}
+    adapter.step(first)
+    adapter.pictures()
 
 
 def _remedy(error: BaseException) -> str:
@@ -124,6 +157,8 @@ def _remedy(error: BaseException) -> str:
     for one in reversed(errors):
         if isinstance(one, ModuleNotFoundError) and one.name:
             return f"write {PACKAGE}{one.name.partition('.')[0]} into requirements.txt beside agent.py"
+    if any(type(one).__name__ == "PolicyFileMissing" for one in errors):
+        return "put the file there, and do not name it in .dockerignore"
     kinds = {kind.__name__ for one in errors for kind in type(one).__mro__} & _MISSING
     if "UnregisteredEnv" in kinds:
         return "write the package with this game into requirements.txt and import it in agent.py, or correct its name"

@@ -645,6 +645,58 @@ def test_what_the_image_lacks_ends_its_build(
     assert do.startswith(remedy)
 
 
+SEVERAL = """
+class Agent:
+    possible_agents = ["left", "right"]
+    def start(self, game):
+        pass
+    def reset(self, seed=None):
+        return {"left": [1, 0], "right": [0, 1]}, {}
+    def step(self, actions):
+        return {"left": [1, 0], "right": [0, 1]}, {}, {}, {}, {}
+    def render(self):
+        import numpy
+        return numpy.zeros((4, 4, 3), numpy.uint8)
+    def close(self):
+        pass
+
+class Partner:
+    def act(self, observation, info):
+        assert observation == [0, 1]
+        return 1
+
+class Lost:
+    def __init__(self):
+        import nosuch
+    def act(self, observation, info):
+        return 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("plays", "file", "status", "words"),
+    [
+        ("agent:Partner", "", 0, WELL),
+        ("random", "", 0, WELL),
+        ("agent:Lost", "", 1, "No module named 'nosuch' => write the package that brings nosuch into requirements.txt"),
+        ("policies/p.onnx", "", 1, "right: there is no file policies/p.onnx => put the file there"),
+        ("policies/p.onnx", "no ONNX", 0, "right: policies/p.onnx is no ONNX file"),
+    ],
+)
+def test_policies_are_tried_too(
+    recipe: Recipe, folder: Path, tmp_path: Path, plays: str, file: str, status: int, words: str
+) -> None:
+    write_study(folder, agent_DOT_py=SEVERAL)
+    if file:
+        (folder / "policies").mkdir()
+        (folder / "policies/p.onnx").write_text(file)
+    team = {"left": "human", "right": plays}
+    for name, players in {"all": team, "by group": {"0": {"left": "human", "right": "idle"}, "1": team}}.items():
+        (tmp_path / name).mkdir()
+        found, said = tried(recipe, folder, tmp_path / name, game="grid", players=players, actionSpace=["stay", "go"])
+        assert (found, words in said) == (status, True), said
+
+
 @pytest.mark.parametrize(
     ("first", "seconds", "words"),
     [
@@ -686,10 +738,12 @@ def test_what_the_agent_is_tried_with_names_the_image_and_the_rest_of_the_sectio
             {"game": "a"},
             {"game": "b"},
             {"game": "a", "options": {"x": 1}},
-            {"maxEpisodes": 2, "game": "a", "options": {}},
+            {"maxEpisodes": 2, "game": "a", "options": {}, "actionSpace": ["x"]},
+            {"game": "a", "players": {"p": "random"}},
+            {"game": "a", "players": {"p": "random"}, "actionSpace": ["x"]},
         )
     ]
-    assert len(set(names)) == 3
+    assert len(set(names)) == 5
     assert names[0] == names[3]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from trial.policies.policy import Policy, PolicyError
+from trial.policies.policy import Policy, PolicyError, PolicyFileMissing
 from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
 
 SAMPLE = "sample:"
@@ -46,12 +46,12 @@ def load(
 
 
 def _file(folder: Path, name: str) -> Path:
-    """The file of this name below the folder. Raises PolicyError if there is none."""
+    """The file of this name below the folder. Raises PolicyError."""
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise PolicyError(f"{name} leads out of the project's folder")
     if not path.is_file():
         near = sorted(other.relative_to(folder).as_posix() for other in folder.glob("policies/**/*.onnx"))
         hint = f"; there are {', '.join(near[:5])}" if near else ""
-        raise PolicyError(f"there is no file {name}{hint}")
+        raise PolicyFileMissing(f"there is no file {name}{hint}")
     return path

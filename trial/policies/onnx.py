@@ -162,10 +162,10 @@ def load(spec: str, file: Path, count: int, space: Any, *, sample: bool) -> Onnx
 def _session(spec: str, file: Path) -> Any:
     try:
         import onnxruntime  # noqa: PLC0415 - a server without such a policy does without
-    except ImportError:
+    except ImportError as error:
         raise PolicyError(
             f"{spec} needs the package onnxruntime, which is not installed; write {PACKAGE} into requirements.txt"
-        ) from None
+        ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what is wrong comes as an exception

@@ -13,6 +13,10 @@ class PolicyError(Exception):
     """A policy cannot be used, or gave no action. The message is a sentence for the researcher, without its end."""
 
 
+class PolicyFileMissing(PolicyError):
+    """There is no such file."""
+
+
 class Policy(Protocol):
     """Chooses the actions of one player. All methods run on the policy's thread (`trial/policies/thread.py`)."""
 
