@@ -322,7 +322,7 @@ def test_a_connection_keeps_little_but_never_loses_its_last_words():
         for number in range(10_000):
             connection.send(str(number))
             connection.send_state(f"state {number}")
-            connection.send_frame(np.full((2, 2, 3), number % 256, np.uint8), number)
+            connection.send_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
         connection.close(1000, "done")
         connection.close(4409, "too late")
         await connection.run()
@@ -347,7 +347,7 @@ def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog
         paper.subprotocol = subprotocol
         connection = Connection(paper)
         width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
-        connection.send_frame(np.zeros((2, width, depth), np.uint8), 1)
+        connection.send_picture(np.zeros((2, width, depth), np.uint8), 1)
         await asyncio.wait_for(connection.run(), 5)
         return paper.sent
 

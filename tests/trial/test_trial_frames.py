@@ -329,7 +329,7 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
         connection = Connection(paper, lossless=lossless)  # type: ignore[arg-type]
         running = asyncio.create_task(connection.run())
         for number, frame in enumerate(sequence):
-            connection.send_frame(frame, number)
+            connection.send_picture(frame, number)
             async with asyncio.timeout(10):
                 while len(paper.sent) <= number:
                     await asyncio.sleep(0.001)

@@ -18,7 +18,8 @@ import numpy as np
 from trial.agent import callbacks, environments, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
-from trial.pictures import frames
+from trial.pictures.picture import Picture
+from trial.pictures.reader import PictureReader
 
 _METHODS = ("start", "step", "render", "reset", "close")
 _USUAL = frozenset({"observation", "reward", "done", "info"})  # the dict of HIPPO's sample agent
@@ -138,10 +139,18 @@ class AgentAdapter:
     An agent is an object, or a module with functions of the same names.
     """
 
-    def __init__(self, folder: Path, game: str | None, action_space: tuple[str, ...] | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        game: str | None,
+        action_space: tuple[str, ...] | None,
+        reader: PictureReader | None = None,
+    ) -> None:
+        """`reader` reads what `render` returns; by default pixels alone."""
         self._folder = folder
         self._game = game
         self._configured = action_space
+        self.reader = reader or PictureReader()
         self._agent: Any = None
         self._returned: Any = None  # by start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
@@ -240,6 +249,7 @@ class AgentAdapter:
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
         """Begin an episode: its first observation and info, if the agent returns them, and whether it took the seed."""
         seeded = signatures.SEED in self._signatures["reset"].named
+        self.reader.begin_episode()
         result = self._call("reset", seed=seed)
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
             # No action was chosen yet, so this is an environment that reports actions of its own.
@@ -254,6 +264,8 @@ class AgentAdapter:
         the environment has an `action` in the info of `reset` too, it counts only if it differs from the human's. An
         `action` beside the info, in a dict, always counts.
         """
+        if self.reader.due:  # steps of an earlier server are taken again without pictures
+            self.render()
         result = self._agent.step(action) if self._unusual_step is None else self._unusual_step(action)
         outcome = read_step_result(result)
         if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
@@ -270,8 +282,9 @@ class AgentAdapter:
         """What `render` returns, for this player if it takes one."""
         return self._call("render", player=player)
 
-    def render(self) -> frames.Frame:
-        return frames.as_frame(self._agent.render() if self._unusual_render is None else self._unusual_render())
+    def render(self) -> Picture:
+        """The present picture. Raises FrameError or SceneError if it is none."""
+        return self.reader.read(self._agent.render() if self._unusual_render is None else self._unusual_render())
 
     def feedback(self, word: str, player: Any = environments.ONLY) -> None:
         """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.

@@ -83,7 +83,7 @@ class TrialLoop:
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
-            SendFrame: lambda effect: effect.connection.send_frame(effect.frame, effect.frame_id),
+            SendFrame: lambda effect: effect.connection.send_picture(effect.frame, effect.frame_id),
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: lambda effect: self._write(effect.line),
