@@ -27,7 +27,7 @@ from bots.links import with_user
 from bots.page import Page
 from trial.pictures.frames import FrameError
 
-SUBPROTOCOLS = [Subprotocol("hippodrome.2"), Subprotocol("hippodrome.1")]
+SUBPROTOCOLS = [Subprotocol(f"hippodrome.{version}") for version in (3, 2, 1)]
 LARGEST_FRAME = 64 * 1024 * 1024
 
 POLL_SECONDS = 0.5
@@ -227,7 +227,7 @@ class Bot:
                 ) as websocket,
             ):
                 if websocket.subprotocol not in SUBPROTOCOLS:
-                    raise Failed("the server speaks neither hippodrome.2 nor hippodrome.1")
+                    raise Failed("the server speaks none of hippodrome.3, hippodrome.2 and hippodrome.1")
                 await Game(websocket, play, self.account, self.random, self.play).run(hello)
         except ConnectionClosed as closed:
             code = closed.rcvd.code if closed.rcvd else 1006

@@ -16,6 +16,9 @@ from websockets.exceptions import ConnectionClosed
 
 from bots.account import Account, Play
 from trial.pictures.frames import Decoder
+from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecoder
+
+_ASSET, _SCENES = bytes([ASSET]), (bytes([SCENE]), bytes([PACKED_SCENE]))
 
 QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
 
@@ -65,6 +68,8 @@ class Game:
         self._random = random
         self._seconds = seconds
         self._screen = Decoder()
+        self._scene = SceneDecoder()
+        self._images: set[str] = set()  # hashes of those that were asked for
         self._hands: Hands | None = None
         self._state = ""
         self._first = True
@@ -95,8 +100,21 @@ class Game:
         with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be heard
             await self._websocket.send(json.dumps(message))
 
+    async def _load(self, images: Sequence[dict[str, Any]]) -> None:
+        """Ask for the images of a game that is drawn by objects, as the page does."""
+        for image in images:
+            if image["hash"] not in self._images:
+                self._images.add(image["hash"])
+                await self._say({"asset": image["name"]})
+
     async def _frame(self, data: bytes) -> None:
-        frame_id, _ = self._screen.decode(data)
+        if data[:1] == _ASSET:
+            self._play.bytes += len(data)
+            return
+        if data[:1] in _SCENES:
+            frame_id = self._scene.decode(data)
+        else:
+            frame_id, _ = self._screen.decode(data)
         await self._say({"ack": frame_id})
         play, now = self._play, time.monotonic()
         play.bytes += len(data)
@@ -117,6 +135,7 @@ class Game:
             self._account.troubles.append(f"the game says: {message['error']}")
         if "UI" in message:
             self._hands = Hands(self._random, message)
+            await self._load(message.get("assets", ()))
             self._may_stop = "stop" in message["UI"]
         if message.get("done"):
             play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)

@@ -19,6 +19,7 @@ from websockets.typing import Subprotocol
 from testing import preloaded
 from tests.trial.taking import TakesMessages
 from trial.pictures.frames import Decoder, Frame
+from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, PACKED_SCENE, SCENE, SceneDecoder
 from trial.recordings import recording
 from trial.wire.connection import SUBPROTOCOLS
 
@@ -159,6 +160,8 @@ class Client(TakesMessages):
         self.frames: list[tuple[float, int]] = []
         self.kinds: list[int] = []
         self.frame: Frame | None = None
+        self.scene = SceneDecoder()
+        self.assets: dict[int, bytes] = {}
         self.jpegs: list[dict[str, Any]] = []
 
     async def say(self, **message: Any) -> None:
@@ -170,8 +173,17 @@ class Client(TakesMessages):
 
     async def take(self) -> None:
         data = await self.websocket.recv()
+        if isinstance(data, bytes) and data[0] == ASSET:
+            _, number, offset = ASSET_HEADER.unpack_from(data)
+            had = self.assets.setdefault(number, b"")
+            assert len(had) == offset
+            self.assets[number] = had + data[ASSET_HEADER.size :]
+            return
         if isinstance(data, bytes):
-            frame_id, self.frame = self.decoder.decode(data)
+            if data[0] in (SCENE, PACKED_SCENE):
+                frame_id = self.scene.decode(data)
+            else:
+                frame_id, self.frame = self.decoder.decode(data)
             self.frames.append((time.monotonic(), frame_id))
             self.kinds.append(data[0])
             if self.acks:

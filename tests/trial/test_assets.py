@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from protocol.trial import Scene as SceneSection
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.raster import Raster
@@ -127,7 +128,7 @@ def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def raster(found: Assets = Assets()) -> Raster:  # noqa: B008 - it never changes
-    return Raster(100, 50, "#ffffff", relative=True, smooth=False, assets=found)
+    return Raster(SceneSection(width=100, height=50, pixel_art=True), found)
 
 
 def pixel(picture: Any, x: int, y: int) -> str:

@@ -101,6 +101,11 @@ def test_a_permanent_object_stays_until_the_episode_ends() -> None:
     assert not as_scene([]).objects, "the first scene of an episode has none before it"
 
 
+def test_permanent_objects_come_first_from_the_beginning() -> None:
+    first = as_scene([BALL, BALL | {"id": "wall", "permanent": True}])
+    assert list(first.objects) == list(as_scene([BALL], first).objects) == ["wall", "ball"]
+
+
 def test_a_permanent_object_can_be_changed_and_removed() -> None:
     first = as_scene([BALL | {"permanent": True}])
     changed = as_scene([BALL | {"permanent": True, "x": 1}], first)

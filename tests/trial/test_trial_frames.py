@@ -356,7 +356,7 @@ def test_a_connection_makes_a_picture_exact_that_no_other_follows() -> None:
     assert set(kinds[10:]) == {ROWS}
 
 
-@pytest.mark.parametrize(("subprotocol", "lossless"), [(SUBPROTOCOLS[0], True), (SUBPROTOCOLS[1], False)])
+@pytest.mark.parametrize(("subprotocol", "lossless"), [(SUBPROTOCOLS[0], True), (SUBPROTOCOLS[2], False)])
 def test_a_connection_sends_no_jpeg_where_it_must_not(subprotocol: str, lossless: bool) -> None:
     kinds, _ = shown_by_a_link(subprotocol, lossless=lossless)
     assert kinds == [KEY] + [DIFFERENCE] * 9
@@ -389,7 +389,7 @@ def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_client: A
 
     async def play() -> None:
         async with open_client(server.address) as new:
-            assert new.websocket.subprotocol == "hippodrome.2"
+            assert new.websocket.subprotocol == "hippodrome.3"
             await new.play(30)
             assert new.kinds.count(JPEG) > 20
         async with open_client(server.address, subprotocols=("hippodrome.1",)) as old:
@@ -412,7 +412,7 @@ def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> None:
 
     async def play() -> None:
         async with open_client(server.address) as client:
-            assert client.websocket.subprotocol == "hippodrome.2"
+            assert client.websocket.subprotocol == "hippodrome.3"
             await client.play(30)
             assert set(client.kinds) == EXACT
 

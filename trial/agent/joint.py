@@ -15,7 +15,7 @@ import numpy as np
 
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.environments import Players, Turns
-from trial.pictures.frames import Frame, as_frame
+from trial.pictures.picture import Picture
 
 ALL = "__all__"
 """In what an environment returns, a key beside the players: the value for all of them (RLlib's `MultiAgentEnv`)."""
@@ -60,6 +60,7 @@ class JointAdapter:
     def __init__(self, adapter: AgentAdapter, players: Players, turns: Turns | None) -> None:
         """`adapter` has started its agent. `turns` says whose turn it is in a PettingZoo `AECEnv`."""
         self._adapter = adapter
+        self._reader = adapter.reader
         self._players = players
         self._turns = turns
         self._gone: set[str] = set()
@@ -115,6 +116,8 @@ class JointAdapter:
             for player in self.players
             if player not in self._gone
         }
+        if self._reader.due:  # steps of an earlier server are taken again without pictures
+            self.pictures()
         returned = _read(self._adapter.step_with(given))
         self._end(returned.terminated, self._terminated)
         self._end(returned.truncated, self._truncated)
@@ -125,11 +128,12 @@ class JointAdapter:
             "step", returned.observations, returned.infos, returned.rewards, over=over, extra=returned.extra
         )
 
-    def pictures(self) -> Mapping[str, Frame] | Frame:
+    def pictures(self) -> Mapping[str, Picture] | Picture:
         """The present picture; by player, for those in `views`, if `render` takes a player."""
         if self._adapter.renders_by_player:
-            return {player: as_frame(self._adapter.draw(self._players.keys[player])) for player in self.views}
-        return as_frame(self._adapter.draw())
+            draw, keys = self._adapter.draw, self._players.keys
+            return {player: self._reader.read(draw(keys[player]), player) for player in self.views}
+        return self._reader.read(self._adapter.draw())
 
     def feedback(self, player: str, word: str) -> None:
         """Hand a word of this player's participant to an agent that listens: `feedback(word)` or also the player."""

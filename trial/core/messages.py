@@ -21,7 +21,7 @@ _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "right
 """HIPPO's front end presses an action with these controls."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
-_FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack"})
+_FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack", "asset"})
 
 
 class NotAMessage(ValueError):
@@ -63,6 +63,8 @@ class Message:
     held: bool | None = None
     frame_rate: str | float | None = None
     ack: int | None = None
+    asset: str | None = None
+    """The client asks for this image."""
     lasts: bool = False
     """The action acts until the next one, as HIPPO's clients expect."""
     fields: Mapping[str, Any] | None = None
@@ -160,6 +162,7 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
         held=held,
         frame_rate=_frame_rate(value["changeFrameRate"]) if "changeFrameRate" in value else None,
         ack=_ack(value["ack"]) if "ack" in value else None,
+        asset=_asset(value["asset"]) if "asset" in value else None,
     )
 
 
@@ -177,6 +180,12 @@ def _frame_rate(value: Any) -> str | float:
 def _ack(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 0xFFFFFFFF:
         raise BadMessage("ack must be the id of a frame")
+    return value
+
+
+def _asset(value: Any) -> str:
+    if not isinstance(value, str) or not 0 < len(value) <= 200:
+        raise BadMessage("asset must be the name of an image")
     return value
 
 
@@ -205,11 +214,14 @@ def controls(
     players: Collection[str] = (),
     to_act: bool | None = None,
     turn_ends_in: float | None = None,
+    scene: Mapping[str, Any] | None = None,
 ) -> str:
     """The answer to a hello and to `requestUI`.
 
     It names the project's own controls only if there are some, players only if there are several, and `to_act` only
     turn by turn.
+
+    `scene` is what a client is told that draws objects: of the picture, and of the images in it.
     """
     return json.dumps(
         {
@@ -228,6 +240,7 @@ def controls(
             **({"player": player, "players": list(players)} if len(players) > 1 else {}),
             **({"pace": "turns"} if to_act is not None else {}),
             **_turn(to_act, turn_ends_in),
+            **(scene or {}),
         }
     )
 

@@ -33,6 +33,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from typing import Any, Literal
 
+from protocol.trial import Trial as TrialSection
 from trial.core import messages
 from trial.core.clients import Client, Clients, state_of, turn_of
 from trial.core.effects import (
@@ -87,10 +88,20 @@ class Phase(Enum):
 class Trial:
     """One game step as it is played on this server. See the module's docstring for events, effects and phases."""
 
-    def __init__(self, settings: Settings, step: str, *, trial_id: str, new_seed: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        step: str,
+        *,
+        trial_id: str,
+        new_seed: Callable[[], int],
+        assets: Sequence[Mapping[str, Any]] = (),
+    ) -> None:
+        """`assets` are the images of a game that is drawn by objects, as clients are told of them."""
         self.settings = settings
         self.config = settings.trial
         self._shown = self.config.ui.shown()
+        self._scene = _scene(self.config, assets)
         self.step = step
         self.id = trial_id
         self.phase = Phase.STARTING
@@ -718,6 +729,7 @@ class Trial:
             next_in=self._break_left(),
             player=player,
             players=tuple(progress.players),
+            scene=self._scene,
             **turn_of(progress, player, self._turn_ends_in()),
         )
 
@@ -741,6 +753,14 @@ def _scores(score: float, scores: Mapping[str, float]) -> dict[str, Any]:
     """A score for the records, and those of all players if there are several."""
     several = {player: messages.tidy(value) for player, value in scores.items()}
     return {"score": messages.tidy(score), **({"scores": several} if several else {})}
+
+
+def _scene(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """What a client is told of a game that is drawn by objects; None if it is not."""
+    if config.scene is None:
+        return None
+    told = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
+    return {"scene": told, "assets": list(assets)}
 
 
 def _number(over: Episode | Break) -> int:

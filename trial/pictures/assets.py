@@ -84,7 +84,11 @@ def load(project: Path, folder: str) -> Assets:
     found: dict[str, Asset] = {}
     problems: list[str] = []
     total = 0
-    for path in _files(place):
+    try:
+        paths = list(_files(place))
+    except OSError as error:
+        return Assets({}, (f"{folder} cannot be read ({type(error).__name__})",))
+    for path in paths:
         name = path.relative_to(place).with_suffix("").as_posix()
         shown = path.relative_to(project).as_posix()
         try:

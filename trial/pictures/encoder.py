@@ -31,9 +31,10 @@ class Encoder:
     def __init__(self, *, lossy: bool = False) -> None:
         self.lossy = lossy
         self._jpeg = b""
-        self._forget()
+        self.forget()
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """The next frame is sent whole: the client was shown something else."""
         self._shown: Frame | None = None  # the picture sent last, in any coding
         self._exact: Frame | None = None  # the last picture that the client has without loss
         self._rows = 0  # of `_shown` that have been sent without loss
@@ -52,7 +53,7 @@ class Encoder:
     def encode(self, frame: Frame, frame_id: int) -> bytes:
         """The bytes of one frame. `frame` is kept for the next difference and must not change afterwards."""
         if self._shown is not None and self._shown.shape != frame.shape:
-            self._forget()
+            self.forget()
         if not self.lossy or max(frame.shape) > frames.LONGEST_JPEG_SIDE:
             data = self._unlimited(frame, self._exact, frame_id)
         elif self._shown is not None and not self.exact and _same(frame, self._shown):

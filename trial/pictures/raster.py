@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from protocol.trial import Scene as SceneSection
 from trial.pictures.assets import Asset, Assets
 from trial.pictures.frames import Frame
 from trial.pictures.scene import CheckedObject, Scene
@@ -24,13 +25,11 @@ Rgba = tuple[int, int, int, int]
 class Raster:
     """Draws the scenes of a project. Its methods may be called by any thread."""
 
-    def __init__(
-        self, width: int, height: int, background: str, *, relative: bool, smooth: bool, assets: Assets
-    ) -> None:
-        self._size = width, height
-        self._background = background
-        self._scale = (width, height) if relative else (1, 1)
-        self._filter = Image.Resampling.BILINEAR if smooth else Image.Resampling.NEAREST
+    def __init__(self, section: SceneSection, assets: Assets) -> None:
+        self._size = section.width, section.height
+        self._background = section.background
+        self._scale = self._size if section.coordinates == "relative" else (1, 1)
+        self._filter = Image.Resampling.NEAREST if section.pixel_art else Image.Resampling.BILINEAR
         self._assets = assets
         self._lock = threading.Lock()
         self._sprite = lru_cache(maxsize=256)(self._made)
@@ -38,7 +37,7 @@ class Raster:
     def draw(self, scene: Scene) -> Frame:
         """The scene as a picture of RGB values."""
         with self._lock:
-            canvas = Image.new("RGB", self._size, self._background[:7])
+            canvas = Image.new("RGB", self._size, self._background)
             for each in sorted(scene.objects.values(), key=lambda each: float(each.get("depth", 0))):
                 self._object(canvas, each)
             return np.array(canvas, dtype=np.uint8)

@@ -58,7 +58,9 @@ class PictureReader:
         assert self._section is not None
         for name in sorted(images - self._assets.by_name.keys()):
             shown = next(key for key, each in scene.objects.items() if each.get("image") == name)
-            self._say(f"render(): the object {shown!r} shows the image {name!r}, which is not in {self._section.assets}/")
+            self._say(
+                f"render(): the object {shown!r} shows the image {name!r}, which is not in {self._section.assets}/"
+            )
 
     def _say(self, sentence: str) -> None:
         if sentence not in self._said and len(self._said) < _MOST_SAID:

@@ -51,7 +51,7 @@ class Scene:
     """What is to be seen. It never changes, so connections may keep it."""
 
     objects: Mapping[str, CheckedObject]
-    """By id, in the order of `render()`: of two with the same depth the later one covers the other."""
+    """By id, permanent ones first, then in the order of `render()`: at the same depth a later one covers the others."""
     hud: str = ""
     """A line of text beside the score."""
     permanent: frozenset[str] = frozenset()
@@ -108,6 +108,9 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
         (permanent.add if fields.get("permanent") else permanent.discard)(name)
         same = known.get(name)
         objects[name] = same if same == checked and same is not None else checked
+    if permanent:  # in the scenes after this one they come first in any case
+        stays = {name: each for name, each in objects.items() if name in permanent}
+        objects = stays | {name: each for name, each in objects.items() if name not in permanent}
     return Scene(objects, hud, frozenset(permanent), tuple(dict.fromkeys(problems))[:MOST_PROBLEMS])
 
 

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import secrets
 import uuid
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 from trial.agent.agent import AgentAdapter
@@ -59,8 +59,12 @@ class TrialLoop:
         store: Store,
         spool: Spool,
         watchers: Watchers,
+        assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        self.core = Trial(settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31))
+        """`assets` are the images of a game that is drawn by objects (`Assets.table`)."""
+        self.core = Trial(
+            settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31), assets=assets
+        )
         self.ready = asyncio.Event()
         """The first frame is there, or the trial is over."""
         self._settings = settings

@@ -33,6 +33,7 @@ from trial.programs.environments import MOST, Environments
 from trial.recordings.spool import Spool, store_file
 from trial.recordings.store import Store, open_store
 from trial.server import warm
+from trial.server.drawing import Drawing
 from trial.server.handshake import (
     OTHER_ID,
     OTHER_STUDY,
@@ -74,7 +75,10 @@ class Server:
         self._listener: Listener
         self._lifetime: Lifetime
         self._worker = Worker()
-        self._agent = AgentAdapter(settings.agent_dir, settings.trial.game, settings.trial.action_space)
+        self._drawing = Drawing(settings.trial.scene, settings.agent_dir)
+        self._agent = AgentAdapter(
+            settings.agent_dir, settings.trial.game, settings.trial.action_space, self._drawing.reader
+        )
         self._agent_ready: asyncio.Task[bool]
         self._failure = 1  # the exit status if the server ends by an error
         self._trial: TrialLoop | None = None
@@ -207,7 +211,10 @@ class Server:
         step = await self._authenticate(websocket)
         self._listener.authenticated(websocket)
         trial = self._trial_of(step)
-        connection = Connection(websocket, lossless=self.settings.trial.lossless)
+        drawing = self._drawing
+        connection = Connection(
+            websocket, lossless=self.settings.trial.lossless, assets=drawing.assets, draw=drawing.draw
+        )
         sender = asyncio.create_task(connection.run())
         self._connections[connection] = sender
         self._lifetime.connected()
@@ -322,6 +329,8 @@ class Server:
                 continue
             if message.ack is not None and connection.binary:
                 connection.acknowledged(message.ack, loop.time())
+            if message.asset is not None and not connection.send_asset(message.asset):
+                connection.send(messages.error("this game has no such image"))
             trial.receive(connection, message)
 
     # ---- trials
@@ -346,6 +355,7 @@ class Server:
             store=self._store,
             spool=self._spool,
             watchers=self._watchers,
+            assets=self._drawing.assets.table(),
         )
         trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(self._trial_done)
         return trial

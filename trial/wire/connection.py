@@ -7,7 +7,7 @@ import contextlib
 import logging
 import math
 import socket
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 
@@ -17,12 +17,17 @@ from websockets.exceptions import ConnectionClosed
 from trial.core import messages
 from trial.core.flow_control import Window
 from trial.pictures import frames
+from trial.pictures.assets import Assets
 from trial.pictures.encoder import Encoder
+from trial.pictures.picture import Picture
+from trial.pictures.scene import Scene
+from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
 
 log = logging.getLogger("trial")
 
-SUBPROTOCOLS = ("hippodrome.2", "hippodrome.1")
-"""What a client may offer, the preferred one first. Clients of `hippodrome.1` know lossless frames only."""
+SUBPROTOCOLS = ("hippodrome.3", "hippodrome.2", "hippodrome.1")
+"""What a client may offer, the preferred one first. Clients of the first draw scenes; of the last, they know lossless
+frames only."""
 REST_SECONDS = 0.25
 """A lossy frame is made exact if no other follows within this time or that of 2.5 frames, whichever is longer."""
 
@@ -30,6 +35,8 @@ _ROWS_RATE = 20  # at least so many ROWS frames a second
 _INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
 _UNSENT_BYTES = 16_384  # the most that the kernel keeps unsent: some clients do not acknowledge frames
 _TEXTS = 64  # if so many messages wait, new ones are dropped
+_ASSET_PART = 65_536  # bytes of an image that are sent at a time
+_ASSET_TIMES = 3  # that a connection may ask for an image
 
 
 class Connection:
@@ -37,21 +44,34 @@ class Connection:
 
     Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
     Pictures may lose something on the way (trial/pictures/encoder.py) if the client knows such frames and `lossless`
-    is False.
+    is False. A client that does not draw scenes gets them as frames, which `draw` makes; it runs on a thread.
     """
 
-    def __init__(self, websocket: ServerConnection, *, lossless: bool = False) -> None:
+    def __init__(
+        self,
+        websocket: ServerConnection,
+        *,
+        lossless: bool = False,
+        assets: Assets | None = None,
+        draw: Callable[[Scene], frames.Frame] | None = None,
+    ) -> None:
         self.websocket = websocket
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.rate = 30
         """Frames per second of the game now."""
-        self._encoder = Encoder(lossy=websocket.subprotocol == SUBPROTOCOLS[0] and not lossless)
+        self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
+        self._encoder = Encoder(lossy=websocket.subprotocol in SUBPROTOCOLS[:2] and not lossless)
+        self._scenes = SceneEncoder()
+        self._draw = draw
+        self._assets = () if assets is None else tuple(assets.by_name.values())
+        self._asked: Counter[int] = Counter()  # how often for each asset
+        self._wanted: deque[tuple[int, int]] = deque()  # assets that are asked for, by number, each with an offset
         self._sharpen_at = math.inf
         self._texts: deque[str] = deque()
         self._state: str | None = None
-        self._frame: tuple[int, frames.Frame] | None = None
-        self._sent = 0, 0  # id and bytes of the last picture
+        self._picture: tuple[int, Picture] | None = None
+        self._sent = 0, False  # id of the last picture, and whether it is large
         self._closing: tuple[int, str] | None = None  # code, last words
         self._wake = asyncio.Event()
         _keep_little_unsent(websocket)
@@ -67,15 +87,26 @@ class Connection:
         self._state = text
         self._wake.set()
 
-    def send_frame(self, frame: frames.Frame, frame_id: int) -> None:
-        """Send a frame. It replaces a frame that still waits. `frame` must not change afterwards."""
-        self._frame = (frame_id, frame)
+    def send_picture(self, picture: Picture, picture_id: int) -> None:
+        """Send a picture. It replaces one that still waits. `picture` must not change afterwards."""
+        self._picture = (picture_id, picture)
         self._wake.set()
+
+    def send_asset(self, name: str) -> bool:
+        """Send an image; False if there is none of this name. A client that asks for it too often gets it no more."""
+        number = next((number for number, each in enumerate(self._assets) if each.name == name), None)
+        if number is None:
+            return False
+        self._asked[number] += 1
+        if self._asked[number] <= _ASSET_TIMES:
+            self._wanted.append((number, 0))
+            self._wake.set()
+        return True
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         """The client has shown this frame."""
         self.window.acknowledged(frame_id, now)
-        if self._frame is not None or not self._encoder.exact:
+        if self._picture is not None or not self._encoder.exact:
             self._wake.set()
 
     def close(self, code: int, last_words: str) -> None:
@@ -108,6 +139,9 @@ class Connection:
                     return
                 if timer is not None:
                     timer.cancel()
+                if self._wanted:
+                    await self._send_part()
+                    self._wake.set()
                 wait = self._wait(loop.time())
                 if wait > 0.0:
                     if wait < math.inf:
@@ -126,29 +160,55 @@ class Connection:
 
     def _wait(self, now: float) -> float:
         """Seconds until the next frame may be sent; infinite if there is none."""
-        if self._frame is not None:
+        if self._picture is not None:
             return self.window.wait(now, self.rate)
         if not self.binary or self._encoder.exact:
             return math.inf
         return max(self._sharpen_at - now, self.window.wait(now, self.rate))
 
+    async def _send_part(self) -> None:
+        """Send the next bytes of an image that was asked for."""
+        number, offset = self._wanted[0]
+        packed = self._assets[number].packed
+        part = packed[offset : offset + _ASSET_PART]
+        if offset + len(part) < len(packed):
+            self._wanted[0] = number, offset + len(part)
+        else:
+            self._wanted.popleft()
+        await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
+
     async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
         """Send the picture that waits; if there is none, the next rows that make the last picture exact."""
         pack: Callable[[], bytes | str]
-        encode: Callable[[frames.Frame, int], bytes | str]
-        if self._frame is not None:
-            (frame_id, frame), self._frame = self._frame, None
-            self._sent = frame_id, frame.nbytes
-            encode = self._encoder.encode if self.binary else frames.jpeg_message
-            pack, rest = partial(encode, frame, frame_id), max(REST_SECONDS, 2.5 / self.rate)
+        if self._picture is not None:
+            (frame_id, picture), self._picture = self._picture, None
+            pack, large = self._packing(picture, frame_id)
+            self._sent, rest = (frame_id, large), max(REST_SECONDS, 2.5 / self.rate)
         else:
-            frame_id, _ = self._sent
+            frame_id, large = self._sent
             pack, rest = partial(self._encoder.sharpen, frame_id), 1.0 / max(self.rate, _ROWS_RATE)
-        data: bytes | str = await asyncio.to_thread(pack) if self._sent[1] > _INLINE_BYTES else pack()
+        data: bytes | str = await asyncio.to_thread(pack) if large else pack()
         now = loop.time()
         self.window.sent(frame_id, now)
         self._sharpen_at = now + rest
         await self.websocket.send(data)  # returns when the write buffer is empty
+
+    def _packing(self, picture: Picture, frame_id: int) -> tuple[Callable[[], bytes | str], bool]:
+        """What packs a picture for this client, and whether that takes so long that a thread has to do it."""
+        if isinstance(picture, Scene):
+            if self._draws_scenes:
+                self._encoder.forget()
+                return partial(self._scenes.encode, picture, frame_id), False
+            return partial(self._drawn, picture, frame_id), True
+        self._scenes.forget()
+        return partial(self._encode, picture, frame_id), picture.nbytes > _INLINE_BYTES
+
+    def _drawn(self, scene: Scene, frame_id: int) -> bytes | str:
+        assert self._draw is not None
+        return self._encode(self._draw(scene), frame_id)
+
+    def _encode(self, frame: frames.Frame, frame_id: int) -> bytes | str:
+        return self._encoder.encode(frame, frame_id) if self.binary else frames.jpeg_message(frame, frame_id)
 
     def abort(self) -> None:
         """Cut the connection."""
