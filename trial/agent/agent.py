@@ -11,14 +11,14 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from trial.agent import callbacks, environments, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
-from trial.pictures import frames
+from trial.pictures.picture import Picture
 from trial.pictures.reader import PictureReader
 
 _METHODS = ("start", "step", "render", "reset", "close")
@@ -282,10 +282,10 @@ class AgentAdapter:
         """What `render` returns, for this player if it takes one."""
         return self._call("render", player=player)
 
-    def render(self) -> frames.Frame:
+    def render(self) -> Picture:
         """The present picture. Raises FrameError or SceneError if it is none."""
         value = self._agent.render() if self._unusual_render is None else self._unusual_render()
-        return cast("frames.Frame", self.reader.read(value))
+        return self.reader.read(value)
 
     def feedback(self, word: str, player: Any = environments.ONLY) -> None:
         """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.
