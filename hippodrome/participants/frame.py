@@ -173,10 +173,10 @@ $content
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
     "link": '<p><a class="button" href="$link">$text</a></p>\n',
     "reading": """
-<section id="reading" tabindex="-1" aria-label="To read" hidden>
+<section id="reading" tabindex="-1" style="outline:0" aria-label="To read" hidden>
 <p class="result" id="reading-score"></p>
 $texts
-<p><button type="button" id="reading-button"></button></p>
+<p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
 </section>""",
     "text": '<div class="page" id="text-$key" hidden>\n$content\n</div>',
     "stages": """<ol class="stages">
@@ -222,8 +222,13 @@ _AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|[=?:{},;<>]) ?")
 """Operators and brackets around which spaces mean nothing. Not + and -: `a + +b` is something else without spaces."""
 
 
+def _dense(code: str) -> str:
+    """Code without most spaces and line ends that mean nothing."""
+    return re.sub(r"([;{,(\[])\n", r"\1", _AROUND.sub(r"\1", code))
+
+
 def _plain(name: str, text: str) -> str:
-    """A style or script without comments, indentation and most spaces that mean nothing.
+    """A style or script without comments, indentation, and most spaces and line ends that mean nothing.
 
     A comment behind code begins with space, `//`, space. No regular expression of ours has spaces.
     """
@@ -236,5 +241,5 @@ def _plain(name: str, text: str) -> str:
         lines = (line.strip() for line in text.splitlines())
         text = "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
     if name.endswith(".js"):
-        text = _CODE_OR_TEXT.sub(lambda part: part[0] if part["text"] else _AROUND.sub(r"\1", part[0]), text)
+        text = _CODE_OR_TEXT.sub(lambda part: part[0] if part["text"] else _dense(part[0]), text)
     return text

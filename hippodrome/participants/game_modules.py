@@ -9,7 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {}
+from hippodrome.model.project import GAME_PAGES
+
+MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
+    "keys.js": lambda trial: bool(trial.get("keys")),
+    "reading.js": lambda trial: any(isinstance(trial.get(key), str) for key in GAME_PAGES),
+    "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),
+}
 """By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
+import msgspec
 import pytest
 from websockets.sync.server import serve
 
@@ -57,6 +58,12 @@ class World:
     slow: float = 0.0
     joined: bool = True
     """Whether the game page carries its script, or loads the modules of it."""
+    trial: dict[str, Any] = field(default_factory=dict)
+    """The section of the study."""
+    texts: dict[str, str] = field(default_factory=dict)
+    """The pages that the game page shows, by the key that names each."""
+    controls: dict[str, Any] = field(default_factory=dict)
+    """What the trial server says of the controls besides the usual."""
     spoken: str = "hippodrome.1"
     """The subprotocol of the trial server."""
     url: str = ""
@@ -65,7 +72,9 @@ class World:
     def page(self) -> frame.Page:
         step = PROJECT.steps[self.step]
         if step.type.on_server:
-            view = pages.GameView(PROJECT, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*")
+            study = msgspec.structs.replace(PROJECT, trial=self.trial)
+            texts: dict[str, tuple[str, dict[str, Any]]] = {key: (text, {}) for key, text in self.texts.items()}
+            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*", texts)
             page = pages.game_page(view)
             return page if self.joined else page._replace(html=MODULES.sub(r'\1 src="/game/main.js">\2', page.html))
         return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))
@@ -91,7 +100,7 @@ class World:
             "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
             "actionSpace": ["noop", "fire", "left", "right", "upleft"],
             "frameRate": 30, "minFrameRate": 1, "maxFrameRate": 60, "allowFrameRateChange": False,
-            "state": "ready", "episode": 1, "maxEpisodes": 2, "score": 0,
+            "state": "ready", "episode": 1, "maxEpisodes": 2, "score": 0, **self.controls,
         }  # fmt: skip
         for text in connection:
             message = json.loads(text)
@@ -617,15 +626,42 @@ NOTE_WHEN = """text => {
 """Notes when the page shows the text and when it is left: by its own clock, so a busy machine makes no difference."""
 
 
-def test_the_end_shows_the_score_for_two_seconds(world: World, tab: Any) -> None:
+def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: World, tab: Any) -> None:
     play(world, tab)
     tab.evaluate(NOTE_WHEN, "Your total score in 2 games: 1,370")
     world.step = 3
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 1370}))
-    tab.wait_for_selector("text=Your total score in 2 games: 1,370")
+    tab.wait_for_selector("#overlay-score:visible:text('Your total score in 2 games: 1,370')")
+    assert tab.inner_text("#overlay-title") == "The game is over"
+    assert tab.is_visible("#screen")
     tab.wait_for_selector("text=Next page")
-    assert tab.evaluate("() => sessionStorage.left - sessionStorage.shown") > 1900
+    assert tab.evaluate("() => sessionStorage.left - sessionStorage.shown") > 3900
+
+
+def test_who_has_seen_the_last_picture_goes_on_at_once(world: World, tab: Any) -> None:
+    play(world, tab)
+    tab.evaluate(NOTE_WHEN, "Your score: 7")
+    world.step = 3
+    world.source = "<h1>Next page</h1>"
+    world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
+    tab.wait_for_selector("#overlay-button:text('Go on')")
+    assert tab.evaluate("document.activeElement.id") == "overlay-button"
+    tab.keyboard.press("Enter")
+    tab.wait_for_selector("text=Next page")
+    assert tab.evaluate("() => sessionStorage.left - sessionStorage.shown") < 3900
+    assert {"command": "start"} not in world.heard
+
+
+def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, tab: Any) -> None:
+    play(world, tab)
+    tab.keyboard.press("Space")
+    world.wait_for({"command": "start"})
+    world.connections[0].send(pack(3, RED * 4))
+    world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
+    tab.wait_for_selector("#overlay-button:text('Go on')")
+    pixel = "[...document.getElementById('screen').getContext('2d').getImageData(0, 0, 1, 1).data].join()"
+    tab.wait_for_function(f"{pixel} === '255,0,0,255'")
 
 
 def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None:
@@ -677,8 +713,8 @@ def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
     assert tab.inner_text("#episode") == "Game 2 of 2"
     world.step, world.source = 3, "<h1>Next page</h1>"
-    tab.wait_for_selector("#leave:visible")
-    assert tab.inner_text("#leave-score") == "Your total score in 2 games: 120"
+    tab.wait_for_selector("#overlay-title:text('The game is over')")
+    assert tab.inner_text("#overlay-score") == "Your total score in 2 games: 120"
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-game-end")
     tab.wait_for_selector("text=Next page")

@@ -1,5 +1,6 @@
 // What the participant does: actions of the environment, held down by keys or fingers, and commands.
 import { expectAnswer, send } from "./connection.js";
+import { hooks } from "./hooks.js";
 import { game } from "./state.js";
 
 const held = new Map(); // action -> the set of its keys and fingers
@@ -11,19 +12,19 @@ export function press(action, source) {
   if (!isRunning()) start();
   const sources = held.get(action) ?? new Set();
   held.set(action, sources.add(source));
-  if (sources.size === 1) send({ action, held: true });
+  if (sources.size === 1) send({ ...hooks.means(action), held: true });
 }
 
 export function release(action, source) {
   const sources = held.get(action);
   if (!sources?.delete(source) || sources.size) return;
   held.delete(action);
-  send({ action, held: false });
+  send({ ...hooks.means(action), held: false });
 }
 
 // `tell` is false when there is no server to tell.
 export function releaseAll(tell = true) {
-  if (tell) for (const action of held.keys()) send({ action, held: false });
+  if (tell) for (const action of held.keys()) send({ ...hooks.means(action), held: false });
   held.clear();
   document.querySelectorAll(".pressed").forEach((button) => button.classList.remove("pressed"));
 }
@@ -31,10 +32,11 @@ export function releaseAll(tell = true) {
 // A single action that is not held.
 export function tap(action) {
   if (!isRunning()) start();
-  send({ action });
+  send(hooks.means(action));
 }
 
 export function start() {
+  if (hooks.waits()) return;
   expectAnswer();
   send({ command: "start" });
 }

@@ -21,12 +21,13 @@ export function play(server, hear) {
     own.end = (why, result) => {
       if (link !== own) return;
       link = null;
+      own.done = why === "done"; // the last picture may still be unpacked
       socket.close();
       resolve({ why, welcome: own.welcome, result });
     };
     link = own;
     const failed = () => own.end("lost"); // a new connection begins with a whole picture
-    own.show = startDrawing(() => link === own, (id) => acknowledge(own, id), failed);
+    own.show = startDrawing(() => link === own || own.done, (id) => acknowledge(own, id), failed);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step });
     socket.onmessage = (event) => link === own && receive(own, event.data, hear);

@@ -1,6 +1,7 @@
 // The buttons and the slider, as the server's message with `UI` and `actionSpace` says.
 import { command } from "./actions.js";
 import { send } from "./connection.js";
+import { hooks } from "./hooks.js";
 import { assignKeys, DIRECTIONS, showLegend } from "./keyboard.js";
 import { find, make } from "./page.js";
 import { game } from "./state.js";
@@ -15,21 +16,26 @@ export function buildControls(said) {
   if (wanted === built) return;
   built = wanted;
   const shown = new Set(list(said.UI));
-  const actions = singleActions(said.actionSpace);
+  const own = hooks.controls(said);
+  const actions = own ? [] : singleActions(said.actionSpace);
+  const space = own?.space ?? actions.includes("fire");
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
+  const label = (name, usual = nice(name)) => said.labels?.[name] ?? usual;
   const others = actions.filter((name) => !(name in DIRECTIONS));
-  game.directions = directions.length > 0;
+  game.directions = own?.arrows ?? directions.length > 0;
   game.offered = shown;
-  assignKeys(directions, others, shown);
+  assignKeys(directions, others, shown, space);
   find("controls").replaceChildren(
     ...[
-      groupOf("pad", directions.map((name) => actionButton(name, DIRECTIONS[name].label, `${DIRECTIONS[name].sign}\ufe0e`))),
-      groupOf("others", others.map((name) => actionButton(name, nice(name)))),
+      ...(own?.groups ?? [
+        groupOf("pad", directions.map((name) => actionButton(name, label(name, DIRECTIONS[name].label), `${DIRECTIONS[name].sign}\ufe0e`))),
+        groupOf("others", others.map((name) => actionButton(name, label(name)))),
+      ]),
       commandsOf(shown, said),
       ratesOf(shown, said),
     ].filter(Boolean),
   );
-  showLegend(directions, others, shown);
+  showLegend(directions, others, shown, space, own?.lines);
 }
 
 const list = (said) => (Array.isArray(said) ? said : []);
@@ -40,12 +46,12 @@ function singleActions(actionSpace) {
   return [...new Set(single)].filter((name) => name !== "noop").slice(0, 64);
 }
 
-function groupOf(className, buttons) {
+export function groupOf(className, buttons) {
   return buttons.length ? followFingers(make("div", { className }, ...buttons)) : null;
 }
 
 // "trainOnline" as "Train online"
-function nice(name) {
+export function nice(name) {
   const words = name.replace(/[_-]|\B(?=[A-Z])/g, " ");
   return words.charAt(0).toUpperCase() + words.slice(1).toLowerCase();
 }

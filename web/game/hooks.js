@@ -3,4 +3,8 @@
 export const hooks = {
   said: [], // functions that get each message of the server's once the page has shown it
   overlay: [], // functions that get the name of each overlay that is shown, or of the state without one
+  means: (name) => ({ action: name }), // what a key or a button of this name tells the server
+  key: () => undefined, // what a keyboard event does, as `{ action }`, if the project says so itself
+  controls: () => undefined, // groups of buttons and lines of the legend that stand for those of the actions' names
+  waits: () => false, // whether something is to be seen before the game begins or goes on, and is shown now
 };

@@ -1,5 +1,6 @@
 // The keys of the game, and the legend that lists them.
 import { command, press, release } from "./actions.js";
+import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 
 export const DIRECTIONS = {
@@ -13,12 +14,13 @@ const COMMANDS = { reset: ["R", "begin again"], good: ["G", "good"], bad: ["B", 
 
 let keys = new Map(); // event.code -> `{ action }` or `{ command }`
 
-export function assignKeys(directions, others, shown) {
+// `space`: whether that key is one of the game; then P starts and pauses it.
+export function assignKeys(directions, others, shown, space) {
   keys = new Map();
   for (const name of directions) for (const code of DIRECTIONS[name].codes) keys.set(code, { action: name });
   others.forEach((name) => keys.set(keyOf(name, others), { action: name }));
-  if (!others.includes("fire")) keys.set("Space", { command: "toggle" });
-  if (!keys.has("KeyP") && (shown.has("pause") || others.includes("fire"))) keys.set("KeyP", { command: "toggle" });
+  if (!space) keys.set("Space", { command: "toggle" });
+  if (!keys.has("KeyP") && (shown.has("pause") || space)) keys.set("KeyP", { command: "toggle" });
   for (const name in COMMANDS) if (shown.has(name)) keys.set(`Key${COMMANDS[name][0]}`, { command: name });
 }
 
@@ -28,15 +30,14 @@ function keyOf(name, others) {
   return number <= 9 ? `Digit${number}` : `Unreachable${number}`;
 }
 
-export function showLegend(directions, others, shown) {
-  const lines = [];
+export function showLegend(directions, others, shown, space, lines = []) {
   const arrows = ["left", "up", "right", "down"].filter((name) => directions.includes(name));
   if (arrows.length) lines.push([arrows.map((name) => DIRECTIONS[name].sign), "move"]);
   for (const name of others) {
     const code = keyOf(name, others);
     if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);
   }
-  lines.push([[others.includes("fire") ? "P" : "Space"], shown.has("pause") ? "start and pause" : "start"]);
+  lines.push([[space ? "P" : "Space"], shown.has("pause") ? "start and pause" : "start"]);
   for (const name in COMMANDS) if (shown.has(name)) lines.push(COMMANDS[name]);
   find("legend").replaceChildren(...lines.map(([names, what]) => {
     const boxes = [...names].map((name) => make("kbd", { textContent: name }));
@@ -45,7 +46,7 @@ export function showLegend(directions, others, shown) {
 }
 
 export function onKeyDown(event) {
-  const does = keys.get(event.code);
+  const does = hooks.key(event) ?? keys.get(event.code);
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const on = event.target;
   if (on.matches("input, select, textarea") || (on.matches("button") && event.code === "Space")) return;
@@ -56,6 +57,6 @@ export function onKeyDown(event) {
 }
 
 export function onKeyUp(event) {
-  const does = keys.get(event.code);
+  const does = hooks.key(event) ?? keys.get(event.code);
   if (does?.action) release(does.action, event.code);
 }

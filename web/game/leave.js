@@ -1,16 +1,17 @@
-// The last section: the score, until the next page of the study can be loaded.
+// The end: the last picture with the score, then a section that stays until the next page of the study can be loaded.
+import { showOverlay } from "./overlay.js";
 import { find, points, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause } from "./requests.js";
 
-const SHOWN = 2_000; // ms for which the score is shown at least
+const SHOWN = 4_000; // ms for which the last picture and the score are shown, unless the participant goes on
 
 // `result` is the server's last message; it lacks the score if the game was not played.
 export async function leave({ score, episodes } = {}) {
   const scored = typeof score === "number";
-  setText(find("leave-score"), scored ? `Your ${episodes > 1 ? `total score in ${episodes} games` : "score"}: ${points(score)}` : "");
+  const text = scored ? `Your ${episodes > 1 ? `total score in ${episodes} games` : "score"}: ${points(score)}` : "";
+  setText(find("leave-score"), text);
   find("leave-score").hidden = !scored;
-  showSection("leave");
-  const seen = new Promise((resolve) => setTimeout(resolve, SHOWN));
+  const seen = (scored ? lastPicture(text) : Promise.resolve()).then(() => showSection("leave"));
   for (;;) {
     try {
       const answers = await pageAnswers();
@@ -21,4 +22,15 @@ export async function leave({ score, episodes } = {}) {
     }
     await pause(2_000);
   }
+}
+
+// Resolves when it has been seen.
+function lastPicture(text) {
+  showOverlay("over");
+  setText(find("overlay-score"), text);
+  return new Promise((resolve) => {
+    setTimeout(resolve, SHOWN);
+    find("overlay-button").addEventListener("click", resolve);
+    find("overlay-button").focus({ preventScroll: true });
+  });
 }

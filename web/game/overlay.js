@@ -7,20 +7,22 @@ export const overlays = {
   loading: { title: "Loading the game…" },
   ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
   paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
-  break: { title: "This game is over", button: "Go on now", note: "The next one begins in a moment." },
+  break: { title: "This game is over", button: "Go on now", band: true, note: "The next one begins in a moment." },
   lost: { title: "Connection lost – trying again…", note: "Your game is kept. Please stay on this page." },
   unreachable: {
     title: "Your game cannot be reached – trying again…",
     note: "Your game is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.",
   },
   elsewhere: { title: "The game is open in another tab or on another device", button: "Play here instead" },
-  ended: { title: "Saving your game…" },
+  ended: { title: "Saving your game…", band: true },
+  over: { title: "The game is over", button: "Go on", band: true },
 };
 
 // Shows the overlay of that name; none for other names, such as "playing".
 export function showOverlay(name) {
   const overlay = Object.hasOwn(overlays, name) && overlays[name];
   find("overlay").hidden = !overlay;
+  find("overlay").classList.toggle("band", Boolean(overlay.band)); // the last picture stays to be seen
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
   find("mode").dataset.state = name;
   setText(find("mode"), { playing: "Playing", paused: "Paused" }[name] ?? "");

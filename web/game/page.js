@@ -4,7 +4,7 @@ export const data = JSON.parse(document.getElementById("data").textContent);
 
 export const find = (id) => document.getElementById(id);
 
-const sections = ["wait", "over", "play", "leave"].map(find);
+const sections = ["wait", "over", "play", "leave", "reading"].map(find).filter(Boolean);
 
 export function showSection(id) {
   for (const section of sections) section.hidden = section.id !== id;

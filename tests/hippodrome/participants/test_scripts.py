@@ -118,11 +118,14 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "carried"),
     [
-        ("  const a = (b) => ({ c: 1, d });\n", "const a=(b)=>({c:1,d});\n"),
-        ("  if (a !== b && c) return;\n", "if (a!==b&&c) return;\n"),
-        ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);\n'),
-        ("a + +b - -c;\n", "a + +b - -c;\n"),
+        ("  const a = (b) => ({ c: 1, d });\n", "const a=(b)=>({c:1,d});"),
+        ("  if (a !== b && c) return;\n", "if (a!==b&&c) return;"),
+        ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);'),
+        ("a + +b - -c;\n", "a + +b - -c;"),
+        ("{\n  a;\n}\nb()\n", "{a;}\nb()\n"),
     ],
 )
-def test_a_page_carries_a_script_without_comments_and_spaces_but_texts_as_they_are(source: str, carried: str) -> None:
+def test_a_page_carries_a_script_without_comments_spaces_and_line_ends_but_texts_as_they_are(
+    source: str, carried: str
+) -> None:
     assert frame._plain("a.js", source) == carried

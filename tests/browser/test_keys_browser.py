@@ -1,0 +1,238 @@
+"""Keys, labels and texts of a project's own in a real Chromium."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.browser.test_pages_browser import FLAWS, World, play, shot, tab, tell, world
+
+__all__ = ["tab", "world"]  # fixtures
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+KEYS = {
+    "ArrowLeft": "left", "a": "left", "ArrowUp": "up", "ArrowLeft+ArrowUp": "leftup", " ": "jump", "Enter": "put", "1": "one",
+}  # fmt: skip
+LABELS = {"left": "Go left", "jump": "Jump!"}
+SPACE = ["noop", "left", "up", "leftup", "jump", "put", "one"]
+SIZES = pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
+
+
+@pytest.fixture
+def keyed(world: World) -> World:
+    world.trial = {"keys": KEYS, "labels": LABELS}
+    world.controls = {"keys": KEYS, "labels": LABELS, "actionSpace": SPACE}
+    return world
+
+
+def pressed(world: World, key: str) -> None:
+    world.wait_for({"key": key, "held": True})
+    world.wait_for({"key": key, "held": False})
+
+
+def test_the_projects_keys_are_told_as_the_browser_calls_them(keyed: World, tab: Any) -> None:
+    play(keyed, tab)
+    for key in ("ArrowLeft", "a", "Enter", "1"):
+        tab.keyboard.press(key)
+        pressed(keyed, key)
+    tab.keyboard.press("Space")
+    pressed(keyed, " ")
+    assert keyed.commands("action") == []
+
+
+def test_a_letter_is_let_go_even_if_shift_came_meanwhile(keyed: World, tab: Any) -> None:
+    play(keyed, tab)
+    tab.keyboard.down("a")
+    tab.keyboard.down("Shift")
+    tab.keyboard.up("a")
+    pressed(keyed, "a")
+    tab.keyboard.press("Digit1")  # "!" with Shift
+    pressed(keyed, "1")
+
+
+def test_keys_that_are_not_the_projects_do_as_usual(keyed: World, tab: Any) -> None:
+    play(keyed, tab)
+    tab.keyboard.press("p")
+    keyed.wait_for({"command": "start"})
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.keyboard.press("p")
+    keyed.wait_for({"command": "pause"})
+    tab.keyboard.press("d")
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("a")
+    pressed(keyed, "a")
+    assert not [each for each in keyed.heard if "action" in each or each.get("key") in ("d", "ArrowRight")]
+
+
+@SIZES
+def test_there_is_a_button_for_each_action_and_what_two_do_together_needs_none(
+    keyed: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    play(keyed, tab)
+    names = "all => all.map(each => each.getAttribute('aria-label'))"
+    assert tab.eval_on_selector_all("#controls .pad button", names) == ["Up", "Go left"]
+    assert tab.eval_on_selector_all("#controls .others button", names) == ["Jump!", "Put", "One"]
+    assert tab.evaluate(FLAWS) == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    shot(tab, f"{width}-keys")
+    tab.click("text=Jump!")
+    pressed(keyed, " ")
+    tab.click("#controls .pad .left")
+    pressed(keyed, "ArrowLeft")
+    if width > 1000:
+        assert tab.inner_text("#legend") == (
+            "←A Go left\n↑ up\nSpace Jump!\nEnter put\n1 one\nP start and pause\nR begin again"
+        )
+
+
+def test_an_action_that_only_keys_together_make_has_a_button_if_these_have_none(world: World, tab: Any) -> None:
+    world.trial = {"keys": {"x+y": "jump"}}
+    world.controls = {"keys": {"x+y": "jump"}, "actionSpace": ["noop", "jump"]}
+    play(world, tab)
+    tab.click("#controls .others button")
+    world.wait_for({"action": "jump", "held": True})
+    world.wait_for({"action": "jump", "held": False})
+
+
+def test_labels_alone_are_the_texts_of_the_usual_buttons(world: World, tab: Any) -> None:
+    world.controls = {"labels": {"fire": "Serve", "left": "To the left"}}
+    play(world, tab)
+    assert tab.inner_text("#controls [data-action=fire]") == "Serve"
+    assert tab.get_attribute("#controls [data-action=left]", "aria-label") == "To the left"
+
+
+# Pages beside the game
+
+RULES = "<h1>The rules</h1><p>Jump over the stones.</p>"
+PAUSE = "<h2>Have a rest</h2><p>Look out of the window.</p>"
+
+
+@pytest.fixture
+def told(world: World) -> World:
+    world.trial = {"instructions": "rules", "betweenEpisodes": "pause"}
+    world.texts = {"instructions": RULES, "betweenEpisodes": PAUSE}
+    world.step = 2
+    world.ready()
+    return world
+
+
+@SIZES
+def test_instructions_stand_before_the_game_which_does_not_begin_behind_them(
+    told: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    tab.goto(told.url)
+    tab.wait_for_selector("text=Jump over the stones.")
+    assert not tab.is_visible("#play")
+    assert not tab.is_visible("text=Have a rest")
+    assert tab.evaluate("document.activeElement.id") == "reading"
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-instructions")
+    for key in ("Space", "ArrowLeft", "KeyP"):
+        tab.keyboard.press(key)
+    told.wait_for({"ack": 2})
+    assert {"command": "start"} not in told.heard
+    assert not tab.is_visible("#play")
+    tab.click("text=Go to the game")
+    tab.wait_for_selector("#overlay-title:text('Ready?')")
+    shot(tab, f"{width}-instructions-ready")
+    tab.click("#overlay-button")
+    told.wait_for({"command": "start"})
+
+
+def test_instructions_that_were_read_are_there_in_a_pause_and_not_after_a_reload(told: World, tab: Any) -> None:
+    tab.goto(told.url)
+    tab.click("text=Go to the game")
+    tab.click("#overlay-button")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    assert not tab.is_visible("#instructions-button")
+    tab.keyboard.press("KeyP")
+    tab.click("#instructions-button")
+    tab.wait_for_selector("text=Jump over the stones.")
+    shot(tab, "360-instructions-again")
+    tab.click("text=Back to the game")
+    tab.wait_for_selector("#overlay-title:text('Paused')")
+    tab.reload()
+    tab.wait_for_selector("#overlay-title:text('Ready?')")
+    assert not tab.is_visible("text=Jump over the stones.")
+
+
+@SIZES
+def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_leads_on(
+    told: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    tab.goto(told.url)
+    tab.click("text=Go to the game")
+    tab.click("#overlay-button")
+    told.wait_for({"command": "start"})
+    tell(told, state="break")
+    tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
+    assert not tab.is_visible("text=Have a rest")
+    assert tab.inner_text("#overlay-hint") == ""
+    shot(tab, f"{width}-last-picture")
+    tab.wait_for_selector("text=Have a rest")
+    assert tab.inner_text("#reading-score") == "Game 1 of 2 is over. Your score: 30"
+    assert not tab.is_visible("text=Jump over the stones.")
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-between")
+    before = len(told.commands("command"))
+    tab.click("text=Next game")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    assert told.commands("command")[before:] == ["start"]
+    assert tab.is_visible("#play")
+
+
+def test_who_has_seen_the_last_picture_opens_the_page_between_at_once(told: World, tab: Any) -> None:
+    tab.goto(told.url)
+    tab.click("text=Go to the game")
+    tab.click("#overlay-button")
+    told.wait_for({"command": "start"})
+    before = len(told.commands("command"))
+    tell(told, state="break")
+    tab.click("#overlay-button:text('Go on')", timeout=2_000)
+    tab.wait_for_selector("text=Have a rest", timeout=1_000)
+    assert told.commands("command")[before:] == []
+
+
+# The first picture, and the time that is left
+
+
+@SIZES
+def test_the_first_picture_stands_still_with_a_countdown(world: World, tab: Any, width: int, height: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    world.trial = {"resetFreeze": 3, "episodeSeconds": 90}
+    play(world, tab)
+    tell(world, state="playing", startsIn=2.9, timeLeft=90)
+    tab.wait_for_selector("#overlay-title:text('Get ready')")
+    assert tab.inner_text("#announce") == "Get ready. The game begins in 3 seconds."
+    assert tab.inner_text("#left") == "1:30"
+    assert tab.inner_text("#overlay-hint") == "3"
+    shot(tab, f"{width}-countdown")
+    tab.wait_for_selector("#overlay-hint:text('2')")
+    tab.wait_for_selector("#overlay-hint:text('1')")
+    assert tab.inner_text("#left") == "1:30"
+    assert tab.inner_text("#announce") == "Get ready. The game begins in 3 seconds."
+    tell(world, state="playing", timeLeft=11.5)
+    tab.wait_for_selector("#overlay", state="hidden")
+    assert tab.inner_text("#announce") == "Playing"
+    tab.wait_for_selector("#left:text('0:11')")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-time-left")
+    tab.wait_for_selector("#announce:text('10 seconds left')", state="attached")
+    tell(world, state="paused", timeLeft=9.2)
+    tab.wait_for_timeout(1_500)
+    assert tab.inner_text("#left") == "0:10"
+
+
+def test_the_words_of_the_projects_pages_are_not_taken_for_the_game_pages_own(told: World, tab: Any) -> None:
+    told.texts["instructions"] += "<p id='score'>1</p>"
+    tab.goto(told.url)
+    tab.click("text=Go to the game")
+    told.connections[0].send(json.dumps({"state": "playing", "episode": 1, "score": 5, "frameRate": 30}))
+    tab.wait_for_selector(".hud #score:text('5')")
+    assert tab.text_content("#text-instructions #score") == "1"

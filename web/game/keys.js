@@ -1,0 +1,82 @@
+// Keys and buttons of a project whose config.yml says what each key does (`keys` of the server's message with `UI`).
+import { groupOf, nice } from "./controls.js";
+import { hooks } from "./hooks.js";
+import { DIRECTIONS } from "./keyboard.js";
+import { actionButton } from "./touch.js";
+
+const ARROWS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
+const MOST_BUTTONS = 64; // buttons
+
+let bound = new Map(); // what a key is called here -> the key, as the server knows it
+const pressedKeys = new Map(); // event.code -> what the key is called here: Shift changes `event.key` before it is let go
+
+const called = (key) => `key:${key}`;
+
+// As `parts` in protocol/keyboard.py.
+function partsOf(combined) {
+  if (combined === "+") return ["+"];
+  return combined.endsWith("++") ? [...partsOf(combined.slice(0, -2)), "+"] : combined.split("+");
+}
+
+hooks.means = (name) => (bound.has(name) ? { key: bound.get(name) } : { action: name });
+
+hooks.key = (event) => {
+  if (event.type === "keyup") {
+    const name = pressedKeys.get(event.code);
+    pressedKeys.delete(event.code);
+    return name && { action: name };
+  }
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const onCode = /^(?:Key|Digit|Numpad)(.)$/.exec(event.code)?.[1].toLowerCase(); // another layout, or Shift with a digit
+  const name = [called(key), called(onCode)].find((each) => bound.has(each));
+  if (!name) return undefined;
+  pressedKeys.set(event.code, name);
+  return { action: name };
+};
+
+hooks.controls = ({ keys, labels = {}, actionSpace }) => {
+  if (!keys) return undefined;
+  const all = Object.entries(keys).map(([combined, action]) => ({ parts: partsOf(combined), action }));
+  const single = new Map(all.filter(({ parts }) => parts.length === 1).map(({ parts, action }) => [parts[0], action]));
+  bound = new Map(all.flatMap(({ parts }) => parts).map((key) => [called(key), key]));
+  const pad = Object.keys(ARROWS).filter((key) => bound.has(called(key)));
+  const label = (action) => labels[action] ?? nice(action);
+  const ofPad = ({ parts }) => parts.every((key) => pad.includes(key));
+  const ofButtons = ({ parts }) => parts.every((key) => pad.includes(key) || single.has(key));
+
+  // Whether the action has a button besides those of the pad. What two buttons do together has none.
+  function standsAlone(action) {
+    const own = all.filter((each) => each.action === action);
+    if (own.some((each) => each.parts.length === 1 && ofPad(each))) return false;
+    return Boolean(labels[action]) || own.some(({ parts }) => parts.length === 1) || !own.some(ofButtons);
+  }
+
+  const actions = actionSpace.filter((action) => labels[action] || all.some((each) => each.action === action));
+  const keyOf = (action) => [...single.keys()].find((key) => single.get(key) === action);
+  return {
+    arrows: pad.length > 0,
+    space: bound.has(called(" ")),
+    groups: [
+      groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : nice(ARROWS[key])))),
+      groupOf("others", actions.filter(standsAlone).slice(0, MOST_BUTTONS).map((action) => {
+        const key = keyOf(action);
+        return actionButton(key === undefined ? action : called(key), label(action));
+      })),
+    ],
+    lines: actions.map((action) => [
+      all.filter((each) => each.action === action && (each.parts.length === 1 || !ofPad(each))).map(signs),
+      labels[action] ?? action,
+    ]).filter(([shown]) => shown.length),
+  };
+};
+
+function padButton(key, label) {
+  const direction = ARROWS[key];
+  const button = actionButton(called(key), label, `${DIRECTIONS[direction].sign}\ufe0e`);
+  button.className = `hold ${direction}`;
+  return button;
+}
+
+function signs({ parts }) {
+  return parts.map((key) => DIRECTIONS[ARROWS[key]]?.sign ?? { " ": "Space" }[key] ?? (key.length > 1 ? key : key.toUpperCase())).join(" + ");
+}

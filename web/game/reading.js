@@ -1,0 +1,66 @@
+// Pages of the researcher's beside the game: instructions, before it begins and in a pause, and a page between two games.
+import { start } from "./actions.js";
+import { hooks } from "./hooks.js";
+import { overlays } from "./overlay.js";
+import { data, find, make, points, setText, showSection } from "./page.js";
+import { game } from "./state.js";
+import { recall, remember } from "./storage.js";
+
+const LAST_PICTURE = 2_500; // ms for which the last picture and the score are shown before the page between two games
+
+const texts = { instructions: find("text-instructions"), between: find("text-betweenEpisodes") };
+const noted = `read-${data.step}`;
+const again = make("button", { type: "button", id: "instructions-button", textContent: "Instructions", hidden: true });
+
+let reading = ""; // which of the texts
+let opening; // the timer of the page between two games
+
+// `goOn` says what the button does.
+function openText(name, goOn, score = "") {
+  clearTimeout(opening);
+  reading = name;
+  for (const each in texts) if (texts[each]) texts[each].hidden = each !== name;
+  setText(find("reading-score"), score);
+  find("reading-score").hidden = !score;
+  find("reading-button").textContent = goOn;
+  showSection("reading");
+  window.scrollTo(0, 0);
+  find("reading").focus({ preventScroll: true });
+}
+
+function closeText() {
+  reading = "";
+  showSection("play");
+  find("screen").focus({ preventScroll: true });
+}
+
+function openBetween() {
+  openText("between", "Next game", `Game ${game.episode} of ${game.maxEpisodes} is over. Your score: ${points(game.episodeScore)}`);
+}
+
+const unread = () => Boolean(texts.instructions) && !recall(noted);
+
+hooks.waits = () => {
+  const between = game.state === "break" && texts.between && reading !== "between";
+  if (between) openBetween();
+  else if (game.state === "ready" && unread()) openText("instructions", "Go to the game");
+  else return false;
+  return true;
+};
+
+hooks.overlay.push((name) => {
+  clearTimeout(opening);
+  again.hidden = !texts.instructions || !["ready", "paused"].includes(name);
+  if (name === "ready" && unread()) openText("instructions", "Go to the game");
+  else if (name === "break" && texts.between) opening = setTimeout(openBetween, LAST_PICTURE);
+  else if (reading && name !== "lost" && name !== "unreachable") closeText();
+});
+
+if (texts.between) Object.assign(overlays.break, { button: "Go on", note: "" });
+find("overlay").append(again);
+again.addEventListener("click", () => openText("instructions", "Back to the game"));
+find("reading-button").addEventListener("click", () => {
+  if (reading === "between" && game.state === "break") return start();
+  if (reading === "instructions") remember(noted, true);
+  closeText();
+});
