@@ -217,7 +217,10 @@ def _template(name: str) -> Template:
     return Template(_PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8"))
 
 
-_CODE_OR_TEXT = re.compile(r"""(?P<text>"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`)|[^"`]+""")
+_CODE_OR_TEXT = re.compile(
+    r"""(?P<text>"(?:[^"\\\n]|\\.)*"|`(?:[^`\\$]|\\.|\$(?!\{)|\$\{(?:[^`{}]|`[^`]*`)*\})*`)|[^"`]+"""
+)
+"""A text, a template with the code in it (which may have templates of its own), or other code."""
 _AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|[=?:{},;<>]) ?")
 """Operators and brackets around which spaces mean nothing. Not + and -: `a + +b` is something else without spaces."""
 

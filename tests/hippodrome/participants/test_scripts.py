@@ -122,6 +122,7 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
         ("  if (a !== b && c) return;\n", "if (a!==b&&c) return;"),
         ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);'),
         ("a + +b - -c;\n", "a + +b - -c;"),
+        ("a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`, 1);\n", "a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`,1);"),
         ("{\n  a;\n}\nb()\n", "{a;}\nb()\n"),
     ],
 )
