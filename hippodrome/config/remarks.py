@@ -48,17 +48,20 @@ def starts_at_link(config: Config) -> bool:
 def without_a_key(config: Config) -> Remark | None:
     """What to say about an action that the game takes whenever no key is pressed, and that does something.
 
-    The trial then takes the action `noop`, or else the first one (`trial/core/controls.py`).
+    The trial then takes `idleAction`, or the action `noop`, or else the first one (`trial/core/players.py`). Turn by
+    turn it takes none.
     """
+    if config.trial.idle_action is not None or config.trial.pace == "turns":
+        return None
     names = [name.strip().lower() for name in config.trial.action_space]
     if not names or "noop" in names or names[0] in IDLE or not config.game_steps:
         return None
     rate = config.trial.starting_frame_rate
     idle = next((name for name in names if name in IDLE), None)
     advice = (
-        f'call the action "{idle}" noop, and it is taken instead'
+        f"write idleAction: {idle}, and that is taken instead"
         if idle is not None
-        else "if one of the actions does nothing, call it noop; if none does, see docs/agent.md#no-key"
+        else "if one of the actions does nothing, name it as idleAction; if none does, see docs/agent.md#no-key"
     )
     return Remark(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
 

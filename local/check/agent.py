@@ -165,6 +165,8 @@ class _Reading:
             *self._callbacks(),
             *self._arrows(),
             *self._slow(),
+            *self._slow_policies(),
+            *self._idle(),
             *self._not_on_aws(),
         ]
 
@@ -185,7 +187,7 @@ class _Reading:
         """In which step of which episode it was; nothing for the first step in all groups."""
         steps, episodes = self._report.get("steps", 0), self._report.get("episodes", 0)
         group = "" if self._group is None else f", group {self._group}"
-        if self._report.get("call") in ("start", "close"):
+        if self._report.get("call") in ("start", "players", "policies", "close"):
             return f" ({group.removeprefix(', ')})" if self._group else ""
         if steps < 2 and not episodes and not self._group:
             return ""
@@ -212,6 +214,54 @@ class _Reading:
         said = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
         return [self._in_config(("trial", "startingFrameRate"), said, remark=True)] if said else []
 
+    def _slow_policies(self) -> list[Diagnostic]:
+        """Policies that need longer for an action than there is time. Told once, of the first group."""
+        trial, pace = self._config.trial, Pace(**self._report.get("pace", {}))
+        found: list[Diagnostic] = []
+        for player, told in () if self._group else self._report.get("policies", {}).items():
+            each = Pace(**told)
+            if trial.pace == "turns":
+                given, why = trial.policy_seconds, f"policySeconds is {trial.policy_seconds:g}"
+            else:
+                tick = 1 / trial.starting_frame_rate
+                given = max(tick - pace.usual, tick / 2)
+                why = (
+                    f"at startingFrameRate {trial.starting_frame_rate} a step has {1_000 * tick:.3g} ms, and takes "
+                    f"{1_000 * pace.usual:.2g} itself"
+                )
+            if each.steps > 1 and each.usual > given:
+                needs = f"{self._plays(player)} needs {1_000 * each.usual:.3g} ms for an action here"
+                message = f"{needs}; {why}, so its actions come late"
+                found.append(self._in_config(self._player(player), message, remark=True))
+        return found
+
+    def _idle(self) -> list[Diagnostic]:
+        """An action of no key that visibly does something. Told once, of the first group."""
+        told = self._report.get("idle")
+        if told is None or self._group or told["action"] in remarks.IDLE:
+            return []
+        still = ", ".join(told["still"])
+        advice = (
+            f'write idleAction: "{told["still"][0]}"'
+            if still
+            else "name one as idleAction, or see docs/agent.md#no-key"
+        )
+        said = f"; {still} {'does' if len(told['still']) == 1 else 'do'} not" if still else ""
+        message = (
+            f'missing; while no key is pressed, the game takes its action "{told["action"]}", which changes the picture'
+            f"{said}: {advice}"
+        )
+        return [self._in_config(("trial", "idleAction"), message, remark=True)]
+
+    def _plays(self, player: str) -> str:
+        """What plays this player, as config.yml has it."""
+        return self._config.trial.players_of(self._group).get(player, player)
+
+    def _player(self, player: str) -> Keys:
+        """Where config.yml says who plays this player."""
+        by_group = isinstance(next(iter(self._config.trial.players.values()), None), dict)
+        return ("trial", "players", *((str(self._group or 0),) if by_group else ()), player)
+
     def _not_on_aws(self) -> list[Diagnostic]:
         """What was loaded here, and participants' servers lack."""
         if not agent_imports.may_run_on_aws(self._config):
@@ -236,9 +286,31 @@ class _Reading:
         place = (self._name(error["file"]), error["line"]) if error["file"] else None
         if error["type"] in ("AgentError", "FrameError"):
             return [self._breach(error["text"], place)]
+        told = self._of_players(error, place)
+        if told is not None:
+            return [told]
         remark = report["call"] == "close"
         message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
         return [self._at(place, message, remark=remark)]
+
+    def _of_players(self, error: Mapping[str, Any], place: tuple[str, int] | None) -> Diagnostic | None:
+        """What to say of who plays whom, and of a policy that cannot play; None if it is another error."""
+        text = error["text"].partition(": ")[2]
+        if error["type"] == "PlayersError":
+            key, _, said = text.removeprefix("trial.").partition(" ")
+            return self._in_config(("trial", key), short(said))
+        if error["type"] not in ("PolicyError", "PolicyFileMissing"):
+            return None
+        player = self._asked_policy() or text.partition(": ")[0]
+        said = text.removeprefix(f"{player}: ")
+        if place is None or self._plays(player).endswith(".onnx"):
+            return self._in_config(self._player(player), short(f"{said}{self._where()}"))
+        return self._at(place, short(f"{said}{self._where()}"))
+
+    def _asked_policy(self) -> str | None:
+        """The player whose policy was called last, if one was."""
+        called = re.fullmatch(r"policy (.*) (act|reset)", self._report.get("call", ""))
+        return called[1] if called else None
 
     def _callbacks(self) -> list[Diagnostic]:
         """What callbacks raise, and one that takes too long. Neither ends a game, but data are lacking then."""
@@ -297,7 +369,11 @@ class _Reading:
 
     def _call(self) -> str:
         call = self._report.get("call", "start")
+        policy = self._asked_policy()
+        if policy is not None:
+            return f"{call.rpartition(' ')[2]}() of {printable(self._plays(policy))}"
         return {
+            "policies": "making the policies",
             "start": f'start("{printable(self._config.trial.game or "")}")',
             "step": f"step({self._report.get('action', 0)})",
         }.get(call, f"{call}()")

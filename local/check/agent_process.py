@@ -14,19 +14,24 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
 
+from local.check import idle
 from local.check.pace import Pace
+from local.check.several import Game
 from protocol import environment as variables
 from protocol import handover
+from protocol.trial import Trial
 from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import About, Callbacks
-from trial.core.players import PLAYER
+from trial.agent.joint import JointAdapter
+from trial.agent.starting import start
+from trial.core.players import PLAYER, Player, who_plays
 from trial.server import warm
 from trial.settings import trial_section
 
@@ -62,11 +67,16 @@ def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    player = AgentAdapter(folder, config.game, config.action_space)
+    adapter = AgentAdapter(folder, config.game, config.action_space)
     document = os.environ.pop("GIVEN", "")
+    group = _group(document)
     plain, _Early.folder = os.environ.__class__, folder
     if document:
         os.environ.__class__ = _Early
+    progress = _Progress(report, folder)
+    if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
+        return
+    player: AgentAdapter | JointAdapter = progress.result
 
     def reset() -> Any:
         os.environ.__class__ = plain
@@ -75,24 +85,77 @@ def _try(report: Path) -> None:
         progress.callbacks.session_begins()
         return player.reset(1)
 
-    progress = _Progress(report, folder)
-    if not progress.call("start", player.start):
+    spaces = {PLAYER: player.action_space} if isinstance(player, AgentAdapter) else player.action_spaces
+    progress.known = _actions(player, config)
+    if not progress.call("players", lambda: who_plays(config, spaces, group)):
         return
-    env = player.env
-    space = getattr(env, "action_space", None)
+    players = progress.result
+    progress.callbacks = _callbacks(player, progress, config.callback_seconds)
+    if isinstance(player, JointAdapter):
+        game = Game(player, players, config, folder, progress)
+        if not player.steps_itself and progress.known["names"] > (progress.known["count"] or math.inf):
+            progress.foreign = [progress.known["count"]]
+        played = game.load() and game.play(reset, progress.time_over)
+        if played and _seen_idle(player, players, config, progress) and game.close():
+            progress.over()
+        return
+    env, space = player.env, getattr(player.env, "action_space", None)
     count = getattr(space, "n", None)
-    progress.known = {"names": len(player.action_space), "count": None if count is None else int(count)}
-    if not config.action_space:
-        progress.known["actions"] = player.action_space
     if count is not None and len(player.action_space) > int(count):
         first = int(getattr(space, "start", 0))
         progress.foreign = _foreign_actions(env, range(first, first + int(count)))
-    progress.callbacks = _callbacks(player, progress, config.callback_seconds)
-    if _play(player, progress, reset, config.max_episodes) and progress.call("close", player.close):
+    played = _play(player, progress, reset, config.max_episodes)
+    if played and _seen_idle(player, players, config, progress) and progress.call("close", player.close):
         progress.over()
 
 
-def _callbacks(player: AgentAdapter, progress: _Progress, seconds: float) -> Callbacks:
+def _group(document: str) -> int | None:
+    """The participant's group, which a warm server is told when it is assigned."""
+    if document:
+        return handover.parse(document.encode()).group
+    text = os.environ.get(variables.GROUP, "")
+    return int(text) if text else None
+
+
+def _actions(player: AgentAdapter | JointAdapter, config: Trial) -> dict[str, Any]:
+    """How many names of actions there are, and how many actions (None: not known); the names, if they are not given."""
+    if isinstance(player, AgentAdapter):
+        count = getattr(getattr(player.env, "action_space", None), "n", None)
+        found = {"names": len(player.action_space), "count": None if count is None else int(count)}
+        return found | ({} if config.action_space else {"actions": player.action_space})
+    counts = [count for count in player.action_counts.values() if count is not None]
+    found = {"names": len(config.action_space), "count": int(max(counts)) if counts else None}
+    return found | ({} if config.action_space else {"actions": max(player.action_spaces.values(), key=len)})
+
+
+def _seen_idle(
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: Trial, progress: _Progress
+) -> bool:
+    """Note whether the action of no key visibly does something, where config.yml says nothing of it. Always true.
+
+    Errors are not told: the agent has played well without them.
+    """
+    human = next(one for one in players if one.human)
+    if config.pace == "turns" or config.action_space or config.idle_action is not None:
+        return True
+    others = {one.name: one.idle for one in players}
+
+    def step(action: int) -> bool:
+        if isinstance(player, AgentAdapter):
+            outcome = player.step(action)
+            return outcome.terminated or outcome.truncated
+        return player.step({**others, human.name: action}).over
+
+    picture = player.render if isinstance(player, AgentAdapter) else player.pictures
+    with contextlib.suppress(Exception):
+        still = idle.moves(player.reset, step, picture, len(human.action_space), human.idle)
+        if still is not None:
+            names = [human.action_space[action] for action in still]
+            progress.known["idle"] = {"action": human.action_space[human.idle], "still": names}
+    return True
+
+
+def _callbacks(player: AgentAdapter | JointAdapter, progress: _Progress, seconds: float) -> Callbacks:
     """The agent's callbacks, which are told what happens as on a server."""
     return Callbacks(
         player.callbacks,
@@ -127,7 +190,6 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
     """
     callbacks = progress.callbacks
     random = Random(1)  # noqa: S311 - the same each time
-    until = math.inf
     for episode in range(1, most + 1):
         reset = first_reset if episode == 1 else partial(player.reset, episode)
         if not progress.call("reset", reset):
@@ -138,7 +200,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
         callbacks.episode_began(episode, {PLAYER: observation}, {PLAYER: info})
         ended = False
         while not ended:
-            if progress.steps >= PLAY_STEPS or time.monotonic() > until:
+            if progress.time_over():
                 callbacks.session_ended()
                 return True
             actions = len(player.action_space)
@@ -154,8 +216,6 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
             progress.pace.took(time.monotonic() - began)
             seen = {PLAYER: outcome.observation}, {PLAYER: outcome.info}
             callbacks.stepped({PLAYER: progress.action}, {PLAYER: outcome.reward}, *seen)
-            if progress.steps == 1:
-                until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
         progress.episodes = episode
         callbacks.episode_ended("terminated" if outcome.terminated else "truncated")
     callbacks.session_ended()
@@ -167,7 +227,8 @@ class _Progress:
 
     def __init__(self, report: Path, folder: Path) -> None:
         self._report, self._folder = report, folder
-        self.episodes = self.steps = self.action = 0
+        self.episodes = self.steps = 0
+        self.action: Any = 0  # or by player
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
         self.callbacks: Any = None
@@ -175,6 +236,13 @@ class _Progress:
         self.pace = Pace()
         self.result: Any = None
         self._ours = _installed_modules()
+        self._until = math.inf
+
+    def time_over(self) -> bool:
+        """Whether enough has been played. The time counts from the first step on."""
+        if self.steps == 1 and self._until == math.inf:
+            self._until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
+        return self.steps >= PLAY_STEPS or time.monotonic() > self._until
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
         """Call it; whether that went well."""

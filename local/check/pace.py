@@ -13,6 +13,11 @@ class Pace:
     seconds: float = 0.0
     slowest: float = 0.0
 
+    @property
+    def usual(self) -> float:
+        """Seconds of a step on average, without the slowest one."""
+        return (self.seconds - self.slowest) / (self.steps - 1) if self.steps > 1 else self.seconds
+
     def took(self, seconds: float) -> None:
         """One more step was played."""
         self.steps += 1

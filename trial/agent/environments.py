@@ -29,6 +29,8 @@ class Players:
     observation_spaces: Mapping[str, Any]
     starts: Mapping[str, int]
     """The number of each player's first action for the environment."""
+    counts: Mapping[str, int | None]
+    """How many actions each has for the environment; None if that is not known."""
     of_env: bool
     """`env` itself is stepped, and its `agents` are those who are still in the game."""
 
@@ -125,9 +127,10 @@ def _keys(place: Any) -> list[Any]:
 def players_of(
     env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_env: bool, stepped: bool = True
 ) -> Players:
-    """The players with these keys, and their actions: the configured names first, as far as each player has so many.
+    """The players with these keys, and their actions: the configured names first.
 
-    `stepped`: the environment itself gets the actions, so they begin where its spaces do. Raises PlayersUnknown if two
+    `stepped`: the environment itself gets the actions, so there are as many as its spaces have, and they begin there.
+    Raises PlayersUnknown if two
     players have the same name as text, or if the actions of one cannot be told.
     """
     by_name = {str(key): key for key in keys}
@@ -138,9 +141,10 @@ def players_of(
         env=env,
         names=tuple(by_name),
         keys=by_name,
-        action_names={name: _action_names(env, name, spaces[name], configured) for name in by_name},
+        action_names={name: _action_names(env, spaces[name], configured, stepped) for name in by_name},
         observation_spaces={name: _space(env, "observation_space", key) for name, key in by_name.items()},
         starts={name: int(getattr(space, "start", 0)) if stepped else 0 for name, space in spaces.items()},
+        counts={name: getattr(space, "n", None) for name, space in spaces.items()},
         of_env=of_env,
     )
 
@@ -161,7 +165,9 @@ def _space(env: Any, name: str, key: Any) -> Any:
     return found
 
 
-def _action_names(env: Any, player: str, space: Any, configured: Sequence[str]) -> tuple[str, ...]:
+def _action_names(env: Any, space: Any, configured: Sequence[str], stepped: bool) -> tuple[str, ...]:
+    if configured and not stepped:
+        return tuple(configured)
     count = getattr(space, "n", None)
     names = list(configured) or _meanings(env)
     if count is None:

@@ -72,6 +72,8 @@ class JointAdapter:
         """The names of each player's actions, in the order of their numbers."""
         self.observation_spaces: Mapping[str, Any] = players.observation_spaces
         """Gymnasium's space of each player's observations; None where it is not known."""
+        self.action_counts: Mapping[str, int | None] = players.counts
+        """How many actions each player has in the environment; None where it is not known."""
         self.views: tuple[str, ...] = self.players
         """The players whose pictures are wanted, where each has a view of their own."""
 
@@ -79,6 +81,11 @@ class JointAdapter:
     def env(self) -> Any:
         """The environment, as far as it is known."""
         return self._adapter.env
+
+    @property
+    def steps_itself(self) -> bool:
+        """Whether the researcher's code takes the actions, and not the environment."""
+        return self._adapter.steps_itself
 
     @property
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:

@@ -1,0 +1,58 @@
+"""Whether the action of no key visibly does something: in the agent's process (`agent_process.py`).
+
+In the same state, the picture after the idle action differs from the one before it, and that after another action does
+not: then the idle action did it, and not the game by itself. States are reached by the same seed and actions each time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+import numpy as np
+
+SECONDS = 3.0
+_STATES = (0, 2, 5, 9)  # so many steps after a reset
+_MOST_ACTIONS = 10
+
+
+def moves(
+    begin: Callable[[int], Any], step: Callable[[int], bool], picture: Callable[[], Any], count: int, idle: int
+) -> list[int] | None:
+    """None if the idle action does nothing visible, or if that cannot be told; else the actions that change nothing.
+
+    `begin(seed)` begins an episode, `step(action)` takes a step and says whether the episode is over.
+    """
+    until = time.monotonic() + SECONDS
+    random = Random(1)  # noqa: S311 - the same each time
+    walk = [random.randrange(count) for _ in range(max(_STATES))]
+    still = set(range(min(count, _MOST_ACTIONS))) - {idle}
+    found = False
+    for state in _STATES:
+        seen: dict[int, bool] = {}
+        for action in [idle, idle, *sorted(set(range(min(count, _MOST_ACTIONS))) - {idle})]:
+            if time.monotonic() > until:
+                return None if not found else sorted(still)
+            begin(1)
+            if any([step(each) for each in walk[:state]]):  # noqa: C419 - all steps are taken
+                return sorted(still) if found else None
+            before = picture()
+            step(action)
+            changed = not same(before, picture())
+            if seen.setdefault(action, changed) != changed:
+                return None  # it plays differently each time
+            if changed:
+                still.discard(action)
+        found = found or (seen[idle] and not all(seen.values()))
+    return sorted(still) if found else None
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two pictures show the same: frames, scenes, or one for each player."""
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return bool(np.array_equal(one, other))
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return bool(one == other)

@@ -1,0 +1,148 @@
+"""Plays an environment with several players: in the agent's process (`agent_process.py`).
+
+Participants press random keys, and policies play in their places, as on a server but one after another: each is timed
+by itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any, Protocol
+
+from local.check.pace import Pace
+from protocol.trial import Trial
+from trial.agent.joint import Joint, JointAdapter
+from trial.core.players import Player
+from trial.core.seeds import policy_seed
+from trial.policies.policy import Policy, legal
+from trial.policies.team import load_all
+
+
+class Reporting(Protocol):
+    """What plays are reported to (`_Progress` of `agent_process.py`)."""
+
+    action: Any
+    steps: int
+    episodes: int
+    pace: Pace
+    known: dict[str, Any]
+    result: Any
+    callbacks: Any
+
+    def call(self, name: str, function: Callable[[], Any]) -> bool: ...
+
+
+class Game:
+    """A game of several players; `play` lets them."""
+
+    def __init__(
+        self, adapter: JointAdapter, players: Sequence[Player], config: Trial, folder: Path, progress: Reporting
+    ) -> None:
+        self._adapter, self._players, self._config, self._progress = adapter, players, config, progress
+        self._folder = folder
+        self._policies: dict[str, Policy] = {}
+        self._paces: dict[str, Pace] = {}
+        self._last: dict[str, int] = {}
+        self._random = Random(1)  # noqa: S311 - the same each time
+        self._pressed = 0
+        adapter.views = tuple(player.name for player in players if player.human)
+
+    def load(self) -> bool:
+        """Load the policies; whether that went well."""
+        plays = {player.name: player.plays for player in self._players}
+        idle = {player.name: player.idle for player in self._players}
+        if not self._progress.call("policies", lambda: load_all(plays, self._adapter, self._folder, idle)):
+            return False
+        self._policies = self._progress.result
+        self._paces = {name: Pace() for name in self._policies}
+        return True
+
+    def play(self, first_reset: Callable[[], Any], over: Callable[[], bool]) -> bool:
+        """Play up to the end of the last episode, or until `over`; False if something failed."""
+        progress, callbacks = self._progress, self._progress.callbacks
+        for episode in range(1, self._config.max_episodes + 1):
+            if not progress.call("reset", first_reset if episode == 1 else partial(self._adapter.reset, episode)):
+                return False
+            now: Joint = progress.result[0]
+            if not (progress.call("render", self._adapter.pictures) and self._reset_policies(episode)):
+                return False
+            callbacks.episode_began(episode, now.observations, now.infos)
+            steps = 0
+            while not now.over:
+                if over():
+                    callbacks.session_ended()
+                    return True
+                actions = self._actions(now, steps)
+                if actions is None:
+                    return False
+                began = time.monotonic()
+                progress.action = actions
+                if not progress.call("step", partial(self._adapter.step, actions)):
+                    return False
+                now, steps = progress.result, steps + 1
+                progress.steps += 1
+                if not progress.call("render", self._adapter.pictures):
+                    return False
+                progress.pace.took(time.monotonic() - began)
+                progress.known["policies"] = {name: asdict(pace) for name, pace in self._paces.items()}
+                callbacks.stepped(actions, now.rewards, now.observations, now.infos)
+            progress.episodes = episode
+            callbacks.episode_ended(now.why)
+        callbacks.session_ended()
+        return True
+
+    def close(self) -> bool:
+        """Close the policies and the agent."""
+        for policy in self._policies.values():
+            if not self._progress.call("close", policy.close):
+                return False
+        return self._progress.call("close", self._adapter.close)
+
+    def _reset_policies(self, episode: int) -> bool:
+        self._last = {}
+        for name, policy in self._policies.items():
+            seed = policy_seed(episode, name)
+            if not self._progress.call(f"policy {name} reset", partial(policy.reset, seed)):
+                return False
+        return True
+
+    def _actions(self, now: Joint, step: int) -> dict[str, int] | None:
+        """What those who are to act do; None if a policy failed."""
+        actions: dict[str, int] = {}
+        for player in self._players:
+            name = player.name
+            if name not in now.to_act:
+                continue
+            allowed = legal(len(player.action_space), now.masks.get(name))
+            if player.human:
+                actions[name] = self._press(allowed)
+            elif name in self._policies:
+                action = self._asked(name, now) if self._due(step) else self._last.get(name, player.idle)
+                if action is None:
+                    return None
+                actions[name] = action if action in allowed else allowed[0]
+            else:
+                actions[name] = player.idle if player.idle in allowed else allowed[0]
+        return actions
+
+    def _press(self, allowed: Sequence[int]) -> int:
+        """Each action once in turn, then they are at random."""
+        self._pressed += 1
+        return self._pressed - 1 if self._pressed - 1 in allowed else self._random.choice(allowed)
+
+    def _due(self, step: int) -> bool:
+        return self._config.pace == "turns" or step % self._config.frame_skip == 0
+
+    def _asked(self, name: str, now: Joint) -> int | None:
+        policy, seen, info = self._policies[name], now.observations.get(name), now.infos.get(name, {})
+        began = time.monotonic()
+        if not self._progress.call(f"policy {name} act", lambda: policy.act(seen, info, now.masks.get(name))):
+            return None
+        self._paces[name].took(time.monotonic() - began)
+        self._last[name] = self._progress.result
+        return self._last[name]

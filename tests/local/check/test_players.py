@@ -1,0 +1,252 @@
+"""`make check` of environments with several players: whole episodes with the policies in their places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hippodrome.config import read_project
+from local.check import agent as agent_check
+from testing import onnx_files, preloaded
+from tests.local.conftest import write_study
+from trial.server import process_group
+
+AGENT = """
+import numpy
+
+
+class Agent:
+    possible_agents = ["left", "right"]
+
+    def start(self, game):
+        pass
+
+    def reset(self, seed=None):
+        self.n = 0
+        return self.seen(), {}
+
+    def seen(self):
+        return {"left": numpy.zeros(2, numpy.float32), "right": numpy.ones(2, numpy.float32)}
+
+    def step(self, actions):
+        self.n += 1
+        return self.seen(), {"left": 1}, {"__all__": self.n == 20}, {}, {}
+
+    def render(self):
+        return numpy.zeros((8, 8, 3), numpy.uint8)
+
+    def close(self):
+        pass
+
+
+class Partner:
+    def act(self, observation, info):
+        assert observation[0] == 1
+        return 2
+
+    def reset(self, seed):
+        pass
+"""
+
+TRIAL = """
+trial:
+  game: none
+  maxEpisodes: 3
+  actionSpace: [noop, up, down]
+  players: {left: human, right: PLAYS}
+"""
+
+
+@pytest.fixture(autouse=True)
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The agent is tried in a forked process, whose imports are done."""
+    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    found = write_study(tmp_path / "study", start=2)
+    (found / "agent.py").write_text(AGENT)
+    return found
+
+
+def tried(folder: Path, plays: str, old: str = "", new: str = "", said: list[str] | None = None) -> list[str]:
+    """What is said of the study in which `plays` plays the right player, with a text of the `trial` section replaced."""
+    file = folder / "config.yml"
+    project = file.read_text().partition("\ntrial:")[0]
+    assert old in TRIAL
+    file.write_text(project + (TRIAL.replace(old, new) if old else TRIAL).replace("PLAYS", plays))
+    say = (said if said is not None else []).append
+    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), 60, say)]
+
+
+@pytest.mark.parametrize(
+    "plays", ["agent:Partner", "random", "idle", "gym://learner", "policies/p.onnx", "sample:policies/p.onnx"]
+)
+def test_whole_episodes_are_played(folder: Path, plays: str) -> None:
+    onnx_files.linear(folder / "policies/p.onnx", [[1, 0, 0], [0, 2, 1]])
+    said: list[str] = []
+    found = tried(folder, plays, "maxEpisodes", "gym: advise\n  maxEpisodes", said)
+    assert (found, said) == ([], ["played: 3 of 3 episodes to the end, 60 steps"])
+
+
+def test_players_that_the_environment_has_not_are_told_with_those_it_has(folder: Path) -> None:
+    (line,) = tried(folder, "random", "right:", "rigth:")
+    assert line.endswith('trial.players: names "rigth", but the environment has "left", "right"')
+    assert line.startswith("config.yml:")
+    (line,) = tried(folder, "random", ", right: PLAYS", "")
+    assert line.endswith('trial.players: must say who plays "right"; the environment has "left", "right"')
+
+
+def test_without_players_nobody_plays_the_others(folder: Path) -> None:
+    (line,) = tried(folder, "random", "  players: {left: human, right: PLAYS}\n", "")
+    assert line.endswith('trial.players: must say who plays "right"; the environment has "left", "right"')
+
+
+@pytest.mark.parametrize(
+    ("plays", "said"),
+    [
+        ("policies/none.onnx", "there is no file policies/none.onnx; there are policies/"),
+        ("policies/text.onnx", "policies/text.onnx is no ONNX file that onnxruntime can read: "),
+        ("policies/wide.onnx", "policies/wide.onnx takes observations of 5 numbers (its input 'obs'); the environment gives 2 numbers"),
+        ("policies/many.onnx", "policies/many.onnx returns 4 numbers as 'output'; expected 3, one for each action"),
+        ("policies/nan.onnx", "policies/nan.onnx returned NaN instead of the actions' values"),
+        ("agent:Partnr", "there is no class Partnr in agent.py; classes with act() there: Partner"),
+    ],
+)  # fmt: skip
+def test_a_policy_that_cannot_play_is_told_where_config_yml_names_it(folder: Path, plays: str, said: str) -> None:
+    policies = folder / "policies"
+    onnx_files.linear(policies / "wide.onnx", np.zeros((5, 3)))
+    onnx_files.linear(policies / "many.onnx", np.zeros((2, 4)))
+    onnx_files.constant(policies / "nan.onnx", np.full((1, 3), np.nan, np.float32))
+    (policies / "text.onnx").write_text("text")
+    (line,) = tried(folder, plays)
+    assert f"trial.players.right: {said}" in line
+    assert line.startswith("config.yml:")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("return 2", "return 7", "config.yml:12: trial.players.right: act() returned action 7; there are 0 to 2"),
+        ("return 2", "return 1 / 0", "agent.py:32: act() of agent:Partner fails: ZeroDivisionError"),
+        ("    def reset(self, seed):\n        pass", "    def reset(self, seed):\n        seed.x", "agent.py:35: reset() of agent:Partner fails: AttributeError"),
+        ("class Partner:", "class Partner:\n    def __init__(self):\n        self.y = x\n", "agent.py:31: making the policies fails: NameError"),
+    ],
+)  # fmt: skip
+def test_a_policy_of_agent_py_that_fails_is_told_at_its_line(folder: Path, old: str, new: str, said: str) -> None:
+    (folder / "agent.py").write_text(AGENT.replace(old, new))
+    (line,) = tried(folder, "agent:Partner")
+    assert line.startswith(said)
+
+
+def test_each_group_is_tried_with_its_players(folder: Path) -> None:
+    (folder / "steps" / "hello-0.html").write_text("<p>0</p>")
+    (folder / "steps" / "hello-1.html").write_text("<p>1</p>")
+    (folder / "steps" / "hello.html").unlink()
+    new = "\n    0: {left: human, right: agent:Partner}\n    1: {left: human, right: policies/none.onnx}"
+    said: list[str] = []
+    (line,) = tried(folder, "random", " {left: human, right: PLAYS}", new, said)
+    assert line.endswith("trial.players.1.right: there is no file policies/none.onnx (group 1)")
+    assert said == ["played in group 0: 3 of 3 episodes to the end, 60 steps"]
+
+
+SLOW = "    def act(self, observation, info):\n        import time; time.sleep(0.05)"
+
+
+def test_a_policy_that_is_slower_than_a_step_is_remarked_with_its_time(folder: Path) -> None:
+    (folder / "agent.py").write_text(AGENT.replace("    def act(self, observation, info):", SLOW))
+    (line,) = tried(folder, "agent:Partner")
+    assert "remark: trial.players.right: agent:Partner needs 5" in line
+    assert "ms for an action here; at startingFrameRate 30 a step has 33.3 ms, and takes " in line
+    assert tried(folder, "agent:Partner", "maxEpisodes: 3", "maxEpisodes: 1\n  pace: turns") == []
+
+
+def test_what_the_agent_returns_of_players_that_there_are_not(folder: Path) -> None:
+    (folder / "agent.py").write_text(AGENT.replace('{"left": 1}', '{"lift": 1}'))
+    (line,) = tried(folder, "random")
+    assert line == "agent.py:18: step() returned something of 'lift'; the players are left, right"
+
+
+ENV = AGENT.replace("class Agent:", "class Env:").replace(
+    "def start(self, game):\n        pass\n",
+    """
+    def action_space(self, player):
+        from gymnasium.spaces import Discrete
+        return Discrete(2)
+""",
+)
+
+
+def test_more_names_than_actions(folder: Path) -> None:
+    leaves = "\nclass Agent:\n    def start(self, game):\n        return Env()\n"
+    (folder / "agent.py").write_text(ENV + leaves)
+    (line,) = tried(folder, "random")
+    assert "trial.actionSpace: has 3 names, but the environment has 2 actions; take out" in line
+    translates = f"{leaves}    def step(self, actions):\n        return Env.step(self, actions)\n"
+    translates += "    seen = Env.seen\n    def reset(self, seed=None):\n        return Env.reset(self, seed)\n"
+    (folder / "agent.py").write_text(ENV + translates)
+    assert tried(folder, "random") == []
+
+
+# ---- the action of no key
+
+WORLD = """
+import numpy
+
+
+class Env:
+    STILL = 3
+    def __init__(self):
+        from gymnasium.spaces import Discrete
+        self.action_space = Discrete(4)
+    def get(self):
+        return numpy.full((8, 8, 3), self.at % 200, numpy.uint8)
+    def move(self, action):
+        self.n += 1
+        self.at += (0 if action == self.STILL else action + 1) + self.WIND
+
+
+class Agent:
+    def start(self, game):
+        self.env = Env()
+        return self.env
+    def reset(self, seed=None):
+        self.env.at = self.env.n = 0
+        return 0, {}
+    def step(self, action):
+        self.env.move(action)
+        return 0, 0, self.env.n == 20, False, {}
+    def render(self):
+        return self.env.get()
+    def close(self):
+        pass
+"""
+
+ALONE = ("  actionSpace: [noop, up, down]\n  players: {left: human, right: PLAYS}\n", "")
+
+
+def world(folder: Path, wind: str, still: str = "3") -> None:
+    (folder / "agent.py").write_text(WORLD.replace("STILL = 3", f"STILL = {still}; WIND = {wind}"))
+
+
+def test_an_idle_action_that_changes_the_picture_is_remarked_with_one_that_does_not(folder: Path) -> None:
+    world(folder, "0")
+    found = [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
+    assert len(found) == 1
+    assert found[0].endswith(
+        'trial.idleAction: missing; while no key is pressed, the game takes its action "0", which changes the picture; '
+        '3 does not: write idleAction: "3"'
+    )
+    assert "remark: " in found[0]
+    for new in ('  idleAction: "3"\n', "  pace: turns\n", "  actionSpace: [stay, up, down, left]\n"):
+        assert not [line for line in tried(folder, "", ALONE[0], new) if "idleAction" in line]
+
+
+@pytest.mark.parametrize(("wind", "still"), [("0", "0"), ("1", "3"), ("__import__('random').randrange(9)", "3")])
+def test_an_idle_action_of_which_that_cannot_be_said_is_not_remarked(folder: Path, wind: str, still: str) -> None:
+    """Action 0 does nothing; the game moves by itself; it plays differently each time."""
+    world(folder, wind, still)
+    assert not [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
