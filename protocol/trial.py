@@ -462,8 +462,17 @@ class Trial:
     def players_of(self, group: int | None) -> dict[str, str]:
         """What plays each player in this group; empty if the section does not say."""
         if who.by_group(self.players):
-            return dict(self.players.get(str(group), {}))
+            return dict(self.players.get(str(self.groups()[0] if group is None else group), {}))
         return dict(self.players)
+
+    def groups(self) -> tuple[int, ...]:
+        """The groups that `players` names; empty if it does not differ between groups."""
+        return tuple(map(int, self.players)) if who.by_group(self.players) else ()
+
+    def player_names(self) -> tuple[str, ...]:
+        """The players that `players` names, in any group."""
+        tables = self.players.values() if who.by_group(self.players) else [self.players]
+        return tuple(dict.fromkeys(name for table in tables for name in table))
 
     def document(self) -> dict[str, Any]:
         """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""

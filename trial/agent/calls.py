@@ -11,7 +11,6 @@ from trial.agent.callbacks import Callbacks
 from trial.core.effects import Begun, Call, FeedbackCall, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
 from trial.core.players import PLAYER, View
 from trial.core.progress import Episode
-from trial.core.unfinished import UnfinishedEpisode
 from trial.recordings import recording
 
 log = logging.getLogger("trial")
@@ -21,23 +20,10 @@ class Diverged(Exception):
     """A replayed episode differs from its recording."""
 
 
-class AgentCalls:
-    """Runs calls of an agent with one player, on the agent's thread.
+class Calls:
+    """Runs calls, on the agent's thread. `stamp` returns the first fields of each line of the recording."""
 
-    `stamp` returns the first fields of each line of the recording. `views` is whether the core is told what the player
-    sees.
-    """
-
-    def __init__(
-        self,
-        agent: AgentAdapter,
-        stamp: Callable[[], dict[str, Any]],
-        *,
-        record_observations: bool,
-        views: bool = False,
-    ) -> None:
-        self._agent = agent
-        self._views = views
+    def __init__(self, stamp: Callable[[], dict[str, Any]], *, record_observations: bool) -> None:
         self._stamp = stamp
         self._record_observations = record_observations
         self.callbacks: Callbacks | None = None
@@ -51,13 +37,81 @@ class AgentCalls:
         if isinstance(call, FeedbackCall):
             return self._end(call)
         if isinstance(call, ResetCall):
+            if self.callbacks:
+                self.callbacks.session_begins()
             return self._reset(call.episode, call.seed)
         assert isinstance(call, ReplayCall)
-        return self._replay(call.unfinished, call.default_actions[PLAYER])
+        return self._replay(call)
 
     def _reset(self, episode: int, seed: int) -> Begun:
+        raise NotImplementedError
+
+    def _step(self, call: StepCall) -> StepTaken:
+        raise NotImplementedError
+
+    def _take_again(self, call: ReplayCall) -> Replayed:
+        raise NotImplementedError
+
+    def _say(self, word: str) -> str:
+        """Give the agent a word of feedback; the player whose human said it."""
+        raise NotImplementedError
+
+    def _replay(self, call: ReplayCall) -> Replayed:
+        if not self.callbacks:
+            return self._take_again(call)
+        self.callbacks.session_begins()
+        self.callbacks.replaying = True
+        try:
+            return self._take_again(call)
+        finally:
+            self.callbacks.replaying = False
+
+    def _give_feedback(self, call: FeedbackCall) -> None:
+        for word in call.feedback:
+            call.heard += 1
+            self._feedback(word)
+
+    def _feedback(self, word: str) -> None:
+        player = self._say(word)
         if self.callbacks:
-            self.callbacks.session_begins()
+            self.callbacks.fed_back(player, word)
+
+    def _end(self, call: FeedbackCall) -> None:
+        self._give_feedback(call)
+        if self.callbacks:
+            if isinstance(call.over, Episode):
+                self.callbacks.episode_ended(call.over.why)
+            if call.last:
+                self.callbacks.session_ended()
+
+    def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        kept, too_large = recording.bounded_extra(values)
+        for name, size in too_large.items():
+            if name not in self._said_too_large:
+                self._said_too_large.add(name)
+                text = (
+                    "what step() returns as %r is too large for the recording (%d bytes); its size is recorded instead"
+                )
+                log.warning(text, name[:100], size)
+        return {"extra": kept}
+
+
+class AgentCalls(Calls):
+    """Runs calls of an agent with one player. `views` is whether the core is told what the player sees."""
+
+    def __init__(
+        self,
+        agent: AgentAdapter,
+        stamp: Callable[[], dict[str, Any]],
+        *,
+        record_observations: bool,
+        views: bool = False,
+    ) -> None:
+        super().__init__(stamp, record_observations=record_observations)
+        self._agent = agent
+        self._views = views
+
+    def _reset(self, episode: int, seed: int) -> Begun:
         first, info, seeded = self._agent.reset(seed)
         frame = self._agent.render()
         if self.callbacks:
@@ -73,17 +127,8 @@ class AgentCalls:
         mask = mask_in(info)
         return View(frozenset({PLAYER}), masks={} if mask is None else {PLAYER: mask})
 
-    def _replay(self, unfinished: UnfinishedEpisode, default_action: int) -> Replayed:
-        if not self.callbacks:
-            return self._take_again(unfinished, default_action)
-        self.callbacks.session_begins()
-        self.callbacks.replaying = True
-        try:
-            return self._take_again(unfinished, default_action)
-        finally:
-            self.callbacks.replaying = False
-
-    def _take_again(self, unfinished: UnfinishedEpisode, default_action: int) -> Replayed:
+    def _take_again(self, call: ReplayCall) -> Replayed:
+        unfinished, default_action = call.unfinished, call.default_actions[PLAYER]
         first, info, seeded = self._agent.reset(unfinished.seed or 0)
         if not seeded or unfinished.seed is None:
             raise Diverged("the environment takes no seed")
@@ -102,23 +147,9 @@ class AgentCalls:
             info = result.info
         return Replayed(self._agent.render(), self._view(info))
 
-    def _give_feedback(self, call: FeedbackCall) -> None:
-        for word in call.feedback:
-            call.heard += 1
-            self._feedback(word)
-
-    def _feedback(self, word: str) -> None:
+    def _say(self, word: str) -> str:
         self._agent.feedback(word)
-        if self.callbacks:
-            self.callbacks.fed_back(PLAYER, word)
-
-    def _end(self, call: FeedbackCall) -> None:
-        self._give_feedback(call)
-        if self.callbacks:
-            if isinstance(call.over, Episode):
-                self.callbacks.episode_ended(call.over.why)
-            if call.last:
-                self.callbacks.session_ended()
+        return PLAYER
 
     def _tell_step(self, action: int, result: StepResult) -> None:
         assert self.callbacks is not None
@@ -155,17 +186,6 @@ class AgentCalls:
         )
         view = self._view(result.info) if self._views else None
         return StepTaken({PLAYER: result.reward}, result.terminated, result.truncated, frame, line, view)
-
-    def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        kept, too_large = recording.bounded_extra(values)
-        for name, size in too_large.items():
-            if name not in self._said_too_large:
-                self._said_too_large.add(name)
-                text = (
-                    "what step() returns as %r is too large for the recording (%d bytes); its size is recorded instead"
-                )
-                log.warning(text, name[:100], size)
-        return {"extra": kept}
 
 
 def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:

@@ -92,6 +92,7 @@ class Progress:
             (player for player in self.players.values() if not player.human),
             frame_skip=config.frame_skip,
             seconds=config.policy_seconds if turns else None,
+            goes_on=config.input != "single",  # an action that is taken once is not taken again between two choices
         )
         self.state = PlayState.READY
         self.outcome: str | None = None

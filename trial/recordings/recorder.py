@@ -77,8 +77,8 @@ class Recorder:
         """There is a recording to which lines can be written."""
         return self._recording is not None
 
-    def open(self, opening: OpenRecording) -> None:
-        """Open a recording and write its header. Raises OSError."""
+    def open(self, opening: OpenRecording, players: Mapping[str, Any]) -> None:
+        """Open a recording and write its header, with who plays whom if there are several. Raises OSError."""
         settings, config = self._settings, self._settings.trial
         name = "trial" if config.data_file == "trial" else f"episode-{opening.episode:04d}"
         self._recording = self._spool.open(f"{self._folder}/{self._step}-{name}.jsonl.gz")
@@ -91,6 +91,7 @@ class Recorder:
             step=self._step,
             game=config.game,
             actionSpace=list(opening.action_space),
+            **({"players": _with_actions(players, opening)} if players else {}),
             frameRate=opening.frame_rate,
             actionBufferLifespan=config.action_buffer_lifespan,
             episode=opening.episode,
@@ -160,6 +161,15 @@ class Recorder:
     @property
     def _answer_key(self) -> str:
         return answer_key(self._settings.project_id, self._settings.user_id, self._step)
+
+
+def _with_actions(players: Mapping[str, Any], opening: OpenRecording) -> dict[str, Any]:
+    """What is said of each player, with its actions if they are others than those of the first human."""
+    spaces = {player.name: player.action_space for player in opening.players}
+    return {
+        name: {**said, **({} if spaces[name] == opening.action_space else {"actionSpace": list(spaces[name])})}
+        for name, said in players.items()
+    }
 
 
 def now_text() -> str:

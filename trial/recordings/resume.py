@@ -16,7 +16,7 @@ from typing import Any
 
 from trial.core.messages import is_feedback
 from trial.core.progress import Episode
-from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.recordings import recording
 from trial.recordings.store import Store
 
@@ -79,9 +79,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         del current.steps[max(0, int(line["steps"])) :]
     elif kind == "step":
         words = tuple(_feedback(line))
-        current.steps.append(
-            RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, line.get("advice"))
-        )
+        current.steps.append(_step(line, words))
         current.unheard = []
         recorded.seconds += 1.0 / rate
         if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more
@@ -92,8 +90,19 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         _end(recorded, current, str(line["why"]))
 
 
+def _step(line: Mapping[str, Any], words: tuple[str, ...]) -> RecordedStep:
+    # What the environment was given: the action itself, unless the agent took another one than it was asked for.
+    advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
+    parts = line.get("players") or {}
+    players = {
+        str(name): RecordedAction(part["action"], float(part["reward"] or 0.0), part.get("observed"))
+        for name, part in parts.items()
+    }
+    return RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, advice, players)
+
+
 def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
-    recorded.ended.append(Episode(episode.number, len(episode.steps), episode.score, why))
+    recorded.ended.append(Episode(episode.number, len(episode.steps), episode.score, why, episode.scores))
     recorded.unfinished = None
 
 

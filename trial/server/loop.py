@@ -12,7 +12,9 @@ from typing import Any
 
 from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import About, Callbacks
-from trial.agent.calls import AgentCalls
+from trial.agent.calls import AgentCalls, Calls
+from trial.agent.joint import JointAdapter
+from trial.agent.joint_calls import JointCalls
 from trial.agent.tracebacks import report
 from trial.agent.worker import Worker
 from trial.core.effects import (
@@ -24,6 +26,7 @@ from trial.core.effects import (
     LogAgentError,
     OpenRecording,
     RecordLine,
+    ResetPolicy,
     SaveAnswer,
     SendDone,
     SendFrame,
@@ -34,12 +37,16 @@ from trial.core.effects import (
     WriteLine,
 )
 from trial.core.messages import Message
-from trial.core.players import PLAYER, Player, PlayersError, who_plays
+from trial.core.players import Player, PlayersError
+from trial.core.policies import AskPolicy
 from trial.core.trial import Trial
+from trial.policies.policy import PolicyError
+from trial.policies.seats import Seats
 from trial.programs.watch import Watchers
 from trial.recordings.recorder import Recorder
 from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
+from trial.server.started import Started, Table
 from trial.settings import Settings
 from trial.wire.connection import Connection
 
@@ -55,7 +62,6 @@ class TrialLoop:
         step: str,
         *,
         worker: Worker,
-        agent: AgentAdapter,
         store: Store,
         spool: Spool,
         watchers: Watchers,
@@ -69,15 +75,11 @@ class TrialLoop:
         """The first frame is there, or the trial is over."""
         self._settings = settings
         self._worker = worker
-        self._agent = agent
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
-        self._calls = AgentCalls(
-            agent,
-            self._recorder.stamp,
-            record_observations=settings.trial.record_observations,
-            views=settings.trial.pace == "turns",
-        )
+        self._calls: Calls
+        self._callbacks: Callbacks | None = None
+        self._seats = Seats(self._acted)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -98,14 +100,16 @@ class TrialLoop:
             SaveAnswer: self._save,
             Log: lambda effect: log.log(effect.level, effect.text),
             LogAgentError: self._log_agent_error,
+            AskPolicy: self._seats.ask,
+            ResetPolicy: self._seats.reset,
         }
 
     @property
     def callback_runs(self) -> bool:
         """A callback of the agent has not returned, and may never."""
-        return self._calls.callbacks is not None and self._calls.callbacks.busy
+        return self._callbacks is not None and self._callbacks.busy
 
-    def begin(self, agent_ready: Awaitable[bool]) -> asyncio.Future[None]:
+    def begin(self, agent_ready: Awaitable[Started | None]) -> asyncio.Future[None]:
         """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
         self._starting = asyncio.create_task(self._start(agent_ready))
         self._starting.add_done_callback(self._started)
@@ -144,22 +148,46 @@ class TrialLoop:
 
     # ---- events
 
-    async def _start(self, agent_ready: Awaitable[bool]) -> None:
+    async def _start(self, agent_ready: Awaitable[Started | None]) -> None:
         answers = await self._recorder.earlier_answers()
         if answers is not None:
             self._apply(self.core.already_played(answers))
-        elif await agent_ready:
-            recorded = await self._recorder.recorded()
-            try:
-                players = who_plays(self._settings.trial, {PLAYER: self._agent.action_space}, self._settings.group)
-            except PlayersError as error:
-                log.error("%s", error)
-                self._apply(self.core.agent_failed(self._loop.time()))
-            else:
-                self._find_callbacks(players)
-                self._apply(self.core.start(players, recorded, self._loop.time()))
-        else:
+            return
+        started = await agent_ready
+        table = None if started is None else await self._table(started)
+        if started is None or table is None:
             self._apply(self.core.agent_failed(self._loop.time()))
+            return
+        recorded = await self._recorder.recorded()
+        self._calls = self._calls_of(started, table.players)
+        self._seats.fill(table.players, table.policies)
+        self._find_callbacks(started.agent, table.players)
+        self._apply(self.core.start(table.players, recorded, self._loop.time()))
+
+    async def _table(self, started: Started) -> Table | None:
+        """Who plays whom; None if the policies cannot be loaded, which the log says."""
+        settings = self._settings
+        try:
+            return await self._worker.call(lambda: started.take(settings.group), limit=settings.start_seconds)
+        except (PlayersError, PolicyError) as error:
+            log.error("%s", error)
+        except Exception as error:  # noqa: BLE001 - a policy may be the researcher's code
+            log.error("a policy cannot be loaded\n%s", report(error, settings.agent_dir, settings.user_id))
+        return None
+
+    def _calls_of(self, started: Started, players: Sequence[Player]) -> Calls:
+        stamp, config = self._recorder.stamp, self._settings.trial
+        if isinstance(started.agent, JointAdapter):
+            return JointCalls(started.agent, players, stamp, record_observations=config.record_observations)
+        views = config.pace == "turns"
+        return AgentCalls(started.agent, stamp, record_observations=config.record_observations, views=views)
+
+    def _acted(self, player: str, ask_id: int, action: int | None, error: Exception | None) -> None:
+        """A policy has answered."""
+        if error is not None:
+            self._do(self.core.policy_failed, player, ask_id, error)
+        else:
+            self._do(self.core.policy_acted, player, ask_id, action)
 
     def _started(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and task.exception() is not None:
@@ -199,8 +227,9 @@ class TrialLoop:
             self.ready.set()
         if core.done and not self._done.done():
             self._done.set_result(None)
-            if self._calls.callbacks:
-                self._calls.callbacks.close()
+            if self._callbacks:
+                self._callbacks.close()
+            self._seats.close()
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._do, core.advance)
@@ -208,14 +237,14 @@ class TrialLoop:
     def _call(self, call: Call) -> None:
         self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
 
-    def _find_callbacks(self, players: Sequence[Player]) -> None:
+    def _find_callbacks(self, agent: AgentAdapter | JointAdapter, players: Sequence[Player]) -> None:
         """The agent has started: see which callbacks it has."""
         settings, loop = self._settings, self._loop
-        found = self._agent.callbacks
+        found = agent.callbacks
         if not found:
             return
         self.core.callbacks = True
-        self._calls.callbacks = Callbacks(
+        self._callbacks = self._calls.callbacks = Callbacks(
             found,
             About(
                 self.core.id,
@@ -224,7 +253,7 @@ class TrialLoop:
                 tuple(player.name for player in players),
                 tuple(player.name for player in players if player.human),
             ),
-            lambda: self._agent.env,
+            lambda: agent.env,
             seconds=settings.trial.callback_seconds,
             stamp=self._recorder.stamp,
             failed=lambda name, error: log.error(
@@ -235,13 +264,13 @@ class TrialLoop:
 
     def _write_callbacks(self) -> None:
         """Write what callbacks have recorded, if a recording is open."""
-        if self._calls.callbacks and self._recorder.is_open:
-            for line in self._calls.callbacks.take():
+        if self._callbacks and self._recorder.is_open:
+            for line in self._callbacks.take():
                 self._write(line)
 
     def _tell_moved(self, effect: TellMoved) -> None:
         """On the agent's thread, between two calls, so that the callback sees the environment at rest."""
-        callbacks = self._calls.callbacks
+        callbacks = self._callbacks
         if callbacks:
             self._worker.submit(
                 lambda: callbacks.player_moved(effect.callback, effect.player),
@@ -260,7 +289,7 @@ class TrialLoop:
 
     def _open_recording(self, opening: OpenRecording) -> None:
         try:
-            self._recorder.open(opening)
+            self._recorder.open(opening, self._seats.described if opening.players else {})
         except OSError as error:
             log.error("a recording cannot be opened (%s)", short_error(error))
             self._apply(self.core.recording_failed(self._loop.time()))

@@ -12,6 +12,7 @@ import json
 import logging
 import os
 from collections.abc import Coroutine
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,9 @@ from trial.agent.worker import Worker
 from trial.core import messages
 from trial.core.effects import AgentTimeout
 from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
+from trial.core.players import PlayersError
 from trial.core.progress import CommandRefused
+from trial.policies.policy import PolicyError
 from trial.programs import watch
 from trial.programs.environments import MOST, Environments
 from trial.recordings.spool import Spool, store_file
@@ -47,6 +50,7 @@ from trial.server.handshake import (
 from trial.server.lifetime import Lifetime, exit_hard_after
 from trial.server.listener import CLOSE_SECONDS, Listener
 from trial.server.loop import TrialLoop
+from trial.server.started import Started
 from trial.settings import Settings
 from trial.wire.connection import Connection
 from trial.wire.inbound import Inbound
@@ -79,7 +83,7 @@ class Server:
         self._agent = AgentAdapter(
             settings.agent_dir, settings.trial.game, settings.trial.action_space, self._drawing.reader
         )
-        self._agent_ready: asyncio.Task[bool]
+        self._agent_ready: asyncio.Task[Started | None]
         self._failure = 1  # the exit status if the server ends by an error
         self._trial: TrialLoop | None = None
         self._finished_steps: set[str] = set()
@@ -149,17 +153,24 @@ class Server:
 
     # ---- before the participant comes
 
-    async def _start_agent(self) -> bool:
+    async def _start_agent(self) -> Started | None:
         try:
-            await self._worker.call(self._agent.start, limit=self.settings.start_seconds)
+            settings = self.settings
+            start = partial(Started.start, self._agent, settings)
+            started = await self._worker.call(start, limit=settings.start_seconds)
+        except (PlayersError, PolicyError) as error:
+            self._failure = exits.NO_AGENT
+            log.error("%s", error)
+            self._lifetime.end_in(TELL_SECONDS, "error")
+            return None
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
             settings = self.settings  # as they are now: a warm server may have been assigned meanwhile
             self._failure = exits.LATE_AGENT if isinstance(error, AgentTimeout) else exits.NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
             self._lifetime.end_in(TELL_SECONDS, "error")
-            return False
+            return None
         log.info("the agent is ready")
-        return True
+        return started
 
     async def _assign(self, handover: Handover) -> None:
         """Make this warm server the server of the participant in the handover."""
@@ -351,7 +362,6 @@ class Server:
             self.settings,
             step,
             worker=self._worker,
-            agent=self._agent,
             store=self._store,
             spool=self._spool,
             watchers=self._watchers,

@@ -1,0 +1,228 @@
+"""A participant and a policy on a real server: who acts, what is shown, what is recorded, what goes wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import itertools
+import time
+
+import pytest
+
+from tests.trial.two_players import TRIAL, two_players
+
+
+def played(server, open_client, *, frames=8, keys=(), stop=False):
+    """Play so many steps with these presses; the client."""
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            for key in keys:
+                await client.say(action=key, held=True)
+            seen = len(client.frames)
+            await client.until(lambda: len(client.frames) >= seen + frames or client.done)
+            server.terminate()
+            await client.closed()
+            return client
+
+    client = asyncio.run(run())
+    assert server.wait() == 0
+    return client
+
+
+def steps(server, name="a1"):
+    lines = [line for found in server.recordings(server=name).values() for line in found]
+    return [line for line in lines if line["kind"] == "step"]
+
+
+def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
+    server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 10})
+    client = played(server, open_client, frames=8, keys=["up"])
+    assert client.errors == [], server.said()
+    assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
+    lines = steps(server)
+    parts = [line["players"] for line in lines]
+    assert [part["right"]["observed"] for part in parts[:5]] == [0, 1, 2, 3, 4], "asked after each step"
+    assert [part["right"]["action"] for part in parts[:5]] == [1, 2, 0, 1, 2]
+    assert {part["right"]["by"] for part in parts} == {"policy"}
+    assert parts[-1]["left"] == {"action": 1, "actionName": "up", "by": "human", "reward": 1.0}
+    assert (lines[-1]["action"], lines[-1]["by"], lines[-1]["reward"]) == (1, "human", 1.0), "as with one player"
+    assert lines[-1]["human"] == 1
+    assert client.state["score"] == sum(line["reward"] for line in lines), "the participant's own"
+
+
+def test_the_head_of_a_recording_says_who_plays(launch, open_client):
+    server = launch(two_players(), trial=TRIAL)
+    played(server, open_client, frames=2)
+    head, reset = next(iter(server.recordings().values()))[:2]
+    assert head["players"] == {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "agent:Partner"}}
+    assert reset["toAct"] == ["left", "right"]
+
+
+def test_a_recording_with_several_players_ends_with_all_scores(launch, open_client):
+    server = launch(two_players(length=4), trial=TRIAL | {"seed": 14, "maxEpisodes": 2, "startingFrameRate": 60})
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.play(1)
+            await client.until(lambda: client.done)
+            return client
+
+    client = asyncio.run(run())
+    assert server.wait() == 0
+    episodes = list(server.recordings().values())
+    paid = [[line["players"]["right"]["reward"] for line in lines if line["kind"] == "step"] for lines in episodes]
+    ends = [line["scores"] for lines in episodes for line in lines if line["kind"] == "end"]
+    assert [len(rewards) for rewards in paid] == [4, 4]
+    assert ends == [{"left": 0, "right": sum(rewards)} for rewards in paid]
+    assert server.answer()["answers"]["scores"] == {"left": 0, "right": sum(map(sum, paid))}
+    assert client.done["score"] == 0
+    heads = [found[0] for found in server.recordings().values()]
+    assert [head["seed"] for head in heads] == [14, 15], "seed: the first; each after it has the next"
+
+
+def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
+    server = launch(two_players(act="time.sleep(0.2)"), trial=TRIAL | {"startingFrameRate": 20})
+    client = played(server, open_client, frames=30)
+    parts = [line["players"]["right"] for line in steps(server)]
+    assert "late" in {part["by"] for part in parts}
+    fresh = [number for number, part in enumerate(parts) if part["by"] == "policy"]
+    assert fresh, "what comes late is used after all"
+    for before, late in itertools.pairwise(parts):
+        if late["by"] == "late":
+            assert late["action"] == before["action"], "its last action goes on"
+    took = client.frames[-1][0] - client.frames[-30][0]
+    assert took < 29 / 20 + 1.0
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        ("raise ValueError('no idea')", "ValueError: no idea"),
+        ("return 7", "7"),
+        ("return float('nan')", "nan"),
+        ("return None", "None"),
+    ],
+)
+def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_client, act, said):
+    server = launch(two_players(act=act), trial=TRIAL | {"startingFrameRate": 30})
+    client = played(server, open_client, frames=12)
+    assert client.errors == [], "the participant can do nothing about it"
+    parts = [line["players"]["right"] for line in steps(server)]
+    assert len(parts) >= 10
+    assert {(part["by"], part["action"]) for part in parts[1:]} == {("none", 0)}, "it idles"
+    (told,) = [line for line in server.said().splitlines() if "the policy of right (agent:Partner) failed: " in line]
+    assert said in told
+    assert "it idles until the episode is over" in server.said()
+    lines = [line for found in server.recordings().values() for line in found]
+    assert any(line["kind"] == "error" and line.get("player") == "right" for line in lines)
+
+
+def test_a_policy_that_hangs_holds_up_nothing(launch, open_client):
+    server = launch(two_players(act="time.sleep(3600)"), trial=TRIAL | {"startingFrameRate": 30})
+    began = time.monotonic()
+    played(server, open_client, frames=15)
+    assert time.monotonic() - began < 12
+    assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
+
+
+@pytest.mark.parametrize(
+    ("players", "said"),
+    [
+        ({"left": "human"}, 'trial.players must say who plays "right"; the environment has "left", "right"'),
+        ({"left": "human", "rihgt": "random"}, 'trial.players names "rihgt", but the environment has "left", "right"'),
+        ({"left": "human", "right": "agent:Nobody"}, "Nobody"),
+        ({"left": "human", "right": "policies/gone.onnx"}, "there is no file policies/gone.onnx"),
+    ],
+)
+def test_players_that_do_not_fit_are_named_before_anybody_plays(launch, open_client, players, said):
+    server = launch(two_players(), trial={**TRIAL, "players": players})
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.hello()
+            return await client.closed()
+
+    assert asyncio.run(run()) == 1011
+    assert server.wait() == 3, "the agent cannot be started"
+    assert said in server.said()
+    assert "Traceback" not in server.said()
+
+
+# ---- an interrupted game
+
+
+def test_an_interrupted_game_of_two_goes_on_where_it_was(launch, open_client):
+    trial = TRIAL | {"startingFrameRate": 20, "frameSkip": 2}
+    first = launch(two_players(), trial=trial, SERVER="a-1")
+    played(first, open_client, frames=9, keys=["down"])
+    before = steps(first, "a-1")
+    second = launch(two_players(), trial=trial, SERVER="a-2")
+    played(second, open_client, frames=6)
+    after = steps(second, "a-2")
+    assert [line["step"] for line in before + after] == list(range(1, len(before + after) + 1)), second.said()
+    fresh = [part for part in (line["players"]["right"] for line in before + after) if "observed" in part]
+    asked = [part["action"] for part in fresh]
+    assert asked == [number % 3 for number in range(1, len(asked) + 1)], "the partner remembers what it saw"
+    assert [part["observed"] for part in fresh] == list(range(0, len(before + after), 2)), "every second step"
+
+
+# ---- turn by turn
+
+
+def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(launch, open_client):
+    server = launch(two_players(turns=True), trial=TRIAL | {"pace": "turns", "startingFrameRate": 10})
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            assert client.controls["pace"] == "turns"
+            await client.say(command="start")
+            await client.until(lambda: client.state.get("toAct"))
+            waiting = len(client.frames)
+            await client.watch(0.5)
+            assert len(client.frames) == waiting, "no step for a participant who pressed nothing"
+            await client.say(action="up", held=True)
+            await client.until(lambda: len(client.frames) >= waiting + 2)
+            (mine, _), (theirs, _) = client.frames[-2:]
+            assert theirs - mine > 0.05, "the participant sees each move"
+            await client.until(lambda: client.state.get("toAct"))
+            await client.watch(0.4)
+            assert len(client.frames) == waiting + 2, "a key that is held acts once"
+            server.terminate()
+            await client.closed()
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    mine, theirs = steps(server)
+    assert mine["players"]["left"] == {"action": 1, "actionName": "up", "by": "human", "reward": 1.0}
+    assert (mine["players"]["right"]["action"], mine["players"]["right"]["by"]) == (None, None)
+    assert (theirs["players"]["right"]["action"], theirs["players"]["right"]["by"]) == (1, "policy")
+    assert (theirs["players"]["left"]["action"], theirs["toAct"]) == (None, ["left"])
+
+
+def test_a_turn_of_limited_time_ends_without_a_press(launch, open_client):
+    keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.2, "turnEnds": "random", "seed": 5}
+    server = launch(two_players(turns=True), trial=TRIAL | keys)
+    played(server, open_client, frames=6)
+    mine = [line["players"]["left"] for line in steps(server)[::2]]
+    assert {part["by"] for part in mine} == {"random"}
+
+
+def test_a_policy_has_policy_seconds_in_its_turn(launch, open_client):
+    keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.1, "policySeconds": 0.3}
+    server = launch(two_players(turns=True, act="time.sleep(3600)"), trial=TRIAL | keys)
+    played(server, open_client, frames=5)
+    assert [line["players"]["right"]["by"] for line in steps(server)[1::2]][:2] == ["late", "late"]
+
+
+def test_seeds_of_policies_follow_from_the_episodes(launch, open_client):
+    act = "return (self.seed + self.asked) % 3\n\n    def reset(self, seed):\n        self.seed, self.asked = seed, 0"
+    server = launch(two_players(act=act), trial=TRIAL | {"seed": 4})
+    played(server, open_client, frames=3)
+    expected = int.from_bytes(hashlib.sha256(b"4\0right").digest()[:8], "big") % 2**31
+    assert steps(server)[0]["players"]["right"]["action"] == (expected + 1) % 3

@@ -1,0 +1,180 @@
+"""Carries out the core's calls on an agent with several players, on the agent's thread."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trial.agent.calls import Calls, Diverged
+from trial.agent.joint import Joint, JointAdapter
+from trial.core.actions import Action
+from trial.core.effects import Begun, ReplayCall, Replayed, StepCall, StepTaken
+from trial.core.players import Player, View
+from trial.core.policies import Observed
+from trial.core.unfinished import UnfinishedEpisode
+from trial.recordings import recording
+
+
+class JointCalls(Calls):
+    """Runs calls of an agent with several players. `players` are all of them, in the environment's order.
+
+    What a line of the recording says of one player, as lines of a game with one player do, it says of the first human.
+    """
+
+    def __init__(
+        self,
+        agent: JointAdapter,
+        players: Sequence[Player],
+        stamp: Callable[[], dict[str, Any]],
+        *,
+        record_observations: bool,
+    ) -> None:
+        super().__init__(stamp, record_observations=record_observations)
+        self._agent = agent
+        humans = tuple(player.name for player in players if player.human)
+        self._first = humans[0]
+        self._policies = frozenset(player.name for player in players) - set(humans)
+        agent.views = humans
+
+    def _reset(self, episode: int, seed: int) -> Begun:
+        joint, seeded = self._agent.reset(seed)
+        pictures = self._agent.pictures()
+        if self.callbacks:
+            self.callbacks.episode_began(episode, joint.observations, joint.infos)
+        fields: dict[str, Any] = {
+            "episode": episode,
+            "seed": seed if seeded else None,
+            "info": recording.plain(joint.infos.get(self._first, {})),
+            **self._seen(joint),
+            "players": {player: self._told(player, joint) for player in self._agent.players},
+            "toAct": sorted(joint.to_act),
+        }
+        return Begun(recording.line("reset", **self._stamp(), **fields), pictures, self._view(joint))
+
+    def _view(self, joint: Joint) -> View:
+        """What the core is told. Policies look at observations while the environment goes on, so they get copies."""
+        seen = {player: snapshot(joint.observations.get(player)) for player in self._policies & joint.to_act}
+        infos = {player: joint.infos.get(player, {}) for player in seen}
+        return View(joint.to_act, seen, infos, joint.masks)
+
+    def _seen(self, joint: Joint) -> dict[str, Any]:
+        if not self._record_observations:
+            return {}
+        return {"observation": recording.observation(joint.observations.get(self._first))}
+
+    def _told(self, player: str, joint: Joint) -> dict[str, Any]:
+        """What a line says of what another player than the first human was told."""
+        said: dict[str, Any] = {}
+        if player != self._first:
+            info = joint.infos.get(player)
+            if info:
+                said["info"] = recording.plain(info)
+            if self._record_observations and player in joint.observations:
+                said["observation"] = recording.observation(joint.observations[player])
+        return said
+
+    def _say(self, word: str) -> str:
+        self._agent.feedback(self._first, word)
+        return self._first
+
+    def _step(self, call: StepCall) -> StepTaken:
+        stamp, actions, first = self._stamp(), call.actions, self._first
+        self._give_feedback(call)
+        joint = self._agent.step({player: action.index for player, action in actions.items()})
+        pictures = self._agent.pictures()
+        self._tell_step({player: action.index for player, action in actions.items() if action.acts}, joint)
+        asked, truncated = actions[first], joint.over and joint.why == "truncated"
+        terminated = joint.over and not truncated
+        line = recording.line(
+            "step",
+            **stamp,
+            **call.fields,
+            human=asked.index if asked.human else None,
+            action=asked.index,
+            actionName=asked.name,
+            by=asked.by,
+            **({"advice": asked.index} if asked.by == "advice" else {}),
+            reward=joint.rewards[first],
+            terminated=terminated,
+            truncated=truncated,
+            info=joint.infos.get(first, {}),
+            players={player: self._part(player, action, joint) for player, action in actions.items()},
+            toAct=sorted(joint.to_act),
+            **self._seen(joint),
+            **(self._extra(joint.extra) if joint.extra else {}),
+        )
+        return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint))
+
+    def _part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
+        """One player's part of a step's line."""
+        return {
+            "action": action.index if action.acts else None,
+            "actionName": action.name if action.acts else None,
+            "by": action.by if action.acts else None,
+            **({} if action.observed is None else {"observed": action.observed}),
+            "reward": joint.rewards[player],
+            **self._told(player, joint),
+        }
+
+    def _tell_step(self, actions: Mapping[str, int], joint: Joint) -> None:
+        if self.callbacks:
+            self.callbacks.stepped(actions, joint.rewards, joint.observations, joint.infos)
+
+    def _take_again(self, call: ReplayCall) -> Replayed:
+        unfinished = call.unfinished
+        joint, seeded = self._agent.reset(unfinished.seed or 0)
+        if not seeded or unfinished.seed is None:
+            raise Diverged("the environment takes no seed")
+        if self.callbacks:
+            self.callbacks.episode_began(unfinished.number, joint.observations, joint.infos)
+        acted_upon = _Remembered(unfinished)
+        acted_upon.see(0, joint)
+        for number, step in enumerate(unfinished.steps, 1):
+            for word in step.feedback:
+                self._feedback(word)
+            if not step.players:
+                raise Diverged("it was played with one player")
+            taken = {name: part.action for name, part in step.players.items() if part.action is not None}
+            joint = self._agent.step({**call.default_actions, **taken})
+            rewards = {player: part.reward for player, part in step.players.items()}
+            if joint.over or joint.rewards != rewards:
+                raise Diverged("it plays differently now")
+            self._tell_step(taken, joint)
+            acted_upon.see(number, joint)
+        return Replayed(self._agent.pictures(), self._view(joint), acted_upon.by_player)
+
+
+class _Remembered:
+    """Finds in a replay what each policy acted upon."""
+
+    def __init__(self, unfinished: UnfinishedEpisode) -> None:
+        self._wanted: dict[int, list[str]] = defaultdict(list)
+        for step in unfinished.steps:
+            for player, part in step.players.items():
+                if part.observed is not None:
+                    self._wanted[part.observed].append(player)
+        self.by_player: dict[str, list[Observed]] = defaultdict(list)
+
+    def see(self, steps: int, joint: Joint) -> None:
+        """So many steps were taken, and this is what the players see."""
+        for player in self._wanted.get(steps, ()):
+            seen = snapshot(joint.observations.get(player))
+            self.by_player[player].append(Observed(seen, joint.infos.get(player, {}), joint.masks.get(player)))
+
+
+def snapshot(observation: Any) -> Any:
+    """A copy of an observation, which the environment does not change any more."""
+    if isinstance(observation, np.ndarray):
+        return observation.copy()
+    if isinstance(observation, Mapping):
+        return {key: snapshot(value) for key, value in observation.items()}
+    if isinstance(observation, list | tuple):
+        return _same_kind(observation, (snapshot(value) for value in observation))
+    return observation
+
+
+def _same_kind(kind: Sequence[Any], values: Iterable[Any]) -> Any:
+    return tuple(values) if isinstance(kind, tuple) else list(values)

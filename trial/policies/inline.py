@@ -1,0 +1,31 @@
+"""Asks a policy that takes no time on the event loop itself, so that it needs no thread."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from trial.policies.policy import Mask, Policy
+from trial.policies.thread import Done
+
+
+class InlinePolicy:
+    """Has the methods of `PolicyThread`. `done` is called soon, once for each question."""
+
+    def __init__(self, policy: Policy, done: Done) -> None:
+        self.policy = policy
+        self._done = done
+        self._loop = asyncio.get_running_loop()
+
+    def ask(self, ask_id: int, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> None:
+        """Ask for an action; `done(ask_id, action, None)` follows."""
+        self._loop.call_soon(self._done, ask_id, self.policy.act(observation, info, mask), None)
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self.policy.reset(seed)
+
+    def close(self) -> None:
+        """Free what it holds."""
+        self.policy.close()
