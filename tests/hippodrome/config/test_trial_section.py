@@ -175,13 +175,18 @@ def test_an_action_that_is_taken_without_a_key_is_named() -> None:
     text = said("left", "right", startingFrameRate=50)
     assert text is not None
     assert text.startswith('while no key is pressed, the game takes "left", 50 times a second')
-    assert "noop" in text
+    assert "name it as idleAction" in text
 
 
 def test_an_idle_action_of_another_name_is_proposed() -> None:
     text = said("left", "right", "stay")
     assert text is not None
-    assert 'call the action "stay" noop' in text
+    assert "write idleAction: stay, and that is taken instead" in text
+
+
+@pytest.mark.parametrize("given", [{"idleAction": "left"}, {"pace": "turns"}])
+def test_a_study_that_says_what_happens_without_a_key_is_not_remarked(given: dict[str, Any]) -> None:
+    assert said("left", "right", **given) is None
 
 
 @pytest.mark.parametrize("actions", [(), ("noop", "left"), ("left", "NOOP"), ("nothing", "left")])
