@@ -11,10 +11,17 @@ from typing import Any
 
 from hippodrome.model.project import GAME_PAGES
 
+
+def _has_scene(trial: Mapping[str, Any]) -> bool:
+    """Its game is drawn by objects (docs/objects.md)."""
+    return trial.get("scene") is not None
+
+
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "reading.js": lambda trial: any(isinstance(trial.get(key), str) for key in GAME_PAGES),
     "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),
+    **dict.fromkeys(("painter.js", "scene.js", "sprites.js"), _has_scene),
 }
 """By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""
 

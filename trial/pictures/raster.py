@@ -90,7 +90,9 @@ class Raster:
         if width < 1 or height < 1:
             return
         layer = Image.new("RGBA", (width, height))
-        ImageDraw.Draw(layer).multiline_text((0, 0), text, ink, font)
+        share = each.get("origin", (0, 0))[0]
+        align = "left" if share < 0.25 else "center" if share < 0.75 else "right"
+        ImageDraw.Draw(layer).multiline_text((0, 0), text, ink, font, align=align)
         self._lay(canvas, layer, each)
 
     def _paste(self, canvas: Image.Image, each: CheckedObject) -> None:

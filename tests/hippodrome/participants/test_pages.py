@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -70,10 +71,18 @@ def step(source: str, **more: Any) -> Page:
     return pages.step_page(step_view(source, **more))
 
 
-def game(**state: Any) -> Page:
+def game(project: Project | None = None, **state: Any) -> Page:
     present = {"state": "queued", "seconds": 3, "typical": None, "attempt": 1, "again": False, "reason": None, **state}
     view = GameView(
-        PROJECT, STEPS[2], "P1", present, "/next?poll=1", "/next", "/next?x=1", "TICKET", "wss://*.example.org:*"
+        project or PROJECT,
+        STEPS[2],
+        "P1",
+        present,
+        "/next?poll=1",
+        "/next",
+        "/next?x=1",
+        "TICKET",
+        "wss://*.example.org:*",
     )
     return pages.game_page(view)
 
@@ -345,6 +354,14 @@ def test_pages_are_small(capsys: pytest.CaptureFixture[str]) -> None:
     with capsys.disabled():
         print("\ncompressed pages, bytes:", sizes)
     assert max(sizes.values()) < 14_000
+
+
+def test_the_page_of_a_game_drawn_by_objects_is_small(capsys: pytest.CaptureFixture[str]) -> None:
+    drawn = msgspec.structs.replace(PROJECT, trial={"scene": {"width": 600}})
+    size = len(gzip.compress(game(project=drawn).html.encode()))
+    with capsys.disabled():
+        print("\ncompressed page of a game drawn by objects, bytes:", size)
+    assert len(gzip.compress(game().html.encode())) + 1_000 < size < 40_000
 
 
 def test_a_page_carries_the_style_of_its_own_kind_only() -> None:

@@ -1,0 +1,195 @@
+"""Games that are drawn by objects, in a real Chromium on a real trial server."""
+# ruff: noqa: F811 - fixtures of other tests of pages
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.browser.test_pages_browser import FLAWS, World, shot, tab, world  # noqa: F401
+from tests.trial.conftest import Running
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+AGENT = """
+class Agent:
+    def start(self, game):
+        self.t = self.x = 0
+    def reset(self, seed=None):
+        self.t = self.x = 0
+    def step(self, action):
+        self.t += 1
+        self.x += action
+        return None, 1.0, self.t >= 5000, False, {}
+    def render(self):
+        return {"hud": "Caught: <b>3</b> of 10", "objects": [
+            {"id": "sky", "type": "rectangle", "x": 0, "y": 0, "width": 600, "height": 400, "color": "#bfe3f2", "permanent": True, "depth": -2},
+            {"id": "hill", "type": "line", "points": [(0, 0.8), (0.3, 0.65), (0.7, 0.8), (1, 0.7)], "fill_below": True, "color": "#4f9d69", "depth": -1},
+            {"id": "sun", "type": "circle", "x": 0.85, "y": 0.15, "radius": 30, "color": "#f6c445", "outline": "#e08e1b", "outline_width": 4},
+            {"id": "house", "type": "polygon", "points": [(0.1, 0.7), (0.1, 0.5), (0.17, 0.4), (0.24, 0.5), (0.24, 0.7)], "color": "#b5533c"},
+            {"id": "box", "type": "rectangle", "x": 0.6, "y": 0.5, "width": 60, "height": 60, "angle": 45, "origin": (0.5, 0.5), "color": "#7a4fbf"},
+            {"id": "label", "type": "text", "x": 0.5, "y": 0.05, "origin": (0.5, 0), "text": "3 < 4 <b>&amp;\\nsecond line", "size": 24},
+            {"id": "cook", "type": "sprite", "image": "cook", "frame": 1, "x": 0.4, "y": 0.75, "width": 64, "height": 64},
+            {"id": "runner", "type": "sprite", "image": "cook", "animation": "walk", "x": 0.02 * self.x, "y": 0.8, "width": 64, "tween": 300},
+            {"id": "lost", "type": "sprite", "image": "nowhere", "x": 0.75, "y": 0.8, "width": 40, "height": 40},
+        ]}
+    def close(self):
+        pass
+"""
+SCENE = {"width": 600, "height": 400, "background": "#000000", "pixelArt": True}
+SHOWN = """([x, y]) => {
+    const easel = document.querySelectorAll(".stage canvas")[1];
+    const at = [Math.floor(x * easel.width), Math.floor(y * easel.height), 1, 1];
+    return "#" + [...easel.getContext("2d").getImageData(...at).data.slice(0, 3)].map((n) => n.toString(16).padStart(2, "0")).join("");
+}"""
+
+
+def draw_cook(folder: Path, noise: int = 0) -> None:
+    """An atlas of two frames of 16 by 16 pixels, one blue and one red; and an image of `noise` by `noise` pixels."""
+    folder.mkdir(parents=True)
+    sheet = np.zeros((16, 32, 4), np.uint8)
+    sheet[2:14, 2:14] = (32, 64, 200, 255)
+    sheet[2:14, 18:30] = (200, 32, 64, 255)
+    Image.fromarray(sheet).save(folder / "cook.png")
+    atlas = {"frameWidth": 16, "animations": {"walk": {"frames": [0, 1], "frameRate": 4}}}
+    (folder / "cook.json").write_text(json.dumps(atlas))
+    if noise:
+        pixels = np.random.default_rng(1).integers(0, 256, (noise, noise, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / "noise.png")
+
+
+def play(world: World, tab: Any, folder: Path, width: int = 1280, height: int = 800, noise: int = 0) -> Running:
+    """A page that shows the game of a server that has just begun."""
+    draw_cook(folder / "agent" / "assets", noise)
+    trial = {"actionSpace": ["noop", "right"], "scene": SCENE, "maxEpisodes": 1}
+    server = Running(folder, AGENT, trial, {})
+    tab.set_viewport_size({"width": width, "height": height})
+    world.trial = {"scene": SCENE}
+    world.step = 2
+    world.state = {**world.state, "state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
+    tab.goto(world.url)
+    return server
+
+
+@pytest.fixture
+def game(world: World, tab: Any, tmp_path: Path) -> Iterator[Any]:
+    started: list[Running] = []
+
+    def start(**options: Any) -> Running:
+        started.append(play(world, tab, tmp_path, **options))
+        return started[0]
+
+    yield start
+    for server in started:
+        server.process.kill()
+        server.wait()
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
+def test_every_type_of_object_is_drawn_where_it_belongs(game: Any, tab: Any, width: int, height: int) -> None:
+    game(width=width, height=height)
+    tab.click("#overlay-button")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_timeout(200)
+    spots = {
+        **{(0.01, 0.3): "#bfe3f2", (0.5, 0.98): "#4f9d69", (0.85, 0.15): "#f6c445", (0.17, 0.6): "#b5533c"},
+        **{(0.6, 0.5): "#7a4fbf", (0.6, 0.41): "#7a4fbf", (0.66, 0.43): "#bfe3f2"},  # turned about its middle
+        (0.45, 0.83): "#c82040",  # the red frame of the atlas
+    }
+    assert {spot: tab.evaluate(SHOWN, list(spot)) for spot in spots} == spots
+    assert tab.inner_text("#scene-hud") == "Caught: <b>3</b> of 10"
+    assert tab.evaluate(FLAWS) == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    shot(tab, f"{width}-scene")
+    easel = tab.evaluate(
+        "(({ width, clientWidth }) => [width, clientWidth])(document.querySelectorAll('.stage canvas')[1])"
+    )
+    assert easel[0] == easel[1] * tab.evaluate("devicePixelRatio")
+
+
+def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -> None:
+    game()
+    tab.click("#overlay-button")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    places = """async () => {
+        const easel = document.querySelectorAll(".stage canvas")[1];
+        const seen = [];
+        for (let n = 0; n < 40; n += 1) {
+            await new Promise(requestAnimationFrame);
+            const row = easel.getContext("2d").getImageData(0, Math.floor(0.88 * easel.height), easel.width, 1).data;
+            for (let x = 0; x < easel.width; x += 1) {
+                if (row[4 * x + 1] < 100) { seen.push(x / easel.width); break; }
+            }
+        }
+        return seen;
+    }"""
+    tab.keyboard.press("ArrowRight")
+    seen = tab.evaluate(places)
+    assert seen == sorted(seen)
+    assert len({round(place, 4) for place in seen}) > 5, seen
+
+
+def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> None:
+    """The page asks for an image whose last bytes are held back; then they come."""
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        server = route.connect_to_server()
+
+        def pass_on(data: Any) -> None:
+            part = isinstance(data, bytes) and data[0] == 6
+            if part and (held or int.from_bytes(data[3:7]) > 2_000_000):
+                held.append(lambda: route.send(data))
+            else:
+                route.send(data)
+
+        server.on_message(pass_on)
+
+    tab.route_web_socket("ws://127.0.0.1:*/", hold)
+    game(noise=900)
+    tab.wait_for_selector("#overlay progress:visible")
+    until = time.monotonic() + 20
+    while not held:
+        assert time.monotonic() < until
+        tab.wait_for_timeout(20)
+    assert tab.inner_text("#overlay-title") == "Loading the pictures…"
+    assert tab.is_hidden("#overlay-button")
+    assert 0.5 < tab.evaluate("document.querySelector('#overlay progress').value") < 1
+    shot(tab, "scene-loading")
+    tab.keyboard.press("ArrowRight")
+    tab.keyboard.press("Space")
+    tab.wait_for_timeout(200)
+    assert tab.get_attribute("#mode", "data-state") == "ready"
+    for send in held:
+        send()
+    tab.wait_for_selector("#overlay-button:visible")
+    assert tab.inner_text("#overlay-title") == "Ready?"
+    tab.keyboard.press("ArrowRight")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+
+
+def test_images_are_not_loaded_again_when_the_connection_comes_back(game: Any, world: World, tab: Any) -> None:
+    said: list[str] = []
+    tab.on("websocket", lambda socket: socket.on("framesent", lambda text: said.append(str(text))))
+    server = game()
+    tab.wait_for_selector("#overlay-button:visible")
+    assert [each for each in said if "asset" in each] == ['{"asset":"cook"}']
+    server.process.kill()
+    server.wait()
+    tab.wait_for_selector("text=Connection lost")
+    again = Running(server.log.parent, AGENT, {"actionSpace": ["noop", "right"], "scene": SCENE, "maxEpisodes": 1}, {})
+    try:
+        world.state = {**world.state, "url": again.address}
+        tab.wait_for_selector("#overlay-button:visible")
+        assert sum("token" in each for each in said) >= 2
+        assert [each for each in said if "asset" in each] == ['{"asset":"cook"}']
+    finally:
+        again.process.kill()
+        again.wait()

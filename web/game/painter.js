@@ -1,0 +1,142 @@
+// Draws the objects of a scene on a canvas of their own, which lies on that of the frames.
+import { hooks } from "./hooks.js";
+import { find, make } from "./page.js";
+import { spriteOf } from "./sprites.js";
+
+const MISSING = "#8080807f"; // instead of an image that is not there
+const LONGEST = 4096; // pixels of the canvas, on each side
+
+const easel = make("canvas", { hidden: true });
+Object.assign(easel.style, { position: "absolute", inset: 0, width: "100%", height: "100%" });
+easel.setAttribute("aria-hidden", "true"); // the canvas below it has the name, and the keyboard
+find("screen").after(easel);
+const brush = easel.getContext("2d", { alpha: false });
+
+let picture = { width: 600, height: 400, background: "#ffffff", coordinates: "relative" };
+let unitX = 600; // what an x of 1 means, in pixels of the picture
+let unitY = 400;
+let repaint = () => {};
+
+// Says how large the picture is. `changed` is called when it has to be drawn again.
+export function prepare(said, changed) {
+  picture = said;
+  const relative = said.coordinates === "relative";
+  unitX = relative ? said.width : 1;
+  unitY = relative ? said.height : 1;
+  repaint = changed;
+}
+
+// Shows this canvas, in the shape of the scene.
+export function place() {
+  const ratio = String(picture.width / picture.height);
+  if (document.body.style.getPropertyValue("--ratio") !== ratio) document.body.style.setProperty("--ratio", ratio);
+  if (!easel.hidden) return;
+  easel.hidden = false;
+  fit();
+}
+
+// As many pixels as the screen has for it.
+function fit() {
+  const scale = Math.min(devicePixelRatio * (easel.clientWidth || picture.width) / picture.width, LONGEST / Math.max(picture.width, picture.height));
+  const width = Math.max(1, Math.round(picture.width * scale));
+  const height = Math.max(1, Math.round(picture.height * scale));
+  if (easel.width === width && easel.height === height) return false;
+  Object.assign(easel, { width, height });
+  return true;
+}
+
+// Draws `[fields, ms]` one over the other; `ms` is how long the object has been there. Returns whether an animation plays.
+export function paint(layers) {
+  brush.setTransform(1, 0, 0, 1, 0, 0);
+  brush.globalAlpha = 1;
+  brush.fillStyle = picture.background;
+  brush.fillRect(0, 0, easel.width, easel.height);
+  let plays = false;
+  for (const [fields, ms] of layers) {
+    brush.setTransform(easel.width / picture.width, 0, 0, easel.height / picture.height, 0, 0);
+    brush.globalAlpha = fields.alpha ?? 1;
+    brush.fillStyle = fields.color ?? "#000000";
+    plays = draws[fields.type]?.(fields, ms) || plays;
+  }
+  return plays;
+}
+
+const draws = {
+  circle(fields) {
+    brush.beginPath();
+    brush.arc(fields.x * unitX, fields.y * unitY, fields.radius, 0, 2 * Math.PI);
+    fill(fields);
+  },
+  rectangle(fields) {
+    const [left, top] = turn(fields, fields.width, fields.height);
+    brush.beginPath();
+    brush.rect(left, top, fields.width, fields.height);
+    fill(fields);
+  },
+  polygon(fields) {
+    trace(fields.points);
+    brush.closePath();
+    fill(fields);
+  },
+  line(fields) {
+    const { points, width = 1 } = fields;
+    for (const edge of [fields.fill_above && 0, fields.fill_below && picture.height]) {
+      if (typeof edge !== "number") continue;
+      trace(points);
+      brush.lineTo(points.at(-1)[0] * unitX, edge);
+      brush.lineTo(points[0][0] * unitX, edge);
+      brush.fill();
+    }
+    trace(points);
+    Object.assign(brush, { strokeStyle: brush.fillStyle, lineWidth: width, lineJoin: "round" });
+    if (width) brush.stroke();
+  },
+  text(fields) {
+    const { text, size: pixelsHigh = 16, font = "Arial" } = fields;
+    brush.font = `${pixelsHigh}px ${font}, sans-serif`;
+    brush.textBaseline = "top";
+    const lines = text.split("\n");
+    const [, top] = turn(fields, 0, 1.2 * pixelsHigh * lines.length);
+    brush.textAlign = "left";
+    const share = fields.origin?.[0] ?? 0; // each line has its own width
+    lines.forEach((each, number) => brush.fillText(each, -share * brush.measureText(each).width, top + 1.2 * pixelsHigh * number));
+  },
+  sprite(fields, ms) {
+    const image = spriteOf(fields.image);
+    const animation = image?.animations.get(fields.animation);
+    const name = animation ? animation[0][Math.floor((ms / 1000) * animation[1]) % animation[0].length] : fields.frame;
+    const box = name === undefined ? image && [0, 0, image.bitmap.width, image.bitmap.height] : image?.frames.get(name);
+    const width = fields.width ?? (box ? (fields.height ? fields.height * box[2] / box[3] : box[2]) : 32);
+    const height = fields.height ?? (box ? width * box[3] / box[2] : 32);
+    const [left, top] = turn(fields, width, height);
+    brush.imageSmoothingEnabled = !picture.pixelArt;
+    if (box) brush.drawImage(image.bitmap, ...box, left, top, width, height);
+    else {
+      brush.fillStyle = MISSING;
+      brush.fillRect(left, top, width, height);
+    }
+    return Boolean(animation);
+  },
+};
+
+// Turns about the object's origin, which lies at its x and y. Returns where its left and its top are then.
+function turn({ x, y, angle = 0, origin = [0, 0] }, width, height) {
+  brush.translate(x * unitX, y * unitY);
+  brush.rotate(angle * Math.PI / 180);
+  return [-origin[0] * width, -origin[1] * height];
+}
+
+function trace(points) {
+  brush.beginPath();
+  for (const [x, y] of points) brush.lineTo(x * unitX, y * unitY);
+}
+
+function fill({ outline, outline_width: lineWidth = 1 }) {
+  brush.fill();
+  if (outline) Object.assign(brush, { strokeStyle: outline, lineWidth }).stroke();
+}
+
+new ResizeObserver(() => !easel.hidden && fit() && repaint()).observe(easel);
+hooks.pixels.push(() => {
+  easel.hidden = true;
+});

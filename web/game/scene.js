@@ -1,0 +1,114 @@
+// Games that are drawn by objects (docs/wire.md, "A scene"): what the server says of them, put together and shown.
+import { hooks } from "./hooks.js";
+import { askForSprites, takeSpritePart } from "./sprites.js";
+import { find, make, setText } from "./page.js";
+import { paint, place, prepare } from "./painter.js";
+
+const SCENE_HEADER = 5; // bytes: kind, id
+const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
+const UNSAID = { angle: 0, alpha: 1 }; // what these are if the server leaves them out
+
+const utf8 = new TextDecoder();
+const things = new Map(); // id -> the object: its `fields`, and while it moves `from`, `began`, `ms`
+let layers = null; // the objects in the order in which they are drawn; null if that is to be found out again
+let waitsForPaint = false;
+
+const hud = make("span", { id: "scene-hud", hidden: true });
+find("score").closest("p").append(hud);
+const sheet = new CSSStyleSheet(); // pages of other games need none of it
+sheet.replaceSync(`.hud { flex-wrap: wrap; }
+.hud #scene-hud { flex: 1 0 100%; white-space: pre-line; overflow-wrap: anywhere; text-align: center; }
+@media (min-aspect-ratio: 5/4) {
+  .hud { flex-wrap: nowrap; }
+  .hud #scene-hud { flex: none; text-align: inherit; }
+}`);
+document.adoptedStyleSheets = [...document.adoptedStyleSheets, sheet];
+
+async function unpackScene(kind, buffer) {
+  const stream = kind === 5 && new Blob([buffer.slice(SCENE_HEADER)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  const bytes = stream ? await new Response(stream).arrayBuffer() : buffer.slice(SCENE_HEADER);
+  const said = JSON.parse(utf8.decode(bytes));
+  return { draw: () => change(said) };
+}
+
+// Takes what changed, and draws the scene at once: the next display of the screen shows it.
+function change(said) {
+  const now = performance.now();
+  if (said.new) things.clear();
+  for (const id of said.gone ?? []) things.delete(id);
+  for (const [id, fields] of Object.entries(said.set ?? {})) {
+    const thing = things.get(id);
+    if (!thing) things.set(id, { fields, since: now });
+    else Object.assign(thing, fields.type ? { fields, since: now, from: null } : moved(thing, fields, now));
+    if (!thing || fields.type || "depth" in fields) layers = null;
+  }
+  for (const id of said.order ?? []) {
+    const thing = things.get(id);
+    things.delete(id);
+    if (thing) things.set(id, thing);
+  }
+  if (said.new || said.gone || said.order) layers = null;
+  if (said.hud !== undefined) {
+    setText(hud, said.hud);
+    hud.hidden = !said.hud;
+  }
+  place();
+  show(now);
+}
+
+// The object with some fields changed. With a tween it moves there from where it is shown now.
+function moved(thing, fields, now) {
+  const next = { ...thing.fields };
+  for (const [key, value] of Object.entries(fields)) {
+    if (value === null) delete next[key];
+    else next[key] = value;
+  }
+  const since = "animation" in fields ? now : thing.since;
+  const steps = next.tween ? TWEENED.filter((key) => key in fields) : [];
+  if (!steps.length) return { fields: next, since, ...(thing.from && !next.tween ? { from: null } : {}) };
+  const here = shownNow(thing, now);
+  const from = Object.fromEntries(steps.map((key) => [key, here[key] ?? UNSAID[key]]));
+  for (const key in thing.from ?? {}) from[key] ??= here[key];
+  return { fields: next, since, from, began: now, ms: next.tween };
+}
+
+// The fields as they are to be shown at this time.
+function shownNow(thing, now) {
+  if (!thing.from) return thing.fields;
+  const share = (now - thing.began) / thing.ms;
+  if (share >= 1) {
+    thing.from = null;
+    return thing.fields;
+  }
+  const shown = { ...thing.fields };
+  for (const [key, start] of Object.entries(thing.from)) {
+    let way = (shown[key] ?? UNSAID[key]) - start;
+    if (key === "angle") way = ((((way + 180) % 360) + 360) % 360) - 180; // the shorter way round
+    if (Number.isFinite(way)) shown[key] = start + share * way;
+  }
+  return shown;
+}
+
+// Draws, and again with each display of the screen while something moves by itself.
+function show(now) {
+  layers ??= [...things.values()].sort((one, other) => (one.fields.depth ?? 0) - (other.fields.depth ?? 0));
+  const plays = paint(layers.map((thing) => [shownNow(thing, now), now - thing.since]));
+  if ((plays || layers.some((thing) => thing.from)) && !waitsForPaint) {
+    waitsForPaint = true;
+    requestAnimationFrame(() => {
+      waitsForPaint = false;
+      if (things.size) show(performance.now());
+    });
+  }
+}
+
+hooks.subprotocols.unshift("hippodrome.3");
+for (const kind of [4, 5]) {
+  hooks.kinds[kind] = (buffer, take) => take({ kind, id: new DataView(buffer).getUint32(1) }, unpackScene(kind, buffer));
+}
+hooks.kinds[6] = (buffer) => takeSpritePart(buffer, () => things.size && show(performance.now()));
+hooks.said.push((said) => {
+  if (!said.scene) return;
+  prepare(said.scene, () => things.size && show(performance.now()));
+  askForSprites(said.assets ?? []);
+});

@@ -1,0 +1,97 @@
+// The images of a game that is drawn by objects: asked for before it begins, with a bar that shows how far they are.
+import { send } from "./connection.js";
+import { hooks } from "./hooks.js";
+import { showOverlay } from "./overlay.js";
+import { find, make, setText } from "./page.js";
+import { game } from "./state.js";
+
+const PART_HEADER = 7; // bytes: kind, number, offset
+const AT_ONCE = 16; // images that are asked for; a server refuses more than 200 messages a second
+
+const loaded = new Map(); // hash -> `{ bitmap, frames, animations }`, kept while the page is open; null if it is broken
+let table = []; // of the server's
+let arrived = new Map(); // number -> the bytes so far
+let asked = 0; // numbers below this were asked for on this connection, unless they were there already
+let underWay = 0;
+const bar = make("progress", { max: 1, value: 0, hidden: true });
+bar.setAttribute("aria-label", "Pictures of the game");
+find("overlay-hint").after(bar);
+
+export const spriteOf = (name) => loaded.get(table.find((each) => each.name === name)?.hash);
+
+const loading = () => table.some((each) => !loaded.has(each.hash));
+
+export function askForSprites(assets) {
+  table = assets;
+  askForMore();
+  tell();
+}
+
+function askForMore() {
+  for (; asked < table.length && underWay < AT_ONCE; asked += 1) {
+    const { name, hash } = table[asked];
+    if (loaded.has(hash) || table.findIndex((each) => each.hash === hash) < asked) continue;
+    underWay += 1;
+    send({ asset: name });
+  }
+}
+
+export async function takeSpritePart(buffer, ready) {
+  const view = new DataView(buffer);
+  const number = view.getUint16(1);
+  const image = table[number];
+  if (!image || loaded.has(image.hash)) return;
+  const part = new Uint8Array(buffer, PART_HEADER);
+  const all = arrived.get(number) ?? { bytes: new Uint8Array(image.bytes), length: 0 };
+  arrived.set(number, all);
+  if (view.getUint32(3) !== all.length || all.length + part.length > image.bytes) return;
+  all.bytes.set(part, all.length);
+  all.length += part.length;
+  if (all.length === image.bytes) {
+    underWay -= 1;
+    const sprite = await opened(all.bytes).catch(() => null);
+    loaded.set(image.hash, sprite);
+    askForMore();
+    if (!loading()) ready();
+  }
+  tell();
+}
+
+async function opened(bytes) {
+  const end = 4 + new DataView(bytes.buffer).getUint32(0);
+  const { type, frames = {}, animations = {} } = JSON.parse(new TextDecoder().decode(bytes.subarray(4, end)));
+  const bitmap = await createImageBitmap(new Blob([bytes.subarray(end)], { type }));
+  return { bitmap, frames: new Map(Object.entries(frames)), animations: new Map(Object.entries(animations)) };
+}
+
+let told = false; // the overlay shows how far they are
+
+// Says how far they are, and when all are there what the game is waiting for.
+function tell() {
+  if (loading() && ["ready", "paused"].includes(game.state)) {
+    const whole = table.reduce((sum, each) => sum + each.bytes, 0);
+    const there = table.reduce((sum, each, number) => sum + (loaded.has(each.hash) ? each.bytes : arrived.get(number)?.length ?? 0), 0);
+    bar.value = there / whole;
+    setText(find("overlay-title"), "Loading the pictures…");
+    setText(find("overlay-hint"), "");
+    find("overlay-button").hidden = true;
+    bar.hidden = false;
+    told = true;
+  } else if (told) {
+    bar.hidden = true;
+    told = false;
+    showOverlay(game.state);
+  }
+}
+
+const othersWait = hooks.waits;
+hooks.waits = () => loading() || othersWait();
+hooks.overlay.push(() => {
+  bar.hidden = true;
+  told = false;
+  if (loading()) tell();
+});
+hooks.opened.push(() => {
+  arrived = new Map();
+  asked = underWay = 0;
+});
