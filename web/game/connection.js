@@ -4,20 +4,19 @@ import { canDecode, canInflate, decodeJpeg, HEADER, readHeader, unpack } from ".
 import { hooks } from "./hooks.js";
 import { data } from "./page.js";
 
-const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the first has lossy frames too
+export const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the last has no lossy frames
 const SILENCE = 5_000; // ms without a message; then the page asks whether the server is there, and after as long again it gives up
 const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
 const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
 const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
 
-const offered = () => (canInflate ? [...(canDecode ? hooks.subprotocols : []), ...SUBPROTOCOLS.slice(canDecode ? 0 : 1)] : []);
 let link = null; // the present connection; what an earlier one still sends does not count
 
 // Plays until the connection ends; `hear` gets each message. Resolves to `{ why, welcome, result }`: `why` is "done",
 // "elsewhere", "moved" or "lost", `welcome` whether the server let us in, `result` its last message after "done".
 export function play(server, hear) {
   return new Promise((resolve) => {
-    const socket = new WebSocket(server.url, offered());
+    const socket = new WebSocket(server.url, canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : []);
     const own = { socket, heard: performance.now(), asked: 0, acked: 0, welcome: false };
     own.end = (why, result) => {
       if (link !== own) return;
@@ -27,7 +26,6 @@ export function play(server, hear) {
       resolve({ why, welcome: own.welcome, result });
     };
     link = own;
-    for (const hook of hooks.opened) hook();
     const failed = () => own.end("lost"); // a new connection begins with a whole picture
     own.show = startDrawing(() => link === own || own.done, (id) => acknowledge(own, id), failed);
     socket.binaryType = "arraybuffer";
@@ -64,7 +62,7 @@ function receive(own, message, hear) {
 }
 
 function acknowledge(own, id) {
-  if (!own.socket.protocol) return;
+  if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
   const tell = () => {
     own.timer = null;
     own.acked = performance.now();

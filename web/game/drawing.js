@@ -3,7 +3,6 @@
 // learns of it by the acknowledgement of that one.
 import { drawPicture, drawPixels, forgetPicture } from "./canvas.js";
 import { JPEG, KEY } from "./frames.js";
-import { hooks } from "./hooks.js";
 
 // Returns a function that takes a frame's header and the promise of what `unpack` made of it. `isOpen` says whether the
 // connection is still in use; `drawn` gets the id of each frame that was drawn, `failed` is called if one cannot be drawn.
@@ -21,7 +20,6 @@ export function startDrawing(isOpen, drawn, failed) {
       const unpacked = await unpacking;
       if (!isOpen()) return unpacked.picture?.close?.();
       const late = header.kind === JPEG && newestWhole > number;
-      for (const hook of unpacked.draw ? [] : hooks.pixels) hook();
       if (unpacked.draw) unpacked.draw();
       else if (!unpacked.picture) drawPixels(header, unpacked);
       else drawPicture(header.kind === JPEG ? header : unpacked, late ? null : unpacked.picture);

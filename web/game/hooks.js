@@ -6,9 +6,6 @@ export const hooks = {
   means: (name) => ({ action: name }), // what a key or a button of this name tells the server
   key: () => undefined, // what a keyboard event does, as `{ action }`, if the project says so itself
   controls: () => undefined, // groups of buttons and lines of the legend that stand for those of the actions' names
-  opened: [], // functions that are called when a connection begins
-  subprotocols: [], // what this page understands beyond what every page does
   kinds: {}, // by kind of a binary message: a function that gets it, and one that takes a picture's header and what it became
-  pixels: [], // functions that are called when a frame of pixels was drawn
   waits: () => false, // whether something is to be seen before the game begins or goes on, and is shown now
 };

@@ -1,5 +1,4 @@
 // Draws the objects of a scene on a canvas of their own, which lies on that of the frames.
-import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 import { spriteOf } from "./sprites.js";
 
@@ -33,6 +32,11 @@ export function place() {
   if (!easel.hidden) return;
   easel.hidden = false;
   fit();
+}
+
+// Shows the canvas of the frames.
+export function putAway() {
+  easel.hidden = true;
 }
 
 // As many pixels as the screen has for it.
@@ -137,6 +141,3 @@ function fill({ outline, outline_width: lineWidth = 1 }) {
 }
 
 new ResizeObserver(() => !easel.hidden && fit() && repaint()).observe(easel);
-hooks.pixels.push(() => {
-  easel.hidden = true;
-});

@@ -1,8 +1,10 @@
 // Games that are drawn by objects (docs/wire.md, "A scene"): what the server says of them, put together and shown.
+import { SUBPROTOCOLS } from "./connection.js";
+import { canDecode, DIFFERENCE, HEADER, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { askForSprites, takeSpritePart } from "./sprites.js";
 import { find, make, setText } from "./page.js";
-import { paint, place, prepare } from "./painter.js";
+import { paint, place, prepare, putAway } from "./painter.js";
 
 const SCENE_HEADER = 5; // bytes: kind, id
 const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
@@ -102,9 +104,15 @@ function show(now) {
   }
 }
 
-hooks.subprotocols.unshift("hippodrome.3");
+if (canDecode) SUBPROTOCOLS.unshift("hippodrome.3");
 for (const kind of [4, 5]) {
   hooks.kinds[kind] = (buffer, take) => take({ kind, id: new DataView(buffer).getUint32(1) }, unpackScene(kind, buffer));
+}
+for (const kind of [KEY, DIFFERENCE, JPEG, ROWS]) {
+  hooks.kinds[kind] = (buffer, take) => {
+    const header = buffer.byteLength < HEADER ? {} : readHeader(buffer);
+    take(header, unpack(header, buffer).finally(putAway));
+  };
 }
 hooks.kinds[6] = (buffer) => takeSpritePart(buffer, () => things.size && show(performance.now()));
 hooks.said.push((said) => {

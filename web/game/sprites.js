@@ -86,12 +86,11 @@ function tell() {
 
 const othersWait = hooks.waits;
 hooks.waits = () => loading() || othersWait();
-hooks.overlay.push(() => {
+hooks.overlay.push((name) => {
   bar.hidden = true;
   told = false;
-  if (loading()) tell();
-});
-hooks.opened.push(() => {
-  arrived = new Map();
-  asked = underWay = 0;
+  if (["lost", "unreachable", "elsewhere"].includes(name)) {
+    arrived = new Map(); // the next connection sends them anew
+    asked = underWay = 0;
+  } else if (loading()) tell();
 });
