@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.unraisableexception import gc_collect_iterations_key
 
 from testing import exploration, memoized_aws
 
@@ -33,11 +34,11 @@ ONE_AFTER_ANOTHER = (
 
 
 gc.disable()  # until all is imported; see `pytest_collection_finish`
-# A shell's background jobs inherit SIGINT as ignored, and `make test` tells the commands of its tests that they are
-# part of it: both would change what the processes that tests start do.
+# A shell's background jobs inherit SIGINT as ignored, `make test` tells the commands of its tests that they are
+# part of it, and a shell may have a path for Python: all would change what the processes that tests start do.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS"):
+for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHONPATH"):
     os.environ.pop(_name, None)
 memoized_aws.keep()
 exploration.load_profile()
@@ -106,11 +107,18 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """What is imported by now stays: the garbage collector need not look through it again and again (8 % of the time)."""
-    gc.collect()
+    """What is imported by now stays: the garbage collector need not look through it again and again (8 % of the time).
+
+    Nor once before: what little garbage there is costs less than the half second in each worker.
+    """
     gc.freeze()
     gc.enable()
     gc.set_threshold(10_000, 20, 20)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Look for garbage once when all is over; pytest's five times take each worker seconds and find no more."""
+    config.stash[gc_collect_iterations_key] = 1
 
 
 _BEGUN = time.monotonic()
