@@ -90,14 +90,16 @@ data: OF += $(if $(DATA_GIVEN),--from "$(DATA)")
 certificate doctor status cost data logs stop destroy:
 	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
 
-# Tests mostly wait, so two cores take four workers.
-WORKERS ?= 4
+# The quick tests compute. All tests together wait two thirds of their time, so that two cores take more workers.
+WORKERS ?=
+AT_ONCE := 4
 # Python keeps its bytecode, whatever the shell's environment says: every worker and every process of a test uses it.
-PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(or $(WORKERS),$(AT_ONCE)) --dist loadgroup
 QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/test_trial_core.py tests/trial/test_trial_decisions.py \
 	$(addprefix --ignore ,tests/hippodrome/aws tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py)
 
 .PHONY: test
+test: AT_ONCE := 6
 test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 	@$(PYTEST)
 
