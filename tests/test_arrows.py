@@ -41,6 +41,7 @@ ROOMS = {
         "programs",
         "server",
         "check",
+        "interactive_gym",
     ),
     "deploy": ("aws", "core", "code", "cost", "stack", "study", "operate", "lifecycle"),
 }

@@ -1,1 +1,33 @@
-"""The trial server: runs one participant's trial and talks to their browser. Stands alone; see docs/wire.md."""
+"""The trial server: runs one participant's trial and talks to their browser. Stands alone; see docs/wire.md.
+
+The names of `_INTERACTIVE_GYM` are for experiments written for Interactive Gym (docs/interactive-gym.md). They are
+imported when they are asked for, so that importing this package stays cheap.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_INTERACTIVE_GYM = {
+    "RemoteConfig": "remote_config.RemoteConfig",
+    "remote_config": "remote_config",
+    "configuration_constants": "configuration_constants",
+    "object_contexts": "object_contexts",
+    "render_configs": "render_configs",
+    "server_app": "server_app",
+    "app": "server_app",
+    "callback": "callback",
+    "remote_game": "remote_game",
+    "inference_utils": "inference_utils",
+    "onnx_inference_utils": "onnx_inference_utils",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """`from trial import RemoteConfig`, and the other words of Interactive Gym."""
+    if name not in _INTERACTIVE_GYM:
+        raise AttributeError(f"module 'trial' has no attribute {name!r}")
+    module, _, attribute = _INTERACTIVE_GYM[name].partition(".")
+    found = importlib.import_module(f"trial.interactive_gym.{module}")
+    return getattr(found, attribute) if attribute else found

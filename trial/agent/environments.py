@@ -157,7 +157,7 @@ def _space(env: Any, name: str, key: Any) -> Any:
             return found(key)
         except (KeyError, NotImplementedError, AttributeError):
             return None
-    several = found if isinstance(found, Mapping) else getattr(found, "spaces", None)
+    several = getattr(found, "spaces", found if isinstance(found, Mapping) else None)  # "in" asks a space for samples
     if several is None:
         several = getattr(env, f"{name}s", None) if found is None else None
     if isinstance(several, Mapping) and key in several:

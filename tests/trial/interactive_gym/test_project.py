@@ -1,0 +1,218 @@
+"""`python experiment.py`: the project that it makes, what it says, and what it refuses."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hippodrome.config import read_project
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, TOGETHER
+
+ROOT = Path(__file__).resolve().parents[3]
+MAKE = RUN.replace("SERVE", "False")
+
+
+def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True, check=False
+    )
+
+
+def write(folder: Path, source: str = ALONE, name: str = "experiment.py") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(source + MAKE)
+    (folder / "helper.py").write_text(HELPER)
+    (folder / "how.html").write_text('<h1>How</h1><p><img src="key.png" alt="A key"></p>')
+    (folder / "key.png").write_bytes(b"a picture")
+
+
+def made(folder: Path, source: str = ALONE) -> tuple[Path, str]:
+    write(folder, source)
+    done = python(folder, "experiment.py")
+    assert done.returncode == 0, done.stderr
+    return folder / "experiment-study", done.stdout
+
+
+def refused(folder: Path, source: str) -> str:
+    write(folder, source)
+    done = python(folder, "experiment.py")
+    assert done.returncode == 1
+    assert not (folder / "experiment-study").exists()
+    assert done.stderr.startswith("This experiment cannot be played here: "), done.stderr
+    return done.stderr.removeprefix("This experiment cannot be played here: ").strip()
+
+
+def config_of(project: Path) -> Any:
+    return yaml.safe_load((project / "config.yml").read_text())
+
+
+def test_an_experiment_becomes_a_project(tmp_path: Path) -> None:
+    project, said = made(tmp_path)
+    assert f"The project is in {project}." in said
+    found = {path.relative_to(project).as_posix() for path in project.rglob("*") if path.is_file()}
+    assert found == {
+        ".made-by-interactive-gym.json", "agent.py", "config.yml", "experiment.py", "helper.py", "how.html", "key.png",
+        "requirements.txt", "steps/final.html", "steps/instructions.html", "steps/key.png", "steps/welcome.html",
+    }  # fmt: skip
+    assert config_of(project) == {
+        "project": {
+            "id": "Mountain-Car",
+            "name": "Mountain car",
+            "steps": {1: "welcome", 2: "game", "finalStep": "final"},
+        },
+        "trial": {
+            "game": "Mountain_Car",
+            "maxEpisodes": 2,
+            "startingFrameRate": 60,
+            "minFrameRate": 1,
+            "maxFrameRate": 90,
+            "actionSpace": ["left", "noop", "right"],
+            "betweenEpisodes": 3,
+            "idleAction": "noop",
+            "keys": {"ArrowLeft": "left", "ArrowRight": "right", "a+b": "right"},
+            "scene": {"width": 600, "height": 400, "background": "#FFFFFF", "coordinates": "relative"},
+            "instructions": "instructions",
+        },
+    }
+    config = read_project(project)
+    assert config.trial.keys
+    assert (project / "requirements.txt").read_text().startswith("gymnasium==")
+
+
+def test_texts_become_pages(tmp_path: Path) -> None:
+    project, _ = made(tmp_path)
+    welcome = (project / "steps/welcome.html").read_text()
+    assert "<h1>Mountain car</h1>" in welcome
+    assert "{% raw %}" in welcome, "what looks like a template is shown as it is"
+    instructions = (project / "steps/instructions.html").read_text()
+    assert '<img src="key.png"' in instructions
+    assert "<p>Go &amp; go</p>" in instructions
+    final = (project / "steps/final.html").read_text()
+    assert 'href="https://example.org/?a=1&amp;id={{ participant.userId|urlencode }}"' in final
+    assert "5000" in final
+
+
+def test_what_has_no_effect_is_said(tmp_path: Path) -> None:
+    _, said = made(tmp_path)
+    assert "Remark: host has no effect: on one machine a study is held for that machine only" in said
+    assert "Remark: max_ping has no effect: no participant is turned away" in said
+    assert "waitroom" not in said, "only what the experiment sets"
+
+
+def test_players_and_their_policies(tmp_path: Path) -> None:
+    brains = tmp_path / "brains"
+    brains.mkdir()
+    (brains / "two.txt").write_text("2")
+    project, _ = made(tmp_path, TOGETHER)
+    trial = config_of(project)["trial"]
+    assert trial["players"] == {"0": "human", "1": "agent:Policy1"}
+    assert (trial["frameSkip"], trial["input"], trial["actionSpace"]) == (1, "single", ["0", "1", "2"])
+    assert (project / "policies/two.txt").read_text() == "2"
+    assert "Policy1 = _experiment.policy(1)" in (project / "agent.py").read_text()
+    read_project(project)
+
+
+def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
+    package = tmp_path / "examples" / "car"
+    write(package, ALONE.replace("import helper", "from examples.car import helper"), "car_server.py")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "large.bin").write_bytes(b"not ours")
+    done = python(tmp_path, "-m", "examples.car.car_server")
+    assert done.returncode == 0, done.stderr
+    project = package / "car-server-study"
+    assert (project / "examples/car/helper.py").is_file()
+    assert not list(project.rglob("large.bin"))
+    assert '"examples.car.car_server", "config"' in (project / "agent.py").read_text()
+    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+
+
+def test_it_is_made_anew_and_what_was_changed_by_hand_stays(tmp_path: Path) -> None:
+    project, _ = made(tmp_path)
+    (project / "steps/welcome.html").write_text("<h1>Mine</h1>")
+    (project / "data").mkdir()
+    (project / "data/answer").write_text("kept")
+    (tmp_path / "key.png").unlink()
+    (tmp_path / "experiment.py").write_text((ALONE + MAKE).replace("Mountain car", "Another name"))
+    done = python(tmp_path, "experiment.py")
+    assert done.returncode == 0, done.stderr
+    assert "steps/welcome.html was changed by hand and stays; delete it to have it made anew" in done.stdout
+    assert (project / "steps/welcome.html").read_text() == "<h1>Mine</h1>"
+    assert config_of(project)["project"]["name"] == "Another name"
+    assert not (project / "key.png").exists(), "what is no more in the experiment is removed"
+    assert (project / "data/answer").read_text() == "kept"
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    mine = tmp_path / "experiment-study"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("years of work")
+    write(tmp_path)
+    done = python(tmp_path, "experiment.py")
+    assert done.returncode == 1
+    assert f"{mine} holds something else" in done.stderr
+    assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
+
+
+def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config, serve=False)\n")
+    assert python(tmp_path, "experiment.py").returncode == 0
+    done = python(tmp_path / "experiment-study", "-c", "import agent; print(agent.Agent.__name__)")
+    assert (done.returncode, done.stdout) == (0, "Agent\n"), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("PolicyTypes.Human}", "PolicyTypes.Random}", "policy_mapping has no PolicyTypes.Human"),
+        ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "human"}', "several participants in one game are not possible yet"),
+        ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "x.pkl"}', "there is no policies(policy_inference_fn=…) that could play other by 'x.pkl'"),
+        ('"ArrowRight": RIGHT', '"ArrowRight": 7', "'ArrowRight' leads to the action 7; there are 0 to 2"),
+        ("default_action=NOOP", "default_action=3", "'default_action' leads to the action 3; there are 0 to 2"),
+        ("fps=60", "fps=600", "fps must be from 1 to 240, not 600"),
+        ('"MountainCar-v0"', '"MountainCarContinuous-v0"', "the actions of human must be numbered (a Discrete space); they are Box("),
+        (".environment(env_creator=env_creator, ", ".environment(", "there is no environment: give environment(env_creator=…)"),
+        ("import helper", "import helper, sys, types; sys.modules['eventlet'] = types.ModuleType('eventlet')", "take `import eventlet` and `eventlet.monkey_patch()` out"),
+        ("config = (", "configs = [None]; configs[0] = (", "run() takes a RemoteConfig"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in ALONE
+    source = ALONE.replace(old, new)
+    if "configs" in new:
+        source += "\nconfig = configs\n"
+    assert said in refused(tmp_path, source)
+
+
+def test_a_config_that_is_no_variable_of_the_file_is_refused(tmp_path: Path) -> None:
+    source = ALONE.replace("config = (", "def build(): return (")
+    write(tmp_path, source)
+    (tmp_path / "experiment.py").write_text(source + "\nserver_app.run(build(), serve=False)\n")
+    done = python(tmp_path, "experiment.py")
+    assert "the config must be a variable of the experiment's file" in done.stderr
+
+
+def test_images_and_atlases_are_copied_under_their_names(tmp_path: Path) -> None:
+    static = tmp_path / "server/static"
+    static.mkdir(parents=True)
+    (static / "cook.png").write_bytes(b"cook")
+    (static / "cook.json").write_text('{"frames": {"EAST.png": {}}}')
+    specs = (
+        "config.rendering(assets_to_preload=["
+        "object_contexts.AtlasSpec('chef', 'static/cook.png', 'static/cook.json').as_dict(),"
+        "object_contexts.ImgSpec('plain.png', 'static/cook.png').as_dict(),"
+        "object_contexts.ImgSpec('gone', 'static/gone.png').as_dict()],"
+        "animation_configs=[render_configs.Animation('walk', 'chef', ['EAST.png'], 8)])\n"
+    )
+    source = ALONE.replace("server_app\n", "server_app, render_configs\n") + specs
+    project, said = made(tmp_path, source)
+    assert sorted(path.name for path in (project / "assets").iterdir()) == ["chef.json", "chef.png", "plain.png"]
+    assert '"walk": {"frames": ["EAST.png"], "frameRate": 8}' in (project / "assets/chef.json").read_text()
+    assert "Remark: the image 'gone' is not found at static/gone.png; sprites that show it are grey boxes" in said

@@ -1,0 +1,88 @@
+"""The images of an experiment, as files of the project's folder `assets/`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from trial.interactive_gym.remote_config import RemoteConfig
+
+IMAGES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+def of(config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]) -> dict[str, bytes]:
+    """The files below `assets/`, by their names there."""
+    files: dict[str, bytes] = {}
+    given = "assets_dir" in config.given
+    folder = locate(config.assets_dir)
+    if given and folder is None:
+        remark(f"assets_dir: there is no folder {config.assets_dir}")
+    if folder is not None and folder.is_dir() and given:
+        for path in sorted(folder.rglob("*")):
+            if path.suffix.lower() in (*IMAGES, ".json") and path.is_file():
+                files[path.relative_to(folder).as_posix()] = path.read_bytes()
+    for spec in [*config.assets_to_preload, *(config.preload_specs or ())]:
+        _add(_plain(spec), locate, remark, files)
+    _animate(config, files, remark)
+    return files
+
+
+def _add(
+    spec: Mapping[str, Any],
+    locate: Callable[[str], Path | None],
+    remark: Callable[[str], None],
+    files: dict[str, bytes],
+) -> None:
+    name, image = str(spec.get("name", "")), spec.get("img_path")
+    stem = name.rpartition(".")[0] if Path(name).suffix.lower() in IMAGES else name
+    path = locate(str(image)) if image else None
+    if not stem or path is None or not path.is_file():
+        remark(f"the image {name!r} is not found at {image}; sprites that show it are grey boxes")
+        return
+    if path.suffix.lower() not in IMAGES:
+        remark(f"the image {name!r} is no PNG, JPEG or WebP file; sprites that show it are grey boxes")
+        return
+    files[f"{stem}{path.suffix.lower()}"] = path.read_bytes()
+    if spec.get("atlas_path") is None:
+        return
+    atlas = locate(str(spec["atlas_path"]))
+    if atlas is None or not atlas.is_file():
+        remark(f"the atlas of {name!r} is not found at {spec['atlas_path']}")
+        return
+    files[f"{stem}.json"] = _single(atlas.read_bytes(), name, remark)
+
+
+def _single(atlas: bytes, name: str, remark: Callable[[str], None]) -> bytes:
+    """The atlas of one image: of Phaser's several (`textures`) the first."""
+    try:
+        textures = json.loads(atlas).get("textures")
+    except (ValueError, AttributeError):
+        return atlas
+    if not textures:
+        return atlas
+    if len(textures) > 1:
+        remark(f"the atlas of {name!r} has {len(textures)} images; only the first is drawn: pack them into one")
+    return json.dumps({"frames": textures[0].get("frames", [])}).encode()
+
+
+def _animate(config: RemoteConfig, files: dict[str, bytes], remark: Callable[[str], None]) -> None:
+    """Write the animations into the atlases of their sprite sheets."""
+    for each in config.animation_configs:
+        spec = _plain(each)
+        key, sheet = str(spec.get("key")), f"{spec.get('sprite_sheet_key')}.json"
+        if sheet not in files:
+            remark(f"the animation {key!r} is left out: its sprite sheet {spec.get('sprite_sheet_key')!r} has no atlas")
+            continue
+        atlas = json.loads(files[sheet])
+        played: dict[str, Any] = {"frames": list(spec.get("frames", ()))}
+        if spec.get("frameRate"):
+            played["frameRate"] = spec["frameRate"]
+        atlas.setdefault("animations", {})[key] = played
+        files[sheet] = json.dumps(atlas).encode()
+
+
+def _plain(spec: Any) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = spec.as_dict() if hasattr(spec, "as_dict") else spec
+    return found

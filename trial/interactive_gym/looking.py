@@ -1,0 +1,140 @@
+"""What an experiment is like: its environment is made and begun once, on the researcher's machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from trial.interactive_gym import onnx_inference_utils
+from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
+from trial.interactive_gym.playing import ExperimentAgent, Unplayable, mapping_of, space_of
+from trial.interactive_gym.remote_config import RemoteConfig
+
+_FASTEST = 240
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What was found."""
+
+    players: tuple[Any, ...]
+    """As `policy_mapping` calls them."""
+    several: bool
+    actions: int
+    """How many there are; of several players, the most that one has."""
+    human: Any
+    dict_observations: bool
+    objects: bool
+    """The game is drawn by objects, and not by pixels."""
+    game: Any
+    """A RemoteGame of it, for `game_page_html_fn`."""
+
+
+def look(config: RemoteConfig) -> Look:
+    """Make the environment, begin an episode and draw it. Raises Unplayable, and what the experiment's code raises."""
+    _check(config)
+    agent = ExperimentAgent(config)
+    env = agent.start(None)
+    try:
+        observation, _ = agent.reset(1)
+        players = tuple(mapping_of(config))
+        if agent.several:
+            _check_players(players, observation)
+        counts = {player: _count(env, player, several=agent.several) for player in players}
+        picture = agent.render()
+        seen = observation.get(players[-1]) if agent.several and isinstance(observation, Mapping) else observation
+        return Look(
+            players=players,
+            several=agent.several,
+            actions=max(counts.values()),
+            human=next(iter(agent.game.human_players)) if agent.game else None,
+            dict_observations=isinstance(seen, Mapping),
+            objects=isinstance(picture, Mapping),
+            game=agent.game,
+        )
+    finally:
+        agent.close()
+
+
+def is_file(config: RemoteConfig, plays: Any) -> bool:
+    """Whether a policy is an ONNX file that Hippodrome plays by itself: no function of the experiment's own does."""
+    ours = (onnx_inference_utils.load_onnx_policy_fn, onnx_inference_utils.onnx_model_inference_fn)
+    own = (config.load_policy_fn, config.policy_inference_fn) != ours
+    none = config.load_policy_fn is None and config.policy_inference_fn is None
+    return isinstance(plays, str) and plays.endswith(".onnx") and (none or not own)
+
+
+def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> list[str]:
+    """The actions' names: the experiment's own constants (`LEFT = 1`), if each action has one; else their numbers."""
+    found: dict[int, list[str]] = {}
+    for name, value in module.items():
+        if type(value) is int and 0 <= value < actions and name[:1].isupper():
+            found.setdefault(value, []).append(name.lower())
+    if len(found) == actions and all(len(names) == 1 for names in found.values()):
+        named = [found[number][0] for number in range(actions)]
+        if len(set(named)) == actions:
+            return named
+    return [str(number) for number in range(actions)]
+
+
+def _check(config: RemoteConfig) -> None:
+    """Raises Unplayable for what cannot be, whatever the environment is."""
+    if "eventlet" in sys.modules:
+        raise Unplayable("take `import eventlet` and `eventlet.monkey_patch()` out: it changes Python's own threads")
+    mapping = mapping_of(config)
+    humans = [player for player, plays in mapping.items() if plays == PolicyTypes.Human]
+    if not humans:
+        raise Unplayable("policy_mapping has no PolicyTypes.Human: say which player the participant plays")
+    if len(humans) > 1:
+        raise Unplayable(
+            f"policy_mapping has {len(humans)} humans ({', '.join(map(str, humans))}); several participants in one "
+            "game are not possible yet: let one be human, and give the others a policy or PolicyTypes.Random"
+        )
+    for player, plays in mapping.items():
+        known = plays in (PolicyTypes.Human, PolicyTypes.Random) if isinstance(plays, str) else False
+        if not known and config.policy_inference_fn is None and not callable(plays) and not is_file(config, plays):
+            raise Unplayable(f"there is no policies(policy_inference_fn=…) that could play {player} by {plays!r}")
+    if not 1 <= round(config.fps) <= _FASTEST:
+        raise Unplayable(f"fps must be from 1 to {_FASTEST}, not {config.fps}")
+    modes = (InputModes.PressedKeys, InputModes.SingleKeystroke)
+    if config.input_mode not in modes:
+        raise Unplayable(f"input_mode must be one of {', '.join(modes)}, not {config.input_mode!r}")
+    methods = (ActionSettings.DefaultAction, ActionSettings.PreviousSubmittedAction)
+    if config.action_population_method not in methods:
+        raise Unplayable(f"action_population_method must be one of {', '.join(methods)}")
+
+
+def check_actions(config: RemoteConfig, actions: int) -> None:
+    """Raises Unplayable for a key whose action there is not."""
+    for key, action in {**config.action_mapping, "default_action": config.default_action}.items():
+        if key == "default_action" and action is None:
+            continue
+        if isinstance(action, bool) or not _is_whole(action) or not 0 <= int(action) < actions:
+            raise Unplayable(f"{key!r} leads to the action {action!r}; there are 0 to {actions - 1}")
+
+
+def _is_whole(value: Any) -> bool:
+    try:
+        return bool(int(value) == value)
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _check_players(players: tuple[Any, ...], observation: Any) -> None:
+    seen = list(observation) if isinstance(observation, Mapping) else None
+    if seen is not None and not set(seen) <= set(players):
+        raise Unplayable(
+            f"the environment's players are {', '.join(map(repr, seen))}, and policy_mapping has "
+            f"{', '.join(map(repr, players))}: write the environment's names"
+        )
+
+
+def _count(env: Any, player: Any, *, several: bool) -> int:
+    space = env.action_space(player) if several else space_of(env, "action_space", player)
+    count = getattr(space, "n", None)
+    if count is None:
+        shown = "unknown" if space is None else str(space)[:80]
+        raise Unplayable(f"the actions of {player} must be numbered (a Discrete space); they are {shown}")
+    return int(count)

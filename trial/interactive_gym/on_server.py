@@ -1,0 +1,66 @@
+"""What the generated agent.py imports: the experiment's file, loaded on a participant's server."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+from trial.interactive_gym import playing
+from trial.interactive_gym.remote_config import RemoteConfig
+
+_loading = False
+
+
+def is_loading() -> bool:
+    """Whether an experiment's file is being loaded on a server, where `server_app.run` is to do nothing."""
+    return _loading
+
+
+class Experiment:
+    """An experiment in its project's folder."""
+
+    def __init__(self, folder: Path, config: RemoteConfig) -> None:
+        self._config = config
+        self._locate = playing.located(folder)
+
+    def agent(self) -> type:
+        """The class `Agent`."""
+        return playing.agent_class(self._config, self._locate)
+
+    def policy(self, player: Any) -> type:
+        """A class that plays this player."""
+        return playing.policy_class(self._config, player, self._locate)
+
+
+def load(agent_file: str, module: str, name: str) -> Experiment:
+    """The experiment whose config is the variable `name` of `module`, a file beside agent.py.
+
+    The module is imported under its own name, so what stands below `if __name__ == "__main__"` is not run. Raises
+    Unplayable if there is no such config, and what the module raises.
+    """
+    folder = Path(agent_file).resolve().parent
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    config = getattr(_imported(folder, module), name, None)
+    if not isinstance(config, RemoteConfig):
+        raise playing.Unplayable(f"{module} has no RemoteConfig called {name}; run the experiment's file again")
+    return Experiment(folder, config)
+
+
+def _imported(folder: Path, module: str) -> Any:
+    """The module of the project's folder, and not another one of the same name."""
+    global _loading  # noqa: PLW0603 - one import at a time
+    path = folder / f"{module.replace('.', '/')}.py"
+    spec = importlib.util.spec_from_file_location(module, path)
+    if spec is None or spec.loader is None:
+        raise playing.Unplayable(f"there is no {path.name} beside agent.py; run the experiment's file again")
+    made = importlib.util.module_from_spec(spec)
+    sys.modules[module] = made
+    _loading = True
+    try:
+        spec.loader.exec_module(made)
+    finally:
+        _loading = False
+    return made

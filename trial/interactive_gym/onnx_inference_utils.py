@@ -1,0 +1,44 @@
+"""Interactive Gym's `load_policy_fn` and `policy_inference_fn` for ONNX files that RLlib has exported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from trial.interactive_gym.inference_utils import sample_action_via_softmax
+
+ORT_SESSIONS: dict[str, Any] = {}
+"""Models by their paths."""
+
+
+def load_onnx_policy_fn(onnx_model_path: str) -> str:
+    """Load a model; the path stands for it."""
+    if onnx_model_path not in ORT_SESSIONS:
+        import onnxruntime  # noqa: PLC0415 - only experiments with models have it
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        ORT_SESSIONS[onnx_model_path] = onnxruntime.InferenceSession(
+            onnx_model_path, options, providers=["CPUExecutionProvider"]
+        )
+    return onnx_model_path
+
+
+def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
+    """The model's outputs for these inputs. Inputs that it does not have are left out."""
+    session = ORT_SESSIONS[model_path]
+    known = {each.name for each in session.get_inputs()}
+    return session.run(["output"], {name: value for name, value in input_dict.items() if name in known})
+
+
+def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
+    """The action that a model draws for an observation; the parts of a dictionary are joined in their order."""
+    if isinstance(observation, Mapping):
+        observation = np.hstack([np.asarray(part).reshape(-1) for part in observation.values()])
+    inputs = {
+        "obs": np.asarray(observation, np.float32).reshape(1, -1),
+        "state_ins": np.zeros(1, np.float32),  # RLlib's exports ask for it
+    }
+    return sample_action_via_softmax(inference_onnx_model(inputs, onnx_model_path)[0])

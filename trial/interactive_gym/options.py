@@ -1,0 +1,143 @@
+"""Every option of Interactive Gym's RemoteConfig: the method that sets it, its default, and what it becomes here.
+
+`python -m trial.interactive_gym.options` prints the table of docs/interactive-gym.md.
+"""
+
+# ruff: noqa: E501 - a table
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from trial.interactive_gym.configuration_constants import ActionSettings, InputModes
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option. `method` is empty for attributes that no method sets."""
+
+    name: str
+    method: str
+    default: Any
+    becomes: str
+    ignored: str = ""
+    """If it has no effect here: why, as a sentence that is said when an experiment sets it."""
+
+    def fresh(self) -> Any:
+        """The default; lists and dictionaries are new ones."""
+        return self.default() if isinstance(self.default, type) else self.default
+
+
+_LOBBY = "there are no waiting rooms yet: each participant plays alone"
+_PYODIDE = "the environment runs on a participant's server, and not in the browser"
+
+OPTIONS: tuple[Option, ...] = (
+    # environment
+    Option("env_creator", "environment", None, "called by the project's `agent.py` with `env_config` and `render_mode=\"rgb_array\"`"),
+    Option("env_name", "environment", None, "`trial.game`, a name only"),
+    Option("env_config", "environment", dict, "given to `env_creator`"),
+    Option("seed", "environment", 42, "`trial.seed`, if you set it; otherwise each episode has a random seed, which the recording holds"),
+    # policies
+    Option("policy_mapping", "policies", dict, "`trial.players`: `Human` → `human`, `Random` → `random`, else a class in `agent.py` or a file of `policies/`; exactly one player is human"),
+    Option("load_policy_fn", "policies", None, "called on the server, once for each policy; a path is that of the copy in the project"),
+    Option("policy_inference_fn", "policies", None, "called on the server, on a thread of its own for each player"),
+    Option("frame_skip", "policies", 4, "`trial.frameSkip`"),
+    Option("available_policies", "", dict, "kept; neither Interactive Gym nor Hippodrome reads it"),
+    Option("policy_configs", "", dict, "kept; neither Interactive Gym nor Hippodrome reads it"),
+    # gameplay
+    Option("num_episodes", "gameplay", 1, "`trial.maxEpisodes`"),
+    Option("action_mapping", "gameplay", dict, "`trial.keys`; a tuple of keys becomes `ArrowLeft+ArrowUp`"),
+    Option("human_id", "gameplay", None, "the player that is human, if `policy_mapping` is empty"),
+    Option("default_action", "gameplay", None, "`trial.idleAction`"),
+    Option("action_population_method", "gameplay", ActionSettings.DefaultAction, "`DefaultAction`: nothing to write. `PreviousSubmittedAction` with `SingleKeystroke`: `trial.actionBufferLifespan: 10000`; with `PressedKeys` it makes no difference, since the server knows which keys are held"),
+    Option("input_mode", "gameplay", InputModes.PressedKeys, "`trial.input`: `PressedKeys` → `held`, `SingleKeystroke` → `single`"),
+    Option("game_has_composite_actions", "", False, "follows from `action_mapping`"),
+    Option("callback", "gameplay", None, "[callbacks](callbacks.md) of the project's `agent.py` call it with a `RemoteGame`; `remote_game.record(name, value)` writes into the recording, and so does what a method returns"),
+    Option("reset_freeze_s", "gameplay", 0, "`trial.resetFreeze`"),
+    # rendering
+    Option("env_to_state_fn", "rendering", None, "called by `render()` of the project's `agent.py`; its objects are drawn by the [browser](objects.md). Without it, `env.render()` is shown"),
+    Option("preload_specs", "rendering", None, "as `assets_to_preload`"),
+    Option("hud_text_fn", "rendering", None, "called by `render()`; the text stands beside the score"),
+    Option("location_representation", "rendering", "relative", "`trial.scene.coordinates`"),
+    Option("game_width", "rendering", 600, "`trial.scene.width`"),
+    Option("game_height", "rendering", 400, "`trial.scene.height`"),
+    Option("fps", "rendering", 10, "`trial.startingFrameRate`"),
+    Option("background", "rendering", "#FFFFFF", "`trial.scene.background`"),
+    Option("state_init", "rendering", list, "objects of each episode's first picture, which stay"),
+    Option("assets_dir", "rendering", "./static/assets/", "where images are looked for; those that are found are copied to the project's `assets/`"),
+    Option("assets_to_preload", "rendering", list, "images and atlases are copied to the project's `assets/` under the `name` of each"),
+    Option("animation_configs", "rendering", list, "`animations` of the atlas of the sprite sheet; they repeat for ever, whatever `repeat` says"),
+    # hosting
+    Option("host", "hosting", None, "no effect", "on one machine a study is held for that machine only; for others deploy it (docs/aws.md)"),
+    Option("port", "hosting", 8000, "the port of `python experiment.py`"),
+    Option("max_concurrent_games", "hosting", 1, "`project.maxServers`, if you set it"),
+    Option("max_ping", "hosting", None, "no effect", "no participant is turned away for a slow connection; what a connection cannot carry is left out of its pictures"),
+    Option("min_ping_measurements", "", 5, "no effect", "no participant is turned away for a slow connection"),
+    # user_experience
+    Option("page_title", "user_experience", "interactive-gym", "`project.name`"),
+    Option("instructions_html_file", "user_experience", None, "a page of `steps/`, named by `trial.instructions`: it is shown before the game, and can be read again in a pause"),
+    Option("instructions", "user_experience", "", "the same, as text or HTML"),
+    Option("experiment_end_redirect_url", "user_experience", None, "a link on the last page, and after `redirect_timeout` the browser goes there"),
+    Option("end_game_redirect_url", "user_experience", None, "an older name of `experiment_end_redirect_url`"),
+    Option("waitroom_timeout_redirect_url", "user_experience", None, "no effect", _LOBBY),
+    Option("append_subject_id_to_redirect", "user_experience", False, "the participant's id is appended to that address"),
+    Option("append_subject_name_to_redirect", "user_experience", False, "an older name of `append_subject_id_to_redirect`"),
+    Option("redirect_timeout", "user_experience", 5000, "milliseconds until the last page leads on"),
+    Option("waitroom_timeout", "user_experience", None, "no effect", _LOBBY),
+    Option("waitroom_time_randomization_interval_s", "user_experience", (0, 0), "no effect", _LOBBY),
+    Option("welcome_header_text", "user_experience", "", "the heading of the first page, `steps/welcome.html`"),
+    Option("welcome_text", "user_experience", "", "the text of the first page"),
+    Option("game_header_text", "user_experience", "", "the heading of the instructions"),
+    Option("game_page_text", "user_experience", "", "a part of the instructions"),
+    Option("game_page_html_fn", "user_experience", None, "called once when the project is made, for the human player; its HTML is a part of the instructions"),
+    Option("between_episode_header", "", "", "the heading of the page between two episodes, named by `trial.betweenEpisodes`"),
+    Option("between_episode_text", "", "", "the text of that page"),
+    Option("final_page_header_text", "user_experience", "", "the heading of the last page, `steps/final.html`"),
+    Option("final_page_text", "user_experience", "", "the text of the last page"),
+    Option("reset_timeout", "", 3000, "`trial.betweenEpisodes`: milliseconds there, seconds here"),
+    # logging
+    Option("logfile", "logging", "./server_log.log", "no effect", "the logs of `make run` are in the folder that it names, and those on AWS come from `make logs`"),
+    # pyodide
+    Option("run_through_pyodide", "pyodide", False, "no effect", _PYODIDE),
+    Option("environment_initialization_code", "pyodide", "", "without an `env_creator`, run on the server; its variable `env` is the environment"),
+    Option("packages_to_install", "pyodide", list, "lines of the project's `requirements.txt`"),
+)  # fmt: skip
+
+BY_NAME = {option.name: option for option in OPTIONS}
+METHODS = tuple(dict.fromkeys(option.method for option in OPTIONS if option.method))
+
+
+def of_method(method: str) -> tuple[str, ...]:
+    """The names of the options that a method sets, in order."""
+    return tuple(option.name for option in OPTIONS if option.method == method)
+
+
+def table() -> str:
+    """The options as a table in Markdown."""
+    rows = ["| option of `RemoteConfig` | set by | what becomes of it |", "|---|---|---|"]
+    for option in OPTIONS:
+        why = f": {option.ignored}" if option.ignored else ""
+        rows.append(
+            f"| `{option.name}` | {f'`{option.method}()`' if option.method else 'attribute'} | {option.becomes}{why} |"
+        )
+    return "\n".join(rows) + "\n"
+
+
+_ASSERTIONS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "location_representation": (lambda value: value in ("relative", "pixels"), "must be relative or pixels"),
+    "num_episodes": (lambda value: type(value) is int and value >= 1, "must be a whole number of at least 1"),
+    "max_concurrent_games": (lambda value: value >= 1, "must be at least 1"),
+    "run_through_pyodide": (lambda value: isinstance(value, bool), "must be true or false"),
+}
+
+
+def wrong(name: str, value: Any) -> str | None:
+    """What is wrong with a value by itself, as Interactive Gym has it."""
+    good, sentence = _ASSERTIONS.get(name, (lambda _: True, ""))
+    return None if good(value) else f"{name} {sentence}, not {value!r}"
+
+
+if __name__ == "__main__":
+    print(table(), end="")

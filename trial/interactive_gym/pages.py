@@ -1,0 +1,106 @@
+"""The pages of steps/ that an experiment's texts become."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from trial.interactive_gym.remote_config import RemoteConfig
+
+_LINKED = re.compile(r'(?P<before>\b(?:src|href)=")(?P<path>[^":#?{}]+\.[A-Za-z0-9]+)(?=")')
+_TAG = re.compile(r"<[A-Za-z/!]")
+_JINJA = re.compile(r"\{[{%#]")
+
+Locate = Callable[[str], Path | None]
+"""Where a file that an option names lies; None if it is not found."""
+
+
+def welcome(config: RemoteConfig) -> str:
+    """The first page."""
+    heading = config.welcome_header_text or config.page_title
+    return _page(heading, config.welcome_text, plain="<p>Press the button to begin.</p>")
+
+
+def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, remark: Callable[[str], None]) -> str:
+    """What is shown before the game; empty if there is nothing. `human` is the name of the human player."""
+    parts = []
+    if config.instructions_html_file is not None:
+        path = locate(config.instructions_html_file)
+        if path is None:
+            remark(f"instructions_html_file: there is no {config.instructions_html_file}")
+        else:
+            parts.append(path.read_text(encoding="utf-8"))
+    parts += [config.instructions, config.game_page_text]
+    if config.game_page_html_fn is not None:
+        game.human_players = {human: "participant"}
+        try:
+            parts.append(str(config.game_page_html_fn(game, "participant")))
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            remark(f"game_page_html_fn is left out; it raises {type(error).__name__}: {error}")
+    parts = [part for part in parts if part.strip()]
+    return _page(config.game_header_text or "How to play", *parts) if parts else ""
+
+
+def between(config: RemoteConfig) -> str:
+    """The page between two episodes; empty if there is none."""
+    if not (config.between_episode_header or config.between_episode_text):
+        return ""
+    return _page(config.between_episode_header, config.between_episode_text)
+
+
+def final(config: RemoteConfig) -> str:
+    """The last page, which leads on if the experiment says where."""
+    page = _page(config.final_page_header_text or "Thank you!", config.final_page_text, plain="<p>This is the end.</p>")
+    address = config.experiment_end_redirect_url or config.end_game_redirect_url
+    if not address:
+        return page
+    appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect
+    whose = "{{ participant.userId|urlencode }}" if appended else ""
+    target = raw(html.escape(address, quote=True)) + whose
+    return page + (
+        f'<p><a id="onward" href="{target}">Go on</a></p>\n'
+        "<script>\n"
+        '  const onward = document.getElementById("onward");\n'
+        f"  setTimeout(() => location.assign(onward.href), {max(0, round(config.redirect_timeout))});\n"
+        "</script>\n"
+    )
+
+
+def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:
+    """The page with its pictures and styles beside it: those that are found are added to `files`."""
+
+    def beside(found: re.Match[str]) -> str:
+        path = locate(found["path"])
+        if path is None:
+            return found[0]
+        files[f"steps/{path.name}"] = path.read_bytes()
+        return f"{found['before']}{path.name}"
+
+    return _LINKED.sub(beside, page)
+
+
+def raw(text: str) -> str:
+    """The text as a template shows it unchanged."""
+    return "{% raw %}" + text + "{% endraw %}" if _JINJA.search(text) else text
+
+
+def as_html(text: str) -> str:
+    """HTML as it is; plain text in paragraphs."""
+    if _TAG.search(text):
+        return text
+    return "\n".join(f"<p>{html.escape(part.strip(), quote=False)}</p>" for part in text.split("\n\n") if part.strip())
+
+
+def _page(heading: str, *parts: str, plain: str = "") -> str:
+    shown = [as_html(part) for part in parts if part.strip()] or [plain]
+    title = f"<h1>{html.escape(heading, quote=False)}</h1>" if heading and "<h1" not in "".join(shown) else ""
+    return raw("\n".join(part for part in (title, *shown) if part)) + "\n"
+
+
+def quoted(text: str) -> str:
+    """The text as a value of Python and of JSON."""
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,273 @@
+"""Plays an experiment's environment: the agent and the policies of the project that `server_app.run` makes.
+
+The generated agent.py takes them from `on_server.py`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from protocol import environment as variables
+from trial.interactive_gym import callback as ig_callback
+from trial.interactive_gym.configuration_constants import PolicyTypes
+from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.remote_game import RemoteGame
+
+
+class Unplayable(ValueError):
+    """The experiment cannot be played here. The message is for the researcher."""
+
+
+class Several:
+    """An environment with several players, as PettingZoo's `ParallelEnv` describes itself.
+
+    Its `agents` are those of the environment, if it says so.
+    """
+
+    def __init__(self, env: Any, players: Iterable[Any]) -> None:
+        self.env = env
+        self.possible_agents = list(players)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment itself."""
+        return getattr(self.env, "unwrapped", self.env)
+
+    def action_space(self, player: Any) -> Any:
+        """The space of a player's actions; None if it is not known."""
+        return space_of(self.env, "action_space", player)
+
+    def observation_space(self, player: Any) -> Any:
+        """The space of a player's observations; None if it is not known."""
+        return space_of(self.env, "observation_space", player)
+
+
+def space_of(env: Any, name: str, player: Any) -> Any:
+    """The space of a player: of a method, of a map by player, or one for all."""
+    for found in (getattr(env, name, None), getattr(env, f"{name}s", None)):
+        if callable(found) and not hasattr(found, "sample"):
+            try:
+                return found(player)
+            except (KeyError, TypeError, NotImplementedError):
+                continue
+        several = getattr(found, "spaces", found)  # "in" asks a Dict space for whole samples
+        if isinstance(several, Mapping):
+            if player in several:
+                return several[player]
+        elif found is not None:
+            return found
+    return None
+
+
+def mapping_of(config: RemoteConfig) -> dict[Any, Any]:
+    """`policy_mapping`, or what `human_id` says where it is empty."""
+    if config.policy_mapping:
+        return dict(config.policy_mapping)
+    return {"player_0" if config.human_id is None else config.human_id: PolicyTypes.Human}
+
+
+def make_environment(config: RemoteConfig) -> Any:
+    """A new environment, as Interactive Gym makes it. Raises Unplayable without a way to, and what the code raises."""
+    if config.env_creator is not None:
+        return config.env_creator(**config.env_config, render_mode="rgb_array")
+    if config.environment_initialization_code:
+        names: dict[str, Any] = {"__name__": "environment_initialization"}
+        exec(compile(config.environment_initialization_code, "environment_initialization_code", "exec"), names)  # noqa: S102 - the researcher's own code
+        if "env" not in names:
+            raise Unplayable("environment_initialization_code makes no variable env")
+        return names["env"]
+    raise Unplayable("there is no environment: give environment(env_creator=…) a function that makes it")
+
+
+class ExperimentAgent:
+    """The agent of an experiment: what docs/agent.md asks of a class `Agent`."""
+
+    def __init__(self, config: RemoteConfig, locate: Callable[[Any], Any] = lambda name: name) -> None:
+        """`locate` turns a policy's name into the path of its file in the project, if it is one."""
+        self._config = config
+        self._locate = locate
+        self._raw: Any = None
+        self._first = True
+        self._late_start: Callable[[], None] | None = None
+        self.game: RemoteGame | None = None
+        self.env: Any = None
+        self.several = False
+
+    # ---- the five methods
+
+    def start(self, _game: str | None = None) -> Any:
+        """Make the environment."""
+        config = self._config
+        self._raw = make_environment(config)
+        players = mapping_of(config)
+        self.several = len(players) > 1 or _has_players(self._raw)
+        self.game = RemoteGame(config, self._raw, players, os.environ.get(variables.USER_ID, ""))
+        self.env = Several(self._raw, players) if self.several else self._raw
+        return self.env
+
+    def reset(self, seed: int | None = None) -> Any:
+        """Begin an episode."""
+        game = self._game
+        for key in game.human_players:
+            game.human_players[key] = os.environ.get(variables.USER_ID, "")
+        result = self._raw.reset(seed=seed)
+        observation, infos = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
+        game.began(observation, infos)
+        self._first = True
+        return observation, infos
+
+    def step(self, action: Any) -> Any:
+        """Take one step: with an action, or with one for each player."""
+        game = self._game
+        result = tuple(self._raw.step(action))
+        actions = action if isinstance(action, Mapping) else dict.fromkeys(mapping_of(self._config), action)
+        game.stepped(actions, result)
+        return result
+
+    def render(self) -> Any:
+        """The present picture: objects with the HUD's text, or pixels."""
+        config, game = self._config, self._game
+        hud = "" if config.hud_text_fn is None else str(config.hud_text_fn(game))
+        if config.env_to_state_fn is None:
+            return self._raw.render()
+        found = [
+            each.as_dict() if hasattr(each, "as_dict") else each for each in config.env_to_state_fn(self._raw, config)
+        ]
+        pixels = next((each for each in found if _kind(each) == "rendered_env_rgb"), None)
+        if pixels is not None:
+            return _pixels(pixels)
+        if self._first:
+            self._first = False
+            found = [*({**_fields(each), "permanent": True} for each in config.state_init), *found]
+        return {"objects": found, "hud": hud}
+
+    def close(self) -> None:
+        """Free the environment."""
+        close = getattr(self._raw, "close", None)
+        if callable(close):
+            close()
+
+    @property
+    def _game(self) -> RemoteGame:
+        assert self.game is not None, "start() comes first"
+        return self.game
+
+
+class ListeningAgent(ExperimentAgent):
+    """The agent of an experiment with a callback, which it calls as Interactive Gym does.
+
+    `on_game_tick_start` sees the state before a step, which is the one after the step before it. So it is called at
+    the end of that step.
+    """
+
+    def on_episode_start(self, session: Any) -> Any:
+        """The environment has been reset."""
+        self._tell(session, "on_episode_start", "on_game_tick_start")
+
+    def on_tick(self, session: Any) -> Any:
+        """A step has been taken."""
+        more = () if self._game.over else ("on_game_tick_start",)
+        self._tell(session, "on_game_tick_end", "on_graphics_start", "on_graphics_end", *more)
+
+    def on_episode_end(self, session: Any) -> Any:
+        """The episode is over."""
+        self._tell(session, "on_episode_end")
+
+    def on_session_end(self, session: Any) -> Any:
+        """The trial is over. Interactive Gym tells of the end of a game only where it is left in the middle."""
+        if not self._game.over:
+            self._tell(session, "on_game_end")
+
+    def _tell(self, session: Any, *events: str) -> None:
+        """Call these methods of the callback. What one returns is recorded. Raises what they raise, after the last."""
+        game, raised = self._game, []
+        game.record = session.record
+        for event in events:
+            method = getattr(self._config.callback, event, None)
+            if callable(method):
+                try:
+                    value = method(game)
+                except Exception as error:  # noqa: BLE001 - the callback's others are called all the same
+                    raised.append(error)
+                else:
+                    if value is not None:
+                        session.record(event, value)
+        if raised:
+            raise raised[0]
+
+
+def agent_class(config: RemoteConfig, locate: Callable[[Any], Any]) -> type:
+    """The class `Agent` of the project's agent.py."""
+    base = ExperimentAgent if config.callback is None else ListeningAgent
+
+    class Agent(base):  # type: ignore[misc, valid-type]
+        """The experiment's agent."""
+
+        def __init__(self) -> None:
+            super().__init__(config, locate)
+
+    return Agent
+
+
+def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]) -> type:
+    """A class of the project's agent.py that plays this player by the experiment's functions."""
+
+    class Policy:
+        """A policy of the experiment."""
+
+        def __init__(self) -> None:
+            plays = locate(config.policy_mapping[player])
+            self._policy = plays if config.load_policy_fn is None else config.load_policy_fn(plays)
+
+        def act(self, observation: Any, _info: Any) -> int:
+            """The action that the experiment's function chooses."""
+            if config.policy_inference_fn is not None:
+                return int(config.policy_inference_fn(observation, self._policy))
+            return int(self._policy(observation))
+
+    return Policy
+
+
+def located(folder: Path) -> Callable[[Any], Any]:
+    """A function that turns the name of a policy into the path of its file in the project's folder, if it has one."""
+
+    def locate(name: Any) -> Any:
+        if isinstance(name, str | os.PathLike):
+            for path in (folder / name, folder / "policies" / Path(name).name):
+                if path.is_file():
+                    return str(path)
+        return name
+
+    return locate
+
+
+def events_of(callback: Any) -> list[str]:
+    """The events of Interactive Gym that a callback handles with a method of its own."""
+    plain = ig_callback.GameCallback
+    return [
+        event
+        for event in ig_callback.EVENTS
+        if getattr(type(callback), event, None) not in (None, getattr(plain, event))
+    ]
+
+
+def _has_players(env: Any) -> bool:
+    spaces = getattr(env, "action_spaces", None)
+    return isinstance(spaces, Mapping) or bool(getattr(env, "possible_agents", None))
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return dict(value.as_dict() if hasattr(value, "as_dict") else value)
+
+
+def _kind(value: Any) -> Any:
+    return value.get("object_type") if isinstance(value, Mapping) else None
+
+
+def _pixels(value: Mapping[str, Any]) -> Any:
+    import numpy as np  # noqa: PLC0415 - only where pixels are drawn
+
+    return np.asarray(value["game_image"], np.uint8)

@@ -1,0 +1,235 @@
+"""Makes a project of an experiment: config.yml, steps/, agent.py, and copies of the experiment's own files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from trial.interactive_gym import assets, looking, options, pages, playing, sources
+from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
+from trial.interactive_gym.looking import Look
+from trial.interactive_gym.playing import Unplayable
+from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.sources import MADE, Source
+
+LONGEST_BUFFER = 10_000
+"""Steps: the most that `actionBufferLifespan` may be."""
+_NO_ID = re.compile(r"[^A-Za-z0-9_-]+")
+_MADE_BY = "made by `python {file}`; change that file and run it again"
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A project that was made."""
+
+    folder: Path
+    remarks: list[str] = field(default_factory=list)
+    """What has no effect, or is not as in Interactive Gym."""
+
+
+def make(config: RemoteConfig, folder: Path | None = None) -> Made:
+    """Make the project in `folder`, or beside the experiment's file.
+
+    A file that was changed by hand since it was made stays. Raises Unplayable if the experiment cannot be played here
+    or the folder holds something else, OSError, and what the experiment's code raises.
+    """
+    source = sources.find(config)
+    target = (folder or source.file.parent / f"{_id(source.file.stem)}-study").resolve()
+    remarks: list[str] = []
+    files = files_of(config, source, target, remarks.append)
+    remarks += ignored(config)
+    remarks += write(target, files)
+    return Made(target, remarks)
+
+
+def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callable[[str], None]) -> dict[str, bytes]:
+    """The project's files, by their paths there. Raises Unplayable, and what the experiment's code raises."""
+    look = looking.look(config)
+    looking.check_actions(config, look.actions)
+    find = sources.locate(source)
+    own, said = sources.belonging(source, target)
+    for sentence in said:
+        remark(sentence)
+    files = {name: path.read_bytes() for name, path in own.items()}
+    for name in files.keys() & {"agent.py", "config.yml"}:
+        raise Unplayable(
+            f"there is a {name} beside {source.file.name}, and the project needs one of its own: rename it"
+        )
+    players = _players(config, look, find, files, remark)
+    files |= {f"assets/{name}": data for name, data in assets.of(config, find, remark).items()}
+    steps = {
+        "welcome": pages.welcome(config),
+        "final": pages.final(config),
+        "instructions": pages.instructions(config, look.game, look.human, find, remark),
+        "between": pages.between(config),
+    }
+    for name, page in steps.items():
+        if page:
+            files[f"steps/{name}.html"] = pages.with_files(page, find, files).encode()
+    trial = trial_section(config, look, looking.names_of(config, look.actions, source.names))
+    if steps["instructions"]:
+        trial["instructions"] = "instructions"
+    if steps["between"]:
+        trial["betweenEpisodes"] = "between"
+    if look.several:
+        trial["players"] = {str(player): plays for player, (plays, _) in players.items()}
+    document = {"project": _project(config, source), "trial": trial}
+    files["config.yml"] = _yaml(document, source).encode()
+    files["agent.py"] = agent_file(source, [(name, key) for key, (_, name) in players.items() if name]).encode()
+    if "requirements.txt" not in files:
+        lines = sources.requirements(own.values(), config.packages_to_install)
+        files["requirements.txt"] = "".join(f"{line}\n" for line in lines).encode()
+    if config.default_action is None:
+        remark("there is no default_action: while no key is pressed, noop or else action 0 is taken")
+    return files
+
+
+def ignored(config: RemoteConfig) -> list[str]:
+    """Sentences about options that the experiment sets and that have no effect here."""
+    return [
+        f"{option.name} has no effect: {option.ignored}"
+        for option in options.OPTIONS
+        if option.ignored and option.name in config.given and getattr(config, option.name) != option.fresh()
+    ]
+
+
+def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[str, Any]:
+    """The section `trial` of config.yml, but for pages and players. `names` are those of the actions."""
+    trial: dict[str, Any] = {
+        "game": config.env_name or "experiment",
+        "maxEpisodes": config.num_episodes,
+        "startingFrameRate": round(config.fps),
+        "minFrameRate": 1,
+        "maxFrameRate": max(90, round(config.fps)),
+        "actionSpace": names,
+        "betweenEpisodes": config.reset_timeout / 1000 if config.reset_timeout % 1000 else config.reset_timeout // 1000,
+    }
+    if config.default_action is not None:
+        trial["idleAction"] = names[int(config.default_action)]
+    if config.action_mapping:
+        trial["keys"] = {_keys(key): names[int(action)] for key, action in config.action_mapping.items()}
+    if config.input_mode == InputModes.SingleKeystroke:
+        trial["input"] = "single"
+        if config.action_population_method == ActionSettings.PreviousSubmittedAction:
+            trial["actionBufferLifespan"] = LONGEST_BUFFER
+    if look.several:
+        trial["frameSkip"] = config.frame_skip
+    if config.reset_freeze_s:
+        trial["resetFreeze"] = config.reset_freeze_s
+    if "seed" in config.given:
+        trial["seed"] = config.seed
+    if look.objects:
+        trial["scene"] = {
+            "width": round(config.game_width),
+            "height": round(config.game_height),
+            "background": config.background,
+            "coordinates": config.location_representation,
+        }
+    return trial
+
+
+def agent_file(source: Source, policies: list[tuple[str, Any]]) -> str:
+    """The project's agent.py: the experiment's agent, and a class for each policy: its name and the player."""
+    lines = [
+        f'"""The agent of {source.file.name}, {_MADE_BY.format(file=source.file.name)}."""',
+        "",
+        "from trial.interactive_gym import on_server",
+        "",
+        f"_experiment = on_server.load(__file__, {pages.quoted(source.module)}, {pages.quoted(source.variable)})",
+        "",
+        "Agent = _experiment.agent()",
+        *(f"{name} = _experiment.policy({player!r})" for name, player in policies),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
+    """Write the files, and remove those of an earlier time that are there no more; sentences about what was kept.
+
+    Raises Unplayable if the folder holds something that was not made here, and OSError.
+    """
+    made = folder / MADE
+    if folder.exists() and any(folder.iterdir()) and not made.is_file():
+        raise Unplayable(f"{folder} holds something else; give server_app.run(config, project=…) another folder")
+    before: dict[str, str] = json.loads(made.read_text()) if made.is_file() else {}
+    kept = []
+    now = {}
+    for name, data in files.items():
+        path = folder / name
+        now[name] = _hash(data)
+        if path.is_file() and name in before and _hash(path.read_bytes()) not in (before[name], now[name]):
+            kept.append(f"{path} was changed by hand and stays; delete it to have it made anew")
+            now[name] = before[name]
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    for name in before.keys() - files.keys():
+        path = folder / name
+        if path.is_file() and _hash(path.read_bytes()) == before[name]:
+            path.unlink()
+    made.write_text(json.dumps(now, indent=0, sort_keys=True))
+    return kept
+
+
+def _players(
+    config: RemoteConfig,
+    look: Look,
+    find: Callable[[Any], Path | None],
+    files: dict[str, bytes],
+    remark: Callable[[str], None],
+) -> dict[Any, tuple[str, str]]:
+    """By player: what `trial.players` says, and the name of a class in agent.py, if there is one.
+
+    Files of policies are added to `files`.
+    """
+    found: dict[Any, tuple[str, str]] = {}
+    for number, (player, plays) in enumerate(playing.mapping_of(config).items()):
+        if isinstance(plays, str) and plays in (PolicyTypes.Human, PolicyTypes.Random):
+            found[player] = (plays, "")
+            continue
+        file = find(plays) if isinstance(plays, str) and ("/" in plays or "." in plays) else None
+        if file is not None and file.is_file():
+            files[f"policies/{file.name}"] = file.read_bytes()
+        elif isinstance(plays, str) and plays.endswith(".onnx"):
+            remark(f"the policy of {player} is not found: {plays}")
+        if looking.is_file(config, plays) and not look.dict_observations:
+            found[player] = (f"sample:policies/{Path(plays).name}", "")
+        else:
+            found[player] = (f"agent:Policy{number}", f"Policy{number}")
+    return found
+
+
+def _project(config: RemoteConfig, source: Source) -> dict[str, Any]:
+    named = "page_title" in config.given
+    project: dict[str, Any] = {
+        "id": _id(config.env_name or source.file.stem),
+        "name": config.page_title if named else source.file.stem.replace("_", " "),
+        "steps": {1: "welcome", 2: "game", "finalStep": "final"},
+    }
+    if "max_concurrent_games" in config.given:
+        project["maxServers"] = config.max_concurrent_games
+    return project
+
+
+def _id(name: str) -> str:
+    return _NO_ID.sub("-", name.replace("_", "-")).strip("-_")[:60] or "experiment"
+
+
+def _keys(key: Any) -> str:
+    return "+".join(map(str, key)) if isinstance(key, tuple) else str(key)
+
+
+def _yaml(document: Mapping[str, Any], source: Source) -> str:
+    import yaml  # noqa: PLC0415 - servers do without
+
+    head = f"# {source.file.name}, {_MADE_BY.format(file=source.file.name)}.\n\n"
+    return head + yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,100 @@
+"""What Interactive Gym's callbacks and functions are given: the game as it stands."""
+
+from __future__ import annotations
+
+import collections
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+class GameStatus:
+    """Where the game is."""
+
+    Done = "done"
+    Active = "active"
+    Inactive = "inactive"
+    Reset = "reset"
+
+
+def _unrecorded(name: str, value: Any) -> None:
+    """Outside a callback nothing can be recorded."""
+
+
+class RemoteGame:
+    """The game, with Interactive Gym's attributes. Read it; what is changed here changes nothing.
+
+    `current_ping` is always 0, and `document_focus_status` always true: neither is measured here.
+    """
+
+    def __init__(self, config: Any, env: Any, players: Mapping[Any, Any], subject: str = "") -> None:
+        """`players` is `policy_mapping`, with the loaded policies in place of their names."""
+        self.config = config
+        self.env = env
+        self.status = GameStatus.Inactive
+        self.obs: Any = None
+        self.game_id: Any = 0
+        self.game_uuid = str(uuid.uuid4())
+        self.tick_num = 0
+        self.episode_num = 0
+        self.human_players = {key: subject for key, plays in players.items() if plays == "human"}
+        self.bot_players = {key: plays for key, plays in players.items() if plays != "human"}
+        self.episode_rewards: dict[Any, float] = collections.defaultdict(float)
+        self.total_rewards: dict[Any, float] = collections.defaultdict(float)
+        self.total_positive_rewards: dict[Any, float] = collections.defaultdict(float)
+        self.total_negative_rewards: dict[Any, float] = collections.defaultdict(float)
+        self.prev_rewards: dict[Any, float] = {}
+        self.prev_actions: dict[Any, Any] = {}
+        self.current_infos: Any = {}
+        self.terminateds: Any = False
+        self.truncateds: Any = False
+        self.current_ping: dict[Any, int] = collections.defaultdict(int)
+        self.document_focus_status: dict[Any, bool] = collections.defaultdict(lambda: True)
+        self.record: Callable[[str, Any], None] = _unrecorded
+        """In a callback: `record(name, value)` writes a value into the recording (docs/callbacks.md)."""
+
+    @property
+    def observation(self) -> Any:
+        """What the environment returned last."""
+        return self.obs
+
+    @property
+    def rewards(self) -> dict[Any, float]:
+        """Of the last step."""
+        return self.prev_rewards
+
+    def began(self, observation: Any, infos: Any) -> None:
+        """The environment has been reset."""
+        self.status = GameStatus.Active
+        self.obs, self.current_infos = observation, infos
+        self.prev_rewards, self.prev_actions = {}, {}
+        self.terminateds = self.truncateds = False
+        self.tick_num = 0
+        self.episode_num += 1
+        self.episode_rewards = collections.defaultdict(float)
+
+    def stepped(self, actions: Mapping[Any, Any], result: tuple[Any, Any, Any, Any, Any]) -> None:
+        """A step has been taken."""
+        self.obs, rewards, self.terminateds, self.truncateds, self.current_infos = result
+        self.prev_actions = dict(actions)
+        self.prev_rewards = rewards if isinstance(rewards, dict) else {"reward": rewards}
+        for key, reward in (rewards if isinstance(rewards, dict) else {0: rewards}).items():
+            self.episode_rewards[key] += reward
+            self.total_rewards[key] += reward
+            self.total_positive_rewards[key] += max(0, reward)
+            self.total_negative_rewards[key] += min(0, reward)
+        self.tick_num += 1
+        if self.over:
+            last = self.episode_num >= self.config.num_episodes
+            self.status = GameStatus.Done if last else GameStatus.Reset
+
+    @property
+    def over(self) -> bool:
+        """The episode has ended for all."""
+        return _all(self.terminateds) or _all(self.truncateds)
+
+
+def _all(ended: Any) -> bool:
+    if isinstance(ended, Mapping):
+        return bool(ended.get("__all__", bool(ended) and all(ended.values())))
+    return bool(ended)

@@ -1,0 +1,79 @@
+"""`server_app.run(config)`: makes a project of an experiment and holds it on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from trial.interactive_gym import on_server
+from trial.interactive_gym.playing import Unplayable
+from trial.interactive_gym.project import make
+from trial.interactive_gym.remote_config import RemoteConfig
+
+_HIPPODROME = Path(__file__).resolve().parents[2]
+_END_SECONDS = 60
+
+
+def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bool = True) -> Path | None:
+    """Make the experiment's project, say where, and hold it until Ctrl-C.
+
+    `project` is its folder, by default one beside the experiment's file. Without `serve` it is only made. Returns the
+    folder. On a server, where the experiment's file is loaded again, it does nothing. Ends Python with a sentence and
+    exit status 1 if the experiment cannot be played here.
+    """
+    if on_server.is_loading():
+        return None
+    try:
+        if not isinstance(config, RemoteConfig):
+            raise Unplayable(f"run() takes a RemoteConfig, not {type(config).__name__}")
+        made = make(config, None if project is None else Path(project))
+    except Unplayable as error:
+        sys.exit(f"This experiment cannot be played here: {error}")
+    for remark in made.remarks:
+        print(f"Remark: {remark}")
+    folder = shlex.quote(str(made.folder))
+    print(f"The project is in {made.folder}.")
+    print(f"Check it with `make check PROJECT={folder}`; deploy it as docs/aws-project.md says.", flush=True)
+    if serve:
+        _hold(made.folder, config.port)
+    return made.folder
+
+
+def _hold(folder: Path, port: int) -> None:
+    """Hold the project by local mode, which says where participants find it, until Ctrl-C."""
+    if importlib.util.find_spec("local") is None and not (_HIPPODROME / "local").is_dir():
+        sys.exit("The project cannot be held here: there is no Hippodrome beside this package.")
+    command = [sys.executable, "-m", "local", str(folder), "--port", str(port), "--data", str(folder / "data")]
+    paths = [str(_HIPPODROME), *filter(None, [os.environ.get("PYTHONPATH")])]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)})  # noqa: S603 - ours
+    previous = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        status = _end(process)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    if status:
+        sys.exit(status)
+
+
+def _interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """End local mode, which stores what is to be stored. A second Ctrl-C waits for it too."""
+    for wanted in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is None:
+            process.send_signal(wanted)
+        with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):
+            process.wait(_END_SECONDS)
+            return 0
+    return 1
