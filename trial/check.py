@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protocol import environment
+from protocol.trial import check
 from trial.agent import tracebacks
 from trial.server import process_group
 
@@ -105,12 +106,17 @@ def _try(file: Path, report: Path) -> None:
 def _play(folder: Path, section: Mapping[str, Any]) -> None:
     from trial.agent.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
     from trial.agent.starting import start  # noqa: PLC0415
+    from trial.pictures import assets  # noqa: PLC0415
+    from trial.pictures.reader import PictureReader  # noqa: PLC0415
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
+
+    scene = check(dict(section))[0].scene
+    reader = PictureReader(scene, assets.load(folder, scene.assets) if scene is not None else assets.Assets())
 
     # One player takes the first action alone, which every game has.
     names = tuple(section.get("actionSpace") or ("noop",))
     teams = _teams(section.get("players") or {})
-    adapter = AgentAdapter(folder, section.get("game") or DEFAULT_GAME, names)
+    adapter = AgentAdapter(folder, section.get("game") or DEFAULT_GAME, names, reader)
     player = start(adapter, tuple(map(str, teams[0])))
     if isinstance(player, AgentAdapter):
         player.reset(1)

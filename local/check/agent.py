@@ -166,6 +166,7 @@ class _Reading:
             *self._arrows(),
             *self._slow(),
             *self._slow_policies(),
+            *self._undrawn(),
             *self._idle(),
             *self._not_on_aws(),
         ]
@@ -235,6 +236,16 @@ class _Reading:
                 found.append(self._in_config(self._player(player), message, remark=True))
         return found
 
+    def _undrawn(self) -> list[Diagnostic]:
+        """What in images and objects cannot be drawn. The game goes on without it."""
+        found = []
+        for sentence in self._report.get("undrawn", ()):
+            if sentence.startswith("render(): "):
+                found.append(self._at(self._place_of("render"), short(sentence), remark=True))
+            else:
+                found.append(self._in_config(("trial", "scene"), short(sentence), remark=True))
+        return found
+
     def _idle(self) -> list[Diagnostic]:
         """An action of no key that visibly does something. Told once, of the first group."""
         told = self._report.get("idle")
@@ -284,7 +295,7 @@ class _Reading:
                 )
             ]
         place = (self._name(error["file"]), error["line"]) if error["file"] else None
-        if error["type"] in ("AgentError", "FrameError"):
+        if error["type"] in ("AgentError", "FrameError", "SceneError"):
             return [self._breach(error["text"], place)]
         told = self._of_players(error, place)
         if told is not None:

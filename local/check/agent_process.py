@@ -32,6 +32,9 @@ from trial.agent.callbacks import About, Callbacks
 from trial.agent.joint import JointAdapter
 from trial.agent.starting import start
 from trial.core.players import PLAYER, Player, who_plays
+from trial.pictures import assets
+from trial.pictures.assets import Assets
+from trial.pictures.reader import PictureReader
 from trial.server import warm
 from trial.settings import trial_section
 
@@ -67,13 +70,13 @@ def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    adapter = AgentAdapter(folder, config.game, config.action_space)
+    progress = _Progress(report, folder)
+    adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     document = os.environ.pop("GIVEN", "")
     group = _group(document)
     plain, _Early.folder = os.environ.__class__, folder
     if document:
         os.environ.__class__ = _Early
-    progress = _Progress(report, folder)
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
     player: AgentAdapter | JointAdapter = progress.result
@@ -107,6 +110,13 @@ def _try(report: Path) -> None:
     played = _play(player, progress, reset, config.max_episodes)
     if played and _seen_idle(player, players, config, progress) and progress.call("close", player.close):
         progress.over()
+
+
+def _reader(config: Trial, folder: Path, progress: _Progress) -> PictureReader:
+    """Reads pictures, and notes what in the project's images and objects cannot be drawn."""
+    found = Assets() if config.scene is None else assets.load(folder, config.scene.assets)
+    progress.undrawn.extend(found.problems)
+    return PictureReader(config.scene, found, progress.undrawn.append)
 
 
 def _group(document: str) -> int | None:
@@ -231,6 +241,7 @@ class _Progress:
         self.action: Any = 0  # or by player
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
+        self.undrawn: list[str] = []
         self.callbacks: Any = None
         self._callback_errors: list[dict[str, Any]] = []
         self.pace = Pace()
@@ -267,6 +278,8 @@ class _Progress:
         far["pace"] = asdict(self.pace)
         if self.callbacks is not None:
             far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
+        if self.undrawn:
+            far["undrawn"] = self.undrawn
         part = self._report.with_suffix(".part")
         part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
         part.replace(self._report)

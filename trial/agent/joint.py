@@ -64,6 +64,7 @@ class JointAdapter:
         self._players = players
         self._turns = turns
         self._gone: set[str] = set()
+        self._first: dict[str, int] = {}  # the first legal action of those with a mask
         self._terminated: dict[str, bool] = {}
         self._truncated: dict[str, bool] = {}
         self.players: tuple[str, ...] = players.names
@@ -119,7 +120,7 @@ class JointAdapter:
         also of those who are not to act.
         """
         given = {
-            self._players.keys[player]: self._players.number(player, actions.get(player, 0))
+            self._players.keys[player]: self._players.number(player, actions.get(player, self._first.get(player, 0)))
             for player in self.players
             if player not in self._gone
         }
@@ -166,6 +167,7 @@ class JointAdapter:
         details = {player: _info(value) for player, value in told.items()}
         paid = self._by_player(method, rewards)
         masks = {} if over else self._masks(seen, details)
+        self._first = {player: mask.index(True) for player, mask in masks.items()}
         return Joint(
             observations=seen,
             infos=details,

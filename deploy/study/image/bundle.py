@@ -79,8 +79,8 @@ def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = 
     """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image.
 
     `base` is the image to build on instead of the Dockerfile's own. `trial` is the section of config.yml: its game and
-    options are what the agent is tried with while the image is built (trial/check.py). Where it says who plays whom,
-    that and the names of the actions count too, and nothing else.
+    options are what the agent is tried with while the image is built (trial/check.py). Where it says who plays whom, or
+    that objects are drawn, that and the names of the actions count too, and nothing else.
     """
     entries: dict[str, Path | bytes] = {
         "Dockerfile": _dockerfile(base),
@@ -102,7 +102,7 @@ def _dockerfile(base: str) -> bytes:
 
 
 def _tried_with(trial: Mapping[str, Any]) -> bytes:
-    keys = ("game", "options", *(("players", "actionSpace") if trial.get("players") else ()))
+    keys = ("game", "options", "scene", *(("players", "actionSpace") if trial.get("players") else ()))
     return json.dumps({key: trial[key] for key in keys if trial.get(key)}, sort_keys=True).encode()
 
 

@@ -191,6 +191,23 @@ def test_more_names_than_actions(folder: Path) -> None:
     assert tried(folder, "random") == []
 
 
+# ---- drawn by objects
+
+
+def test_a_scene_is_drawn_and_what_cannot_be_is_remarked(folder: Path) -> None:
+    objects = '[{"id": "a", "type": "circle", "x": 0.5, "y": 0.5, "radius": 4}, {"id": "b", "type": "sprite", "image": "cat", "x": 0, "y": 0}]'
+    (folder / "agent.py").write_text(AGENT.replace("numpy.zeros((8, 8, 3), numpy.uint8)", objects))
+    (line,) = tried(folder, "random")
+    assert line.endswith("render() returned objects; say in config.yml how large the picture is, as trial.scene")
+    (folder / "assets").mkdir()
+    (folder / "assets" / "cat.svg").write_text("<svg/>")
+    found = tried(folder, "random", "  game: none\n", "  game: none\n  scene: {width: 60, height: 40}\n")
+    assert [line.partition("remark: ")[2] for line in found] == [
+        "trial.scene: assets/cat.svg is no PNG, JPEG or WebP image; sprites show only these",
+        "render(): the object 'b' shows the image 'cat', which is not in assets/",
+    ]
+
+
 # ---- the action of no key
 
 WORLD = """
