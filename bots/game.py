@@ -15,11 +15,13 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from bots.account import Account, Play
+from trial.core.progress import NOT_POSSIBLE
 from trial.pictures.frames import Decoder
 from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecoder
 
 _ASSET, _SCENES = bytes([ASSET]), (bytes([SCENE]), bytes([PACKED_SCENE]))
 
+MOST_THINKING = 600.0  # seconds that another player's turn may take (policySeconds)
 QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
 
 
@@ -72,6 +74,8 @@ class Game:
         self._images: set[str] = set()  # hashes of those that were asked for
         self._hands: Hands | None = None
         self._state = ""
+        self._turns = False
+        self._to_act = True
         self._first = True
         self._last_frame: float | None = None
         self._may_stop = False
@@ -83,7 +87,8 @@ class Game:
         moving: asyncio.Task[None] | None = None
         try:
             while True:
-                async with asyncio.timeout(QUIET_SECONDS + self._break_seconds):
+                waits = MOST_THINKING if self._turns and not self._to_act else self._break_seconds
+                async with asyncio.timeout(QUIET_SECONDS + waits):
                     data = await self._websocket.recv()
                 if isinstance(data, bytes):
                     await self._frame(data)
@@ -121,7 +126,7 @@ class Game:
         if not self._first:  # the first picture may be one that an earlier connection has shown
             play.frames += 1
         self._first = False
-        if self._state == "playing":
+        if self._state == "playing" and not self._turns:  # turn by turn there is no rate at which pictures come
             if self._last_frame is not None:
                 play.seen += 1
                 play.seconds += now - self._last_frame
@@ -131,9 +136,10 @@ class Game:
 
     async def _told(self, message: dict[str, Any]) -> None:
         play = self._play
-        if "error" in message:
+        if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # which whoever presses keys at random hears
             self._account.troubles.append(f"the game says: {message['error']}")
         if "UI" in message:
+            self._turns = message.get("pace") == "turns"
             self._hands = Hands(self._random, message)
             await self._load(message.get("assets", ()))
             self._may_stop = "stop" in message["UI"]
@@ -141,6 +147,7 @@ class Game:
             play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)
         if "state" in message:
             self._state, play.score = message["state"], message.get("score", 0)
+            self._to_act = message.get("toAct", True)
             play.frame_rate = message.get("frameRate", play.frame_rate)
             self._break_seconds = message.get("nextIn", 0.0)
             if self._state in ("ready", "paused", "break"):
@@ -150,11 +157,14 @@ class Game:
                 await self._say({"command": "start"})
 
     async def _move(self, hands: Hands) -> None:
+        began: float | None = None
         while True:
             await asyncio.sleep(self._random.uniform(0.1, 0.5))
-            if self._state != "playing":
+            if self._state != "playing" or not self._to_act:
                 continue
-            if self._seconds and self._play.seconds >= self._seconds and self._may_stop:
+            began = began or time.monotonic()
+            played = time.monotonic() - began if self._turns else self._play.seconds
+            if self._seconds and played >= self._seconds and self._may_stop:
                 await self._say({"command": "stop"})
                 return
             for message in hands.move():

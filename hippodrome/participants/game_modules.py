@@ -20,6 +20,7 @@ def _has_scene(trial: Mapping[str, Any]) -> bool:
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "reading.js": lambda trial: any(isinstance(trial.get(key), str) for key in GAME_PAGES),
+    "turns.js": lambda trial: trial.get("pace") == "turns",
     "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),
     **dict.fromkeys(("painter.js", "scene.js", "sprites.js"), _has_scene),
 }

@@ -18,6 +18,8 @@ from trial.core.seeds import policy_seed
 from trial.core.turns import Turns
 
 _NO_ACTION = "that action is not in this game's actionSpace"
+NOT_POSSIBLE = "that move is not possible now"
+"""What a participant is told who, turn by turn, chooses an action that the environment's mask forbids."""
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
@@ -265,7 +267,7 @@ class Progress:
         if index is None or not self.playing or not self.turns.waits_for(player):
             return
         if not allowed(index, self._mask(player)):
-            raise CommandRefused("that move is not possible now")
+            raise CommandRefused(NOT_POSSIBLE)
         self.turns.choose(player, Action(index, controls.names[index], "human"))
 
     def _mask(self, player: str) -> Mask | None:

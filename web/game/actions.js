@@ -9,7 +9,10 @@ export const isRunning = () => game.state === "playing" || game.state === "break
 
 export function press(action, source) {
   if (game.state === "elsewhere") return;
-  if (!isRunning()) start();
+  if (!isRunning()) {
+    start();
+    if (hooks.starts()) return;
+  }
   const sources = held.get(action) ?? new Set();
   held.set(action, sources.add(source));
   if (sources.size === 1) send({ ...hooks.means(action), held: true });
@@ -31,7 +34,10 @@ export function releaseAll(tell = true) {
 
 // A single action that is not held.
 export function tap(action) {
-  if (!isRunning()) start();
+  if (!isRunning()) {
+    start();
+    if (hooks.starts()) return;
+  }
   send(hooks.means(action));
 }
 

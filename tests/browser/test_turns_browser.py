@@ -1,0 +1,51 @@
+"""A game that is played turn by turn, in a real Chromium."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.browser.test_pages_browser import FLAWS, World, play, shot, tab, tell, world
+
+__all__ = ["tab", "world"]  # fixtures
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+
+@pytest.fixture
+def in_turns(world: World) -> World:
+    world.trial = {"pace": "turns"}
+    world.controls = {"pace": "turns", "toAct": False, "player": "left", "players": ["left", "right"]}
+    return world
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
+def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, tab: Any, width: int, height: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    play(in_turns, tab)
+    tell(in_turns, state="playing", toAct=True, turnEndsIn=8.5)
+    tab.wait_for_selector("#turn:text('Your turn (9 s)')")
+    assert tab.inner_text("#announce") == "Your turn"
+    shot(tab, f"{width}-your-turn")
+    tab.wait_for_selector("#turn:text('Your turn (7 s)')")
+    tell(in_turns, state="playing", toAct=False)
+    tab.wait_for_selector("#turn:text('The other player\u2019s turn')")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-other-turn")
+    tell(in_turns, state="paused", toAct=False)
+    tab.wait_for_function("document.getElementById('turn').textContent === ''")
+
+
+def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) -> None:
+    play(in_turns, tab)
+    tell(in_turns, state="ready", toAct=False)
+    tab.wait_for_selector("#mode[data-state=ready]", state="attached")
+    before = len(in_turns.commands("action"))
+    tab.keyboard.press("ArrowUp")
+    in_turns.wait_for({"command": "start"})
+    tell(in_turns, state="playing", toAct=True)
+    tab.wait_for_selector("#turn:text('Your turn')")
+    assert len(in_turns.commands("action")) == before
+    tab.keyboard.press("ArrowUp")
+    in_turns.wait_for({"action": "up", "held": True})

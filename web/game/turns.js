@@ -1,0 +1,34 @@
+// Turn by turn: whose turn it is, and the time that is left of it.
+import { hooks } from "./hooks.js";
+import { find, make, setText } from "./page.js";
+import { game } from "./state.js";
+
+const turn = make("span", { id: "turn" });
+let turnEndsAt = null;
+let wasMine = false;
+
+document.querySelector(".hud").append(turn);
+// A press that starts the game, or goes on with it, is no move.
+hooks.starts = () => true;
+
+hooks.said.push((message) => {
+  if (!message.state) return;
+  turnEndsAt = typeof message.turnEndsIn === "number" ? performance.now() + 1000 * message.turnEndsIn : null;
+  showTurn();
+  const mine = isMine();
+  if (mine && !wasMine) setText(find("announce"), "Your turn");
+  wasMine = mine;
+});
+
+const isMine = () => game.state === "playing" && Boolean(game.toAct);
+
+function showTurn() {
+  const others = game.players?.length > 2 ? "The others’ turn" : "The other player’s turn";
+  const left = turnEndsAt === null ? "" : ` (${Math.max(0, Math.ceil((turnEndsAt - performance.now()) / 1000))} s)`;
+  turn.classList.toggle("mine", isMine());
+  if (game.state !== "playing") setText(turn, "");
+  else if (isMine()) setText(turn, `Your turn${left}`);
+  else setText(turn, game.players ? others : "");
+}
+
+setInterval(() => turnEndsAt !== null && isMine() && showTurn(), 200);
