@@ -19,6 +19,7 @@ from trial.core.flow_control import STALLED_SECONDS, Window
 from trial.core.players import PLAYER, alone
 from trial.core.progress import Break, CommandRefused, Episode, PlayState, Progress
 from trial.core.timing import Pacer
+from trial.pictures.frames import Decoder
 from trial.recordings import recording
 from trial.server.watchdog import Watchdog
 from trial.settings import Settings, SettingsError, trial_section
@@ -315,7 +316,8 @@ class Paper:
         self.sent.append(code)
 
 
-def test_a_connection_keeps_little_but_never_loses_its_last_words():
+@pytest.mark.parametrize("code", [1000, 4409])
+def test_a_connection_keeps_little_but_never_loses_its_last_words(code):
     async def talk():
         paper = Paper()
         connection = Connection(paper)
@@ -323,15 +325,18 @@ def test_a_connection_keeps_little_but_never_loses_its_last_words():
             connection.send(str(number))
             connection.send_state(f"state {number}")
             connection.send_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
-        connection.close(1000, "done")
-        connection.close(4409, "too late")
+        connection.close(code, "done")
+        connection.close(4410, "too late")
         await connection.run()
         return paper.sent
 
     sent = asyncio.run(talk())
     assert len(sent) < 100
     assert sent[0] == "0"
-    assert sent[-3:] == ["state 9999", "done", 1000]
+    assert sent[-2:] == ["done", code]
+    pictures = [Decoder().decode(each)[0] for each in sent if isinstance(each, bytes)]
+    assert pictures == ([9_999] if code == 1000 else []), "the picture that shows how the game ended"
+    assert sent[-3 - len(pictures)] == "state 9999"
 
 
 @pytest.mark.parametrize("subprotocol", [None, "hippodrome.2"])

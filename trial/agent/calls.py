@@ -179,7 +179,7 @@ class AgentCalls(Calls):
             **({"advice": asked.index} if asked.by == "advice" else {}),
             reward=result.reward,
             terminated=result.terminated,
-            truncated=result.truncated,
+            truncated=result.truncated or call.truncated_by is not None,
             info=result.info,
             **({"observation": recording.observation(result.observation)} if self._record_observations else {}),
             **(self._extra(result.extra) if result.extra else {}),

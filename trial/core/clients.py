@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from trial.core import messages
 from trial.core.effects import Close, Effect, Pictures, SendDone, SendFrame, SendMessage, SendState
@@ -12,6 +12,15 @@ from trial.core.flow_control import Window
 from trial.core.progress import Progress
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
+
+
+class StateTimes(NamedTuple):
+    """Seconds that are left: of a break, of a turn, of the first picture, of the episode. None: there is none."""
+
+    next_in: float | None = None
+    turn_ends_in: float | None = None
+    starts_in: float | None = None
+    time_left: float | None = None
 
 
 @dataclass(slots=True)
@@ -76,11 +85,8 @@ class Clients:
         for client in self._by_human.values():
             self.send(client, text)
 
-    def send_state(self, progress: Progress, next_in: float | None, turn_ends_in: float | None = None) -> None:
-        """Send the state to those clients that were sent another one.
-
-        `next_in`: seconds of a break that are left. `turn_ends_in`: the same of a turn.
-        """
+    def send_state(self, progress: Progress, times: Callable[[], StateTimes]) -> None:
+        """Send the state to those clients that were sent another one, with the times as they are then."""
         for client in self._by_human.values():
             player = client.player
             state = state_of(progress, player)
@@ -93,8 +99,7 @@ class Clients:
                 progress.scores[player],
                 progress.frame_rate,
                 episode_score=progress.episode_scores[player],
-                next_in=next_in,
-                **turn_of(progress, player, turn_ends_in),
+                **of_state(progress, player, times()),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
@@ -119,8 +124,16 @@ class Clients:
 
 def state_of(progress: Progress, player: str) -> tuple[object, ...]:
     """What is sent to clients whenever one of these changes."""
-    state = (progress.state, progress.episode, progress.scores[player], progress.frame_rate)
+    state: tuple[object, ...] = (progress.state, progress.episode, progress.scores[player], progress.frame_rate)
+    if progress.stands:
+        state = (*state, "stands")
     return state if progress.turns is None else (*state, progress.to_act(player))
+
+
+def of_state(progress: Progress, player: str, times: StateTimes) -> dict[str, Any]:
+    """What a client is told of the times and of its turn."""
+    turn = turn_of(progress, player, times.turn_ends_in)
+    return {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
 
 
 def turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str, Any]:

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from itertools import combinations, permutations
 
+from protocol import keyboard
 from trial.core.players import NOOP
 
-DIRECTIONS = frozenset({"up", "down", "left", "right", "fire"})
+ARROWS = ("up", "down", "left", "right")
+"""The controls of `ui` that show actions."""
+DIRECTIONS = frozenset({*ARROWS, "fire"})
 """Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
 
+KEY = "\0"
+"""Stands before the name of a key, where the project says what each key does: no action is called so."""
+PRESSES = 4
+"""Presses that wait for their step where each press is one action; more are dropped."""
 _COMBINED = 4  # keys that are combined at most; people do not hold more on purpose
 
 
@@ -19,9 +27,19 @@ class Controls:
 
     `action_space` are the names of the environment's actions in their order; `lifespan` is the number of steps
     that a single press acts for. `default` is the action of no key: NOOP or the first, if it is not given.
+    `keys` are the project's own, an action for each combination (`protocol.keyboard`); those of actions that do not
+    exist do nothing. With `single` each press of a key is one action, for one step.
     """
 
-    def __init__(self, action_space: Sequence[str], lifespan: int, default: int | None = None) -> None:
+    def __init__(
+        self,
+        action_space: Sequence[str],
+        lifespan: int,
+        default: int | None = None,
+        *,
+        keys: Mapping[str, str] | None = None,
+        single: bool = False,
+    ) -> None:
         self.names = tuple(action_space)
         self._index = {name: index for index, name in enumerate(self.names)}
         self._lifespan = lifespan
@@ -30,11 +48,19 @@ class Controls:
         self._unseen: set[str] = set()  # held, but no step has acted on them yet
         self._press: int | None = None
         self._press_left = 0.0
+        self._keys = {
+            frozenset(KEY + key for key in keyboard.parts(combined)): self._index[action]
+            for combined, action in (keys or {}).items()
+            if action in self._index
+        }
+        self._key_names = frozenset().union(*self._keys) if self._keys else frozenset()
+        self._single = single
+        self._presses: deque[int] = deque()  # with `single`, those that wait for their step
         self.default = self._index.get(NOOP, 0) if default is None else default
 
     def knows(self, name: str) -> bool:
         """Whether the name is an action, or a key that can be part of one."""
-        return name in self._index or name in DIRECTIONS
+        return name in self._index or name in DIRECTIONS or name in self._key_names
 
     def keep(self, name: str) -> None:
         """This action acts until the next one. NOOP and names that are no actions end the one that acts."""
@@ -42,8 +68,12 @@ class Controls:
         self._press_left = math.inf if self._press is not None else 0
 
     def press(self, name: str) -> None:
-        """One press: acts for `lifespan` steps, or until another action."""
-        self._press = self._index.get(name)
+        """One press: acts for `lifespan` steps, or until another action; with `single` for one step."""
+        index = self._combined_with(name, ())
+        if self._single:
+            self._wait(index)
+            return
+        self._press = index
         self._press_left = self._lifespan if self._press is not None else 0
 
     def hold(self, name: str) -> None:
@@ -51,8 +81,16 @@ class Controls:
         if name in self._held:  # the keyboard repeats; the key is no newer for it
             return
         self._held.insert(0, name)
+        if self._single:
+            self._wait(self._combined_with(name, self._held[1:_COMBINED]))
+            return
         self._unseen.add(name)
         self._press_left = 0
+
+    def _wait(self, index: int | None) -> None:
+        """With `single`: the action waits for its step."""
+        if index is not None and len(self._presses) < PRESSES:
+            self._presses.append(index)
 
     def release(self, name: str) -> None:
         """A key went up. A key that was pressed and released between two steps still acts on the next one."""
@@ -68,11 +106,13 @@ class Controls:
         self._held.clear()
         self._tapped.clear()
         self._unseen.clear()
+        self._presses.clear()
         self._press_left = 0
 
     def forget_taps(self) -> None:
         """Forget the press, and the keys that were released before any step; keys that are held stay, and `keep`'s."""
         self._tapped.clear()
+        self._presses.clear()
         if self._press_left < math.inf:
             self._press_left = 0
 
@@ -83,13 +123,15 @@ class Controls:
 
     def take(self) -> tuple[int, bool]:
         """The action of the step that begins now: its index, and whether a human asked for it."""
+        if self._presses:
+            return self._presses.popleft(), True
         keys = [*self._tapped, *(key for key in self._held if key not in self._tapped)]
         self._tapped.clear()
         self._unseen.clear()
         if self._press_left > 0 and self._press is not None:
             self._press_left -= 1
             return self._press, True
-        index = self._combine(keys)
+        index = None if self._single else self._combine(keys)
         return (self.default, False) if index is None else (index, True)
 
     def choice(self, name: str, held: bool | None) -> int | None:
@@ -98,7 +140,7 @@ class Controls:
         None if that is no action: keys that go up, that the keyboard repeats, or that act only together with others.
         """
         if held is None:
-            return self._index.get(name)
+            return self._combined_with(name, ())
         if not held:
             self.release(name)
             self._tapped.clear()
@@ -123,6 +165,11 @@ class Controls:
     def _combined_with(self, newest: str, others: Sequence[str]) -> int | None:
         for size in range(len(others), -1, -1):
             for rest in combinations(others, size):
+                if newest in self._key_names:
+                    index = self._keys.get(frozenset((newest, *rest)))
+                    if index is not None:
+                        return index
+                    continue
                 for order in permutations((newest, *rest)):
                     index = self._index.get("".join(order))
                     if index is not None:

@@ -119,6 +119,8 @@ class StepCall(FeedbackCall):
     """By player."""
     fields: Mapping[str, Any]
     """More for the step's line of the recording."""
+    truncated_by: str | None = None
+    """The key of `trial` that makes this step the episode's last one: it is recorded as truncated."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "right
 """HIPPO's front end presses an action with these controls."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
-_FIELDS = frozenset({"command", "action", "held", "changeFrameRate", "ack", "asset"})
+_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset"})
 
 
 class NotAMessage(ValueError):
@@ -71,6 +71,8 @@ class Message:
     """What a client without a subprotocol has sent along. It is recorded and changes nothing."""
     fields_dropped: int = 0
     """How many fields it has sent along that were too long to be recorded."""
+    key: str | None = None
+    """A key of the keyboard, where the project says what each does."""
 
     def record(self) -> dict[str, Any]:
         """What goes into a recording: everything but acknowledgements and requestUI."""
@@ -79,6 +81,8 @@ class Message:
             said["command"] = self.command
         if self.action is not None:
             said["action"] = self.action
+        if self.key is not None:
+            said["key"] = self.key
         if self.held is not None:
             said["held"] = self.held
         if self.frame_rate is not None:
@@ -154,14 +158,18 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
     if "action" in value and (not isinstance(action, str) or not 0 < len(action) <= 64):
         raise BadMessage("action must be the name of an action")
     held = value.get("held")
-    if "held" in value and (not isinstance(held, bool) or action is None):
-        raise BadMessage("held must be true or false and come with an action")
+    key = value.get("key")
+    if "key" in value and (not isinstance(key, str) or not 0 < len(key) <= 32 or action is not None):
+        raise BadMessage("key must be the name of a key, and come without an action")
+    if "held" in value and (not isinstance(held, bool) or (action is None and key is None)):
+        raise BadMessage("held must be true or false and come with an action or a key")
     return Message(
         command=command,
         action=action.strip().lower() if action is not None else None,
         held=held,
         frame_rate=_frame_rate(value["changeFrameRate"]) if "changeFrameRate" in value else None,
         ack=_ack(value["ack"]) if "ack" in value else None,
+        key=key,
         asset=_asset(value["asset"]) if "asset" in value else None,
     )
 
@@ -215,13 +223,17 @@ def controls(
     to_act: bool | None = None,
     turn_ends_in: float | None = None,
     scene: Mapping[str, Any] | None = None,
+    starts_in: float | None = None,
+    time_left: float | None = None,
+    input_of_project: Mapping[str, Any] | None = None,
 ) -> str:
     """The answer to a hello and to `requestUI`.
 
     It names the project's own controls only if there are some, players only if there are several, and `to_act` only
     turn by turn.
 
-    `scene` is what a client is told that draws objects: of the picture, and of the images in it.
+    `scene` is what a client is told that draws objects: of the picture, and of the images in it. `input_of_project` is
+    what the project says of keys and buttons. `starts_in` and `time_left` as in `state`.
     """
     return json.dumps(
         {
@@ -241,6 +253,8 @@ def controls(
             **({"pace": "turns"} if to_act is not None else {}),
             **_turn(to_act, turn_ends_in),
             **(scene or {}),
+            **(input_of_project or {}),
+            **_times(starts_in, time_left),
         }
     )
 
@@ -255,15 +269,23 @@ def state(
     next_in: float | None = None,
     to_act: bool | None = None,
     turn_ends_in: float | None = None,
+    starts_in: float | None = None,
+    time_left: float | None = None,
 ) -> str:
     """Where the trial stands, sent whenever one of these changes.
 
+    `starts_in`: seconds for which the first picture still stands. `time_left`: seconds of play of the episode.
     `next_in`: seconds of a break that are left. Turn by turn, `to_act`: whether it is the client's turn, and
     `turn_ends_in`: seconds of it that are left.
     """
     scores = _scores(score, episode_score, next_in)
-    turn = _turn(to_act, turn_ends_in)
-    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn})
+    turn, times = _turn(to_act, turn_ends_in), _times(starts_in, time_left)
+    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times})
+
+
+def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]:
+    times = {"startsIn": starts_in, "timeLeft": time_left}
+    return {name: round(seconds, 3) for name, seconds in times.items() if seconds is not None}
 
 
 def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:

@@ -54,6 +54,8 @@ class Episode:
     score: float
     why: str
     scores: Mapping[str, float] = field(default_factory=dict)
+    limit: str | None = None
+    """The key of `trial` whose limit truncated it: maxSteps or episodeSeconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,13 @@ class Progress:
         self.action_space = self.players[self.first].action_space
         """Of the first human."""
         self.controls = {
-            name: Controls(self.players[name].action_space, config.action_buffer_lifespan, self.players[name].idle)
+            name: Controls(
+                self.players[name].action_space,
+                config.action_buffer_lifespan,
+                self.players[name].idle,
+                keys=config.keys_of(name),
+                single=config.input == "single",
+            )
             for name in self.humans
         }
         turns = config.pace == "turns"
@@ -111,6 +119,8 @@ class Progress:
         self.episode_scores = dict.fromkeys(self.players, 0.0)
         self.needs_reset = True
         """The environment must be reset before the next step."""
+        self.frozen = config.reset_freeze > 0
+        """The episode's first picture stands, or is to: no step is taken, and keys do nothing."""
         self.ended: list[Episode | Break] = []
         """Episodes and breaks that are over, in order; for the caller to take out."""
         self._failures = 0
@@ -162,7 +172,7 @@ class Progress:
 
     def replayed(self, steps: int, scores: Mapping[str, float]) -> None:
         """The episode stands where an earlier server left it."""
-        self.needs_reset = False
+        self.needs_reset = self.frozen = False
         self.steps = steps
         self.total_steps += steps
         self.episode_scores |= {player: score for player, score in scores.items() if player in self.players}
@@ -171,6 +181,11 @@ class Progress:
     @property
     def playing(self) -> bool:
         return self.state is PlayState.PLAYING
+
+    @property
+    def stands(self) -> bool:
+        """The episode's first picture is shown and stands."""
+        return self.frozen and self.playing and not self.needs_reset
 
     @property
     def over(self) -> bool:
@@ -250,10 +265,12 @@ class Progress:
         if lasts:
             return
         if held is None:
-            if self.playing:  # a press while the game is held would act later than it was meant
+            if self.playing and not self.frozen:  # a press while the game is held would act later than it was meant
                 controls.press(name)
         elif held:
             controls.hold(name)
+            if self.config.input == "single" and (self.frozen or not self.playing):
+                controls.forget_taps()
         else:
             controls.release(name)
 
@@ -264,7 +281,7 @@ class Progress:
         if not controls.knows(name):
             raise CommandRefused(_NO_ACTION)
         index = controls.choice(name, held)
-        if index is None or not self.playing or not self.turns.waits_for(player):
+        if index is None or not self.playing or self.frozen or not self.turns.waits_for(player):
             return
         if not allowed(index, self._mask(player)):
             raise CommandRefused(NOT_POSSIBLE)
@@ -406,8 +423,21 @@ class Progress:
             self.turns.begin(to_act)
             self.policies.turn(to_act, now)
 
-    def stepped(self, rewards: Mapping[str, float], terminated: bool, truncated: bool) -> None:
-        """A step was taken."""
+    def thaw(self) -> None:
+        """The first picture has stood long enough: keys act, those that are held now too."""
+        self.frozen = False
+        for controls in self.controls.values():
+            controls.forget_taps()
+
+    def time_over(self) -> None:
+        """The episode has been played for `episodeSeconds`, and no step is due that could be its last."""
+        self._good_episodes += 1
+        self._end_episode("truncated", "episodeSeconds")
+
+    def stepped(
+        self, rewards: Mapping[str, float], terminated: bool, truncated: bool, limit: str | None = None
+    ) -> None:
+        """A step was taken. `limit` is the key of `trial` that makes it the episode's last one, if there is one."""
         if self.over:
             return
         self.steps += 1
@@ -416,10 +446,11 @@ class Progress:
         for player, reward in rewards.items():
             scores[player] += reward
             episode_scores[player] += reward
-        if terminated or truncated:
+        if terminated or truncated or limit is not None:
             self._failures = 0
             self._good_episodes += 1
-            self._end_episode("terminated" if terminated else "truncated")
+            own = terminated or truncated
+            self._end_episode("terminated" if terminated else "truncated", None if own else limit)
 
     def failed(self, *, fatal: bool = False) -> None:
         """The researcher's code raised an error (or, `fatal`, will never answer)."""
@@ -433,14 +464,14 @@ class Progress:
         else:
             self._end_episode("failed")
 
-    def _close_episode(self, why: str) -> None:
+    def _close_episode(self, why: str, limit: str | None = None) -> None:
         scores = dict(self.episode_scores) if self.several else {}
-        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why, scores))
+        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why, scores, limit))
         if self.steps > 0:
             self.episodes_played += 1
 
-    def _end_episode(self, why: str) -> None:
-        self._close_episode(why)
+    def _end_episode(self, why: str, limit: str | None = None) -> None:
+        self._close_episode(why, limit)
         if self.episode >= self.config.max_episodes:
             self._end("finished" if self._good_episodes else "failed")
             return
@@ -462,6 +493,7 @@ class Progress:
         self.steps = 0
         self.episode_scores = dict.fromkeys(self.players, 0.0)
         self.needs_reset = True
+        self.frozen = self.config.reset_freeze > 0
 
     def _end_all(self, break_why: str, outcome: str) -> None:
         """End the trial, and the episode or the break that is on."""

@@ -35,7 +35,8 @@ from typing import Any, Literal
 
 from protocol.trial import Trial as TrialSection
 from trial.core import messages
-from trial.core.clients import Client, Clients, state_of, turn_of
+from trial.core.clients import Client, Clients, StateTimes, of_state, state_of
+from trial.core.controls import ARROWS, KEY
 from trial.core.effects import (
     AgentTimeout,
     Begun,
@@ -58,6 +59,7 @@ from trial.core.effects import (
     TellMoved,
     WriteLine,
 )
+from trial.core.episode_time import EpisodeTime
 from trial.core.flow_control import Window
 from trial.core.message_log import MessageLog
 from trial.core.players import Player, View, alone
@@ -101,6 +103,7 @@ class Trial:
         self.settings = settings
         self.config = settings.trial
         self._shown = self.config.ui.shown()
+        self._offered = (*self._shown, *ARROWS) if self.config.keys else self._shown
         self._scene = _scene(self.config, assets)
         self.step = step
         self.id = trial_id
@@ -117,6 +120,7 @@ class Trial:
         self._clients = Clients(self._emit)
         self._messages = MessageLog()
         self._timing = Timing()
+        self._episode_time = EpisodeTime(self.config.reset_freeze, self.config.episode_seconds)
         self._call: Call | None = None  # the agent has this call
         self._agent_hangs = False  # a call was given up, so the agent's thread takes no other
         self._commands: list[str] = []  # reset and stop wait for the end of a step
@@ -383,6 +387,8 @@ class Trial:
             self.ready = True
             return True
         left = self._break_left()
+        if not progress.playing:
+            self._episode_time.rest(self._now)
         if left is not None:
             self._timing.rest()
             if left > 0.0:
@@ -396,11 +402,27 @@ class Trial:
             if progress.turns is not None:
                 progress.turns.hold(self._now)
             return False
+        elif self._stands():
+            return False
         elif progress.turns is not None:
             return self._turn_if_over()
         else:
             return self._step_if_due()
         return True
+
+    def _stands(self) -> bool:
+        """Whether the episode's first picture still stands; if not, the episode is played from now on."""
+        progress, left = self.progress, self._episode_time.starts_in(self._now)
+        if left > 0.0:
+            self._timing.rest()
+            if progress.turns is not None:
+                progress.turns.hold(self._now)
+            self.wake_at = self._now + left
+            return True
+        if progress.frozen:
+            progress.thaw()
+        self._episode_time.run(self._now)
+        return False
 
     def _do_commands(self) -> None:
         commands, self._commands = self._commands, []
@@ -446,6 +468,7 @@ class Trial:
     def _began(self, begun: Begun) -> None:
         self._emit(WriteLine(begun.line))
         self.progress.began()
+        self._episode_time.begin()
         self._see(begun.view)
         self._show(begun.pictures)
 
@@ -461,6 +484,7 @@ class Trial:
         steps = len(unfinished.steps)
         self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
         self._reset_policies(replayed.observed)
+        self._episode_time.go_on(steps / self.progress.frame_rate)
         self.progress.replayed(steps, unfinished.scores or {self.progress.first: unfinished.score})
         self._see(replayed.view)
         self._show(replayed.pictures)
@@ -501,9 +525,14 @@ class Trial:
         if ends_in is not None and ends_in <= 0.0:
             progress.turn_over()
             return True
+        left = self._episode_time.left(now)
         if turns.waiting:
+            if left is not None and left <= 0.0:
+                progress.time_over()
+                return True
             until = progress.policies_until()
             ends = [until] if until is not None else []
+            ends += [] if left is None else [now + left]
             self.wake_at = min([*ends, now + ends_in] if ends_in is not None else ends, default=None)
             return False
         due = self._timing.turn_due(progress.frame_rate)
@@ -534,15 +563,25 @@ class Trial:
                 feedback=self._messages.feedback,
                 messages=len(said),
                 fields=fields,
+                truncated_by=self._truncates(),
             )
         )
+
+    def _truncates(self) -> str | None:
+        """The key of `trial` that makes the step that begins now the episode's last one, if there is one."""
+        most = self.config.max_steps
+        if most and self.progress.steps + 1 >= most:
+            return "maxSteps"
+        left = self._episode_time.left(self._now)
+        nearest = 0.5 / self.progress.frame_rate  # the step before would be farther from the limit, or the next one
+        return "episodeSeconds" if left is not None and left <= nearest else None
 
     def _stepped(self, call: StepCall, step: StepTaken) -> None:
         self._emit(WriteLine(step.line))
         self._messages.recorded(call.messages, len(call.feedback))
         self._timing.stepped(self._now, self.progress.frame_rate)
         progress, ended = self.progress, len(self.progress.ended)
-        progress.stepped(step.rewards, step.terminated, step.truncated)
+        progress.stepped(step.rewards, step.terminated, step.truncated, call.truncated_by)
         if len(progress.ended) == ended and (step.view is not None or progress.turns is not None):
             self._see(step.view)
         self._show(step.pictures)
@@ -578,6 +617,7 @@ class Trial:
         fields: dict[str, Any] = {"episode": _number(over)}
         if not isinstance(over, Break):
             fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
+            fields |= {} if over.limit is None else {"limit": over.limit}
         fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
         self._emit(RecordLine("break" if isinstance(over, Break) else "end", fields))
         self._messages.recorded(call.messages, len(call.feedback))
@@ -671,7 +711,7 @@ class Trial:
         command = message.command
         if message.frame_rate is not None and not self.config.allow_frame_rate_change:
             raise CommandRefused("the frame rate of this game is fixed")
-        missing = messages.not_offered(message, self._shown)
+        missing = messages.not_offered(message, self._offered)
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
         if messages.is_feedback(command) and self.progress.over:
@@ -683,6 +723,8 @@ class Trial:
             self.progress.change_frame_rate(message.frame_rate)
         if message.action is not None:
             self.progress.act(message.action, message.held, lasts=message.lasts, player=client.player)
+        if message.key is not None:
+            self.progress.act(KEY + message.key, message.held, player=client.player)
 
     def _command(self, client: Client, command: str) -> None:
         if command == "start":
@@ -703,11 +745,16 @@ class Trial:
 
     def _send_state(self) -> None:
         if not self.finished:
-            self._clients.send_state(self.progress, self._break_left(), self._turn_ends_in())
+            self._clients.send_state(self.progress, self._times)
 
-    def _turn_ends_in(self) -> float | None:
-        turns = self.progress.turns
-        return None if turns is None else turns.ends_in(self._now)
+    def _times(self) -> StateTimes:
+        progress, now = self.progress, self._now
+        return StateTimes(
+            next_in=self._break_left(),
+            turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
+            starts_in=self._episode_time.starts_in(now) if progress.stands else None,
+            time_left=None if progress.over or progress.on_break else self._episode_time.left(now),
+        )
 
     def _controls(self, client: Client) -> str:
         config, progress, player = self.config, self.progress, client.player
@@ -726,11 +773,11 @@ class Trial:
             max_episodes=config.max_episodes,
             score=progress.scores[player],
             episode_score=progress.episode_scores[player],
-            next_in=self._break_left(),
             player=player,
             players=tuple(progress.players),
             scene=self._scene,
-            **turn_of(progress, player, self._turn_ends_in()),
+            input_of_project=_input(config, player),
+            **of_state(progress, player, self._times()),
         )
 
     def _send_done(self) -> None:
@@ -761,6 +808,13 @@ def _scene(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping
         return None
     told = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
     return {"scene": told, "assets": list(assets)}
+
+
+def _input(config: TrialSection, player: str) -> dict[str, Any]:
+    """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
+    keys, labels = config.keys_of(player), config.labels
+    said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
+    return {name: value for name, value in said.items() if value}
 
 
 def _number(over: Episode | Break) -> int:

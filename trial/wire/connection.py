@@ -34,6 +34,7 @@ REST_SECONDS = 0.25
 _ROWS_RATE = 20  # at least so many ROWS frames a second
 _INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
 _UNSENT_BYTES = 16_384  # the most that the kernel keeps unsent: some clients do not acknowledge frames
+_DONE = 1000  # the close code of a trial that is over
 _TEXTS = 64  # if so many messages wait, new ones are dropped
 _ASSET_PART = 65_536  # bytes of an image that are sent at a time
 _ASSET_TIMES = 3  # that a connection may ask for an image
@@ -117,7 +118,7 @@ class Connection:
 
     def close_done(self, episodes: int, score: float) -> None:
         """Say that the trial is over, then close. HIPPO's clients expect the plain word `done`, not JSON."""
-        self.close(1000, messages.done(episodes, score) if self.binary else "done")
+        self.close(_DONE, messages.done(episodes, score) if self.binary else "done")
 
     async def run(self) -> None:
         """Send until the connection is closed."""
@@ -134,6 +135,8 @@ class Connection:
                     await self.websocket.send(text)
                 if self._closing is not None:
                     code, last_words = self._closing
+                    if code == _DONE:
+                        await self._send_last_picture(loop)
                     await self.websocket.send(last_words)
                     await self.websocket.close(code)
                     return
@@ -176,6 +179,17 @@ class Connection:
         else:
             self._wanted.popleft()
         await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
+
+    async def _send_last_picture(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Send the picture that still waits when the trial is over, which shows how it ended."""
+        if self._picture is None:
+            return
+        try:
+            await self._send_picture(loop)
+        except ConnectionClosed:
+            raise
+        except Exception:
+            log.exception("the last picture cannot be sent")
 
     async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
         """Send the picture that waits; if there is none, the next rows that make the last picture exact."""
