@@ -99,7 +99,7 @@ class JointCalls(Calls):
             **({"advice": asked.index} if asked.by == "advice" else {}),
             reward=joint.rewards[first],
             terminated=terminated,
-            truncated=truncated,
+            truncated=truncated or call.truncated_by is not None,
             info=joint.infos.get(first, {}),
             players={player: self._part(player, action, joint) for player, action in actions.items()},
             toAct=sorted(joint.to_act),

@@ -134,11 +134,7 @@ class Connection:
                     text, self._state = self._state, None
                     await self.websocket.send(text)
                 if self._closing is not None:
-                    code, last_words = self._closing
-                    if code == _DONE:
-                        await self._send_last_picture(loop)
-                    await self.websocket.send(last_words)
-                    await self.websocket.close(code)
+                    await self._end(loop, *self._closing)
                     return
                 if timer is not None:
                     timer.cancel()
@@ -180,16 +176,17 @@ class Connection:
             self._wanted.popleft()
         await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
 
-    async def _send_last_picture(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Send the picture that still waits when the trial is over, which shows how it ended."""
-        if self._picture is None:
-            return
-        try:
-            await self._send_picture(loop)
-        except ConnectionClosed:
-            raise
-        except Exception:
-            log.exception("the last picture cannot be sent")
+    async def _end(self, loop: asyncio.AbstractEventLoop, code: int, last_words: str) -> None:
+        """Send the last words and close; if the trial is over, after the picture that still waits: it shows how."""
+        if code == _DONE and self._picture is not None:
+            try:
+                await self._send_picture(loop)
+            except ConnectionClosed:
+                raise
+            except Exception:
+                log.exception("the last picture cannot be sent")
+        await self.websocket.send(last_words)
+        await self.websocket.close(code)
 
     async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
         """Send the picture that waits; if there is none, the next rows that make the last picture exact."""
