@@ -53,7 +53,7 @@ class StrictS3(FakePlatform):
     def serving(self) -> Iterator[StrictS3]:
         """Requests are answered within the block."""
         installed.use(self)  # it has what this function needs
-        thread = threading.Thread(target=self._server.serve_forever, args=[0.05], daemon=True)
+        thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         thread.start()
         try:
             yield self

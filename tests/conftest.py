@@ -6,6 +6,7 @@ import gc
 import io
 import os
 import signal
+import socketserver
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import pytest
 from _pytest.unraisableexception import gc_collect_iterations_key
+from werkzeug.serving import BaseWSGIServer
 
 from testing import exploration, memoized_aws
 
@@ -42,6 +44,9 @@ for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHONPATH"):
     os.environ.pop(_name, None)
 memoized_aws.keep()
 exploration.load_profile()
+# A server of http.server or Werkzeug that is shut down sees that when it looks next: by default twice a second.
+for _server in (socketserver.BaseServer, BaseWSGIServer):
+    _server.serve_forever.__defaults__ = (0.02,)
 
 
 def _group(nodeid: str) -> int | None:
