@@ -381,3 +381,32 @@ class Agent:
     adapter.reset(1)
     adapter.step({"a": 2})
     assert adapter.env.taken == {"a": 1}
+
+
+DICT_SPACES = """
+import numpy
+from gymnasium import spaces
+
+class Fields:
+    possible_agents = ["left", "right"]
+    action_space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
+    observation_space = spaces.Dict({"left": spaces.Box(0, 1, (4,)), "right": spaces.Box(0, 1, (5,))})
+    def reset(self, seed=None):
+        return {"left": 0, "right": 0}, {}
+    def step(self, actions):
+        return {}, {}, {"__all__": True}, {}, {}
+    def render(self):
+        return numpy.zeros((2, 2, 3), numpy.uint8)
+    def close(self):
+        pass
+
+class Agent:
+    def start(self, game):
+        return Fields()
+"""
+
+
+def test_spaces_may_be_one_dictionary_space_for_all_players(tmp_path: Path) -> None:
+    adapter = joint(tmp_path, DICT_SPACES)
+    assert adapter.action_spaces == {"left": ("0", "1"), "right": ("0", "1", "2")}
+    assert adapter.observation_spaces["right"].shape == (5,)

@@ -82,7 +82,8 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
     files["config.yml"] = _yaml(document, source).encode()
     files["agent.py"] = agent_file(source, [(name, key) for key, (_, name) in players.items() if name]).encode()
     if "requirements.txt" not in files:
-        lines = sources.requirements(own.values(), config.packages_to_install)
+        models = any(name.endswith(".onnx") for name in files)
+        lines = sources.requirements(own.values(), config.packages_to_install, ("onnxruntime",) if models else ())
         files["requirements.txt"] = "".join(f"{line}\n" for line in lines).encode()
     if config.default_action is None:
         remark("there is no default_action: while no key is pressed, noop or else action 0 is taken")

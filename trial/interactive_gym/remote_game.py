@@ -28,7 +28,7 @@ class RemoteGame:
     """
 
     def __init__(self, config: Any, env: Any, players: Mapping[Any, Any], subject: str = "") -> None:
-        """`players` is `policy_mapping`, with the loaded policies in place of their names."""
+        """`players` is `policy_mapping`; `bot_players` has the names of policies that stand there."""
         self.config = config
         self.env = env
         self.status = GameStatus.Inactive

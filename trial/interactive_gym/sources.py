@@ -109,11 +109,14 @@ def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]
     return found, said
 
 
-def requirements(files: Iterable[Path], given: Iterable[str]) -> list[str]:
-    """The lines of requirements.txt: the packages that these files import, with the versions here, and those given."""
+def requirements(files: Iterable[Path], given: Iterable[str], modules: Iterable[str] = ()) -> list[str]:
+    """The lines of requirements.txt: packages that these files import, with the versions here, and those given.
+
+    `modules` are imported by other code.
+    """
     packages = metadata.packages_distributions()
     found: dict[str, str] = {}
-    for name in sorted({name for file in files if file.suffix == ".py" for name in _imports(file)}):
+    for name in sorted({*modules, *(name for file in files if file.suffix == ".py" for name in _imports(file))}):
         for package in packages.get(name, [])[:1]:
             found[package.lower()] = f"{package}=={metadata.version(package)}"
     for line in given:

@@ -1,0 +1,226 @@
+"""An experiment on a participant's server: its environment, objects, policies and callback; and `python experiment.py`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, TOGETHER
+from trial.interactive_gym import playing
+from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.remote_game import RemoteGame
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def project(folder: Path, source: str) -> Path:
+    """The experiment's project."""
+    folder.mkdir()
+    (folder / "experiment.py").write_text(source + RUN.replace("SERVE", "False"))
+    (folder / "helper.py").write_text(HELPER)
+    (folder / "how.html").write_text("<h1>How</h1>")
+    (folder / "brains").mkdir()
+    (folder / "brains/two.txt").write_text("2")
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "experiment.py"], cwd=folder, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "experiment-study"
+
+
+def play(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
+    """A server of the project, whose game was played to its end."""
+    server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
+
+    async def journey() -> None:
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+
+    asyncio.run(journey())
+    assert server.wait() == 0, server.said()
+    return server
+
+
+SCENE = {"width": 600, "height": 400}
+
+
+def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch: Any, open_client: Any) -> None:
+    made = project(tmp_path / "mine", ALONE)
+    trial = {"actionSpace": ["left", "noop", "right"], "idleAction": "noop", "maxEpisodes": 2, "scene": SCENE}
+    server = play(launch, open_client, made, trial)
+    first, second = server.recordings().values()
+    for found in (first, second):
+        values = [(line["step"], line["name"], line["value"]) for line in found if line["kind"] == "callback"]
+        assert values == [
+            *((step, "rewards", [{"human": 1}, {"reward": -1.0}]) for step in range(1, 21)),
+            (20, "on_episode_end", {"ticks": 20, "before": 20, "score": -20.0}),
+        ]
+
+
+def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_client: Any) -> None:
+    made = project(tmp_path / "mine", TOGETHER)
+    trial = {
+        "actionSpace": ["0", "1", "2"],
+        "players": {"0": "human", "1": "agent:Policy1"},
+        "maxEpisodes": 1,
+        "input": "single",
+        "scene": SCENE,
+    }
+    server = play(launch, open_client, made, trial)
+    (found,) = server.recordings().values()
+    assert found[0]["players"]["1"]["policy"] == "agent:Policy1"
+    steps = [line for line in found if line["kind"] == "step"]
+    assert len(steps) == 10
+    assert {line["players"]["1"]["action"] for line in steps if line["players"]["1"]["by"] == "policy"} == {2}
+    told = [line["value"] for line in found if line["kind"] == "callback"]
+    assert told == [
+        [
+            step["step"],
+            {"0": step["players"]["0"]["action"], "1": step["players"]["1"]["action"]},
+            {"1": "brains/two.txt"},
+        ]
+        for step in steps
+    ]
+
+
+def test_running_the_experiments_file_holds_its_project_until_ctrl_c(tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    project(folder, ALONE)
+    (folder / "experiment.py").write_text(ALONE + RUN.replace("SERVE", "True"))
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    running = subprocess.Popen(
+        [sys.executable, "experiment.py"],
+        cwd=folder,
+        env=env,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert running.stdout is not None
+    try:
+        link = None
+        for line in running.stdout:
+            found = re.search(r"http://\S+", line)
+            if found:
+                link = found[0]
+                break
+        assert link is not None
+        with urllib.request.urlopen(link, timeout=20) as page:
+            assert "Mountain car" in page.read().decode()
+        os.killpg(running.pid, signal.SIGINT)
+        assert running.wait(60) == 0
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(running.pid, signal.SIGKILL)
+        running.stdout.close()
+    with pytest.raises(OSError, match=r".*"):
+        urllib.request.urlopen(link, timeout=5)
+
+
+# ---- its parts
+
+
+class Env:
+    def __init__(self, **given: Any) -> None:
+        self.given = given
+
+    action_space = None
+
+    def reset(self, seed: int | None = None) -> Any:
+        return {"a": 0, "b": 0}, {}
+
+    def step(self, actions: Any) -> Any:
+        return {}, {"a": 1, "b": -2}, {"__all__": False}, {"__all__": False}, {}
+
+
+def test_the_game_keeps_interactive_gyms_books() -> None:
+    config = RemoteConfig().gameplay(num_episodes=2)
+    game = RemoteGame(config, Env(), {"a": "human", "b": "model"}, "P1")
+    assert (game.human_players, game.bot_players, game.status) == ({"a": "P1"}, {"b": "model"}, "inactive")
+    for episode in (1, 2):
+        game.began({}, {})
+        assert (game.episode_num, game.tick_num, game.status) == (episode, 0, "active")
+        game.stepped({"a": 0, "b": 1}, Env().step({}))
+        game.stepped({"a": 0, "b": 1}, ({}, {"a": 3}, {"__all__": True}, {"__all__": False}, {}))
+        assert dict(game.episode_rewards) == {"a": 4, "b": -2}
+        assert (game.tick_num, game.prev_rewards, game.over) == (2, {"a": 3}, True)
+        assert game.status == ("reset" if episode == 1 else "done")
+    assert (dict(game.total_rewards), dict(game.total_positive_rewards), dict(game.total_negative_rewards)) == (
+        {"a": 8, "b": -4}, {"a": 8, "b": 0}, {"a": 0, "b": -4},
+    )  # fmt: skip
+
+
+def test_a_single_players_reward_is_a_number() -> None:
+    game = RemoteGame(RemoteConfig(), None, {"human": "human"})
+    game.began(0, {})
+    game.stepped({"human": 1}, (0, 2.5, True, False, {}))
+    assert (game.prev_rewards, game.episode_rewards[0], game.over) == ({"reward": 2.5}, 2.5, True)
+
+
+def agent(**options: Any) -> playing.ExperimentAgent:
+    config = RemoteConfig()
+    for name, value in options.items():
+        setattr(config, name, value)
+    made = playing.ExperimentAgent(config)
+    made.start(None)
+    made.reset(1)
+    return made
+
+
+def test_objects_of_the_beginning_are_drawn_once_and_stay() -> None:
+    fence = {"uuid": "fence", "object_type": "circle"}
+    made = agent(
+        env_creator=Env,
+        env_to_state_fn=lambda env, config: [{"uuid": "ball"}],
+        state_init=[fence],
+        hud_text_fn=lambda game: f"Episode {game.episode_num}",
+    )
+    assert made.render() == {"objects": [{**fence, "permanent": True}, {"uuid": "ball"}], "hud": "Episode 1"}
+    assert made.render() == {"objects": [{"uuid": "ball"}], "hud": "Episode 1"}
+    made.reset(2)
+    assert len(made.render()["objects"]) == 2
+
+
+def test_a_picture_of_pixels_among_the_objects_is_a_frame() -> None:
+    pixels = {"object_type": "rendered_env_rgb", "name": "x", "game_image": [[[1, 2, 3]]]}
+    made = agent(env_creator=Env, env_to_state_fn=lambda env, config: [pixels])
+    assert np.array_equal(made.render(), np.array([[[1, 2, 3]]], np.uint8))
+
+
+def test_environments_are_made_as_interactive_gym_makes_them() -> None:
+    assert agent(env_creator=Env, env_config={"size": 3})._raw.given == {"size": 3, "render_mode": "rgb_array"}
+    code = "class Env:\n    def reset(self, seed=None): return 7, {}\nenv = Env()"
+    made = agent(environment_initialization_code=code)
+    assert made.reset(1) == (7, {})
+    with pytest.raises(playing.Unplayable, match="makes no variable env"):
+        agent(environment_initialization_code="x = 1")
+
+
+def test_policies_are_loaded_from_the_projects_copy(tmp_path: Path) -> None:
+    (tmp_path / "policies").mkdir()
+    (tmp_path / "policies/model.onnx").write_bytes(b"")
+    config = RemoteConfig().policies(
+        policy_mapping={"a": "human", "b": "far/away/model.onnx", "c": "by name"},
+        load_policy_fn=lambda name: ["loaded", name],
+        policy_inference_fn=lambda observation, policy: np.int64(len(policy) + observation),
+    )
+    locate = playing.located(tmp_path)
+    policy = playing.policy_class(config, "b", locate)()
+    assert policy._policy == ["loaded", str(tmp_path / "policies/model.onnx")]
+    assert policy.act(5, {}) == 7
+    assert playing.policy_class(config, "c", locate)()._policy == ["loaded", "by name"]
