@@ -23,8 +23,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from export.recording import players_of
 from export.state import State
 
+OF_HUMAN = (
+    "Several players played: actions, rewards and observations are those of the first human. An action by none is the "
+    "idle one, also where it was not the human's turn. infos: players (what each did and got, as JSON). "
+)
 STEP_NUMBERS = "The observations were not recorded; in their place stands the number of the step."
 
 
@@ -35,6 +40,7 @@ class Spec(NamedTuple):
     actions: tuple[str, ...]
     dtype: str  # of the observations; "" where there are none
     shape: tuple[int, ...]
+    players: tuple[str, ...] = ()  # if several play
 
 
 @dataclass
@@ -110,6 +116,7 @@ def _look(path: Path, step: str) -> tuple[Spec, int]:
         header = json.loads((file.metadata.metadata or {}).get(b"hippodrome", b"{}")).get("header", {})
         names = header.get("actionSpace")
         actions = tuple(map(str, names)) if isinstance(names, list) else ()
+        players = players_of(header)
         column = file.schema_arrow.get_field_index("action")
         highest = -1
         for number in range(file.metadata.num_row_groups):
@@ -119,9 +126,10 @@ def _look(path: Path, step: str) -> tuple[Spec, int]:
         for batch in file.iter_batches(batch_size=256, columns=["observationDtype", "observationShape"]):
             for row in batch.to_pylist():
                 if row["observationDtype"] is not None:
-                    return Spec(step, actions, row["observationDtype"], tuple(row["observationShape"])), highest
+                    shape = tuple(row["observationShape"])
+                    return Spec(step, actions, row["observationDtype"], shape, players), highest
             break
-    return Spec(step, actions, "", ()), highest
+    return Spec(step, actions, "", (), players), highest
 
 
 def _storage(data: Path, dataset: Dataset, version: str) -> Any:
@@ -151,6 +159,7 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
     description = "Recorded by Hippodrome: what people did, and what came of it. " + (
         "" if spec.dtype else STEP_NUMBERS + " "
     )
+    description += OF_HUMAN if spec.players else ""
     storage.update_metadata(
         {
             "dataset_id": dataset.id,
@@ -262,14 +271,15 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
             "by": [str(row.get("by") or "").replace("\0", "") for row in told],
             "human": np.array([-1 if row.get("human") is None else row["human"] for row in told], np.int64),
             "info": [str(row.get("info") or "").replace("\0", "") for row in told],
-            **_extra(told),
+            **_more(told, "extra"),
+            **(_more(told, "players") if spec.players else {}),
         },
     )
 
 
-def _extra(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
-    """What the agent returned beside Gymnasium's values, as JSON, if it did so in this episode."""
-    kept = [json.loads(row.get("other") or "{}").get("extra") for row in rows]
+def _more(rows: list[dict[str, Any]], name: str) -> dict[str, list[str]]:
+    """A field without a column, as JSON, if a line of this episode has it."""
+    kept = [json.loads(row.get("other") or "{}").get(name) for row in rows]
     if all(value is None for value in kept):
         return {}
-    return {"extra": ["" if value is None else json.dumps(value).replace("\0", "") for value in kept]}
+    return {name: ["" if value is None else json.dumps(value).replace("\0", "") for value in kept]}

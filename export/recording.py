@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import functools
+import itertools
 import json
 import math
 import re
@@ -30,6 +31,7 @@ _PIECE = 256 * 1024  # bytes
 _LONGEST = 64 * 1024 * 1024  # bytes in a line
 _BIGGEST = 256 * 1024 * 1024  # bytes in an observation
 _DTYPE = re.compile(r"bool|(?:u?int|float)(8|16|32|64)")
+_MOST_PLAYERS = 64  # as many as `trial.players` may name
 _NOT_STORED = {"kind", "v", "session", "trial", "observation"}
 
 
@@ -46,8 +48,11 @@ class Converted:
 
 
 @functools.cache
-def schema() -> Any:
-    """The columns of every converted recording. Names are those of the recording's lines."""
+def schema(players: tuple[str, ...] = ()) -> Any:
+    """The columns of every converted recording. Names are those of the recording's lines.
+
+    If several `players` play, each has columns of its own besides: `action.NAME`, `by.NAME`, `reward.NAME`.
+    """
     import pyarrow as pa
 
     when = pa.timestamp("us", tz="UTC")
@@ -81,8 +86,15 @@ def schema() -> Any:
             ("observationDtype", pa.string()),
             ("observationShape", pa.list_(pa.int32())),
             ("other", pa.string()),
+            *((f"{name}.{player}", _PLAYERS_COLUMNS[name][0]()) for player in players for name in _PLAYERS_COLUMNS),
         ]
     )
+
+
+def players_of(header: Mapping[str, Any]) -> tuple[str, ...]:
+    """The players that the head of a recording names; empty if there is one."""
+    players = header.get("players")
+    return tuple(map(str, players))[:_MOST_PLAYERS] if isinstance(players, Mapping) else ()
 
 
 def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, shown: bool = True) -> Converted:
@@ -93,10 +105,12 @@ def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, sh
     import pyarrow.parquet as pq
 
     done = Converted()
-    rows = _Rows(who, scrub)
     header: Mapping[str, Any] = {}
-    with pq.ParquetWriter(target, schema(), compression="zstd") as writer:
-        for line in lines(source, done.problems):
+    read = lines(source, done.problems)
+    first = list(itertools.islice(read, 1))
+    rows = _Rows(who, scrub, players_of(first[0]) if first and first[0].get("kind") == "header" else ())
+    with pq.ParquetWriter(target, rows.schema, compression="zstd") as writer:
+        for line in itertools.chain(first, read):
             kind = line.get("kind")
             if kind == "header" and not header:
                 header = line
@@ -302,16 +316,32 @@ _TYPED: dict[str, Callable[[Any], Any]] = {
     "why": _text,
     "error": _text,
 }
+_PLAYERS_COLUMNS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
+    "action": (lambda: _arrow("int64"), _whole),
+    "by": (lambda: _arrow("string"), _text),
+    "reward": (lambda: _arrow("float64"), _number),
+}
+"""What each player's columns hold: Arrow's type, and the value or None if it does not fit."""
+
+
+def _arrow(name: str) -> Any:
+    import pyarrow as pa
+
+    return getattr(pa, name)()
+
+
 _TEXTS = ("kind", "actionName", "by", "info", "messages", "why", "error", "other", "trial")
 
 
 class _Rows:
     """Rows that wait to be written: a list per column."""
 
-    def __init__(self, who: Mapping[str, Any], scrub: Scrub) -> None:
+    def __init__(self, who: Mapping[str, Any], scrub: Scrub, players: tuple[str, ...] = ()) -> None:
         self._who = who
         self._scrub = scrub
-        self._columns: dict[str, list[Any]] = {name: [] for name in schema().names}
+        self._players = players
+        self.schema = schema(players)
+        self._columns: dict[str, list[Any]] = {name: [] for name in self.schema.names}
         self._bytes = 0
         self.problems: list[str] = []
         self.trial: str | None = None
@@ -341,8 +371,17 @@ class _Rows:
         columns["observationDtype"].append(dtype)
         columns["observationShape"].append(shape)
         columns["other"].append(_json(other) if other else None)
+        self._add_players(line.get("players"))
         self._bytes += len(kept or b"")
         self.waiting += 1
+
+    def _add_players(self, parts: Any) -> None:
+        """What each player did and got, if several play. All else of them is in `other`."""
+        for player in self._players:
+            part = parts.get(player) if isinstance(parts, Mapping) else None
+            for name, (_, fit) in _PLAYERS_COLUMNS.items():
+                value = part.get(name) if isinstance(part, Mapping) else None
+                self._columns[f"{name}.{player}"].append(None if value is None else fit(value))
 
     def _observation(
         self, line: Mapping[str, Any], other: dict[str, Any]
@@ -362,11 +401,11 @@ class _Rows:
         import pyarrow as pa
 
         columns = self._columns
-        for name in _TEXTS:
+        for name in (*_TEXTS, *(f"by.{player}" for player in self._players)):
             columns[name] = [None if text is None else self._scrub.text(text) for text in columns[name]]
         for name, value in self._who.items():
             columns[name] = [value] * self.waiting
-        made = pa.table([pa.array(columns[f.name], f.type) for f in schema()], schema=schema())
+        made = pa.table([pa.array(columns[f.name], f.type) for f in self.schema], schema=self.schema)
         self._columns = {name: [] for name in columns}
         self.written += self.waiting
         self.waiting = self._bytes = 0

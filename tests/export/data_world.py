@@ -6,6 +6,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,7 @@ def record(
     close: bool = True,
     picture: Callable[[int], np.ndarray] | None = None,
     callbacks: Sequence[Mapping[str, Any]] = (),
+    head: Mapping[str, Any] = MappingProxyType({}),
     **more: Any,
 ) -> bytes:
     """A recording as the trial writes it, made by the trial's own code."""
@@ -111,6 +113,7 @@ def record(
     line(
         "header", project=PROJECT.id, user=user, server=server(user, attempt), step=step, game="grid",
         actionSpace=["noop", "up", "down"], frameRate=30, episode=1, seed=5, versions=recording.versions(),
+        **head,
     )  # fmt: skip
     for episode in range(1, episodes + 1):
         seen = {"observation": recording.observation(look(0))} if observe else {}

@@ -231,6 +231,23 @@ def test_what_else_a_step_returned_is_in_tables_and_datasets(tmp_path: Path, mon
     assert [json.loads(text) if text else None for text in episode.infos["extra"]] == [None, *[extra] * 6]
 
 
+def test_each_player_has_columns_and_a_dataset_is_of_the_first_human(tmp_path: Path, monkeypatch: Any) -> None:
+    left, right = {"action": 1, "by": "human", "reward": 2.0}, {"action": None, "by": None, "reward": 0.5, "info": {}}
+    head = {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "random"}}
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=3, head={"players": head},
+          players={"left": left, "right": right})  # fmt: skip
+    out = data(tmp_path, "--format", "parquet,minari")
+    rows = pyarrow.dataset.dataset(out / "recordings").to_table().to_pylist()
+    steps = [row for row in rows if row["kind"] == "step"]
+    assert [(row["action.left"], row["by.left"], row["reward.left"]) for row in steps] == [(1, "human", 2.0)] * 3
+    assert [(row["action.right"], row["by.right"], row["reward.right"]) for row in steps] == [(None, None, 0.5)] * 3
+    assert json.loads(steps[0]["other"])["players"] == {"left": left, "right": right}, "nothing is lost"
+    (episode,) = load(out, "maze-3-v0", monkeypatch).iterate_episodes()
+    assert [json.loads(text)["right"] for text in episode.infos["players"][1:]] == [right] * 3
+    about = json.loads((out / "minari/maze-3-v0/data/metadata.json").read_text())
+    assert "those of the first human" in about["description"]
+
+
 def test_datasets_are_made_by_relative_paths_and_the_printed_path_is_absolute(
     tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
