@@ -182,3 +182,10 @@ def test_all_that_is_drawn_can_be_drawn(load_module: Any) -> None:
         assert scene.problems == ()
         agent.feedback("good" if step % 2 else "bad")
         agent.step(0)
+
+
+def test_a_bot_plays_it_to_the_end(play_example: Any) -> None:
+    played = play_example("coach", startingFrameRate=60, maxEpisodes=3, betweenEpisodes=0)
+    assert [lines[-1]["kind"] for lines in played.recordings] == ["end", "end", "end"]
+    assert {step["by"] for step in played.steps()} == {"agent"}
+    assert {step["actionName"] for step in played.steps()} == {"up", "right", "down", "left"}
