@@ -566,6 +566,21 @@ def test_an_agent_that_plays_passes(recipe: Recipe, folder: Path, tmp_path: Path
     assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
 
 
+DRAWN = """
+class Agent:
+    def start(self, game): pass
+    def reset(self, seed=None): pass
+    def step(self, action): return None, 0.0, False, False, {}
+    def render(self): return [{"id": "ball", "type": "circle", "x": 0.5, "y": 0.5, "radius": 9}]
+    def close(self): pass
+"""
+
+
+def test_an_agent_that_draws_objects_passes(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    write_study(folder, agent_DOT_py=DRAWN)
+    assert tried(recipe, folder, tmp_path, game="ball", scene={"width": 300, "height": 200}) == (0, WELL)
+
+
 OLD_GYM_AGENT = """
 import gym
 

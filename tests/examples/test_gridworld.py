@@ -138,12 +138,12 @@ def test_all_that_is_drawn_can_be_drawn(modules: Any) -> None:
     assert set(images_of(scene)) <= set(load(EXAMPLE, "assets").by_name)
 
 
-def test_the_script_makes_the_images(load_module: Any, tmp_path: Path) -> None:
-    from PIL import Image
-
-    load_module("gridworld", "make_assets").make(tmp_path)
-    made = {file.name for file in tmp_path.iterdir()}
-    assert made == {file.name for file in (EXAMPLE / "assets").iterdir()}
-    for name in made:
-        ours, kept = (np.asarray(Image.open(folder / name)).astype(int) for folder in (tmp_path, EXAMPLE / "assets"))
-        assert np.abs(ours - kept).mean() < 1  # another version of Pillow may round otherwise
+def test_a_bot_and_the_planner_play_it_to_the_end(play_example: Any) -> None:
+    played = play_example("gridworld", maxEpisodes=1)
+    [lines] = played.recordings
+    assert lines[-1]["kind"] == "end"
+    assert lines[0]["players"]["you"]["kind"] == "human"
+    assert {"kind": "policy", "policy": "agent:Planner"}.items() <= lines[0]["players"]["partner"].items()
+    steps = played.steps()
+    assert {step["by"] for step in steps[::2]} == {"human"}
+    assert {step["players"]["partner"]["by"] for step in steps[1::2]} == {"policy"}
