@@ -7,7 +7,7 @@ import contextlib
 import json
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from random import Random
 from typing import Any
 
@@ -15,6 +15,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from bots.account import Account, Play
+from protocol import keyboard
 from trial.core.progress import NOT_POSSIBLE
 from trial.pictures.frames import Decoder
 from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecoder
@@ -33,17 +34,20 @@ class Hands:
         shown: Sequence[str] = controls.get("UI", ())
         self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
         self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop" and _offered(name, shown)]
+        own: Mapping[str, str] = controls.get("keys", {})
+        self._pressed = list(dict.fromkeys(key for combined in own for key in keyboard.parts(combined)))
         self._words = [*(word for word in ("good", "bad") if word in shown), *controls.get("words", ())]
         self._held: list[str] = []
 
     def move(self) -> list[dict[str, Any]]:
         """The next messages."""
         random = self._random
-        said: list[dict[str, Any]] = [{"action": key, "held": False} for key in self._held]
+        field, keys = ("key", self._pressed) if self._pressed else ("action", self._keys)
+        said: list[dict[str, Any]] = [{field: key, "held": False} for key in self._held]
         self._held = []
-        if self._keys and random.random() < 0.7:
-            self._held = random.sample(self._keys, min(len(self._keys), random.choice((1, 1, 1, 2))))
-            said += [{"action": key, "held": True} for key in self._held]
+        if keys and random.random() < 0.7:
+            self._held = random.sample(keys, min(len(keys), random.choice((1, 1, 1, 2))))
+            said += [{field: key, "held": True} for key in self._held]
         elif self._actions:
             said.append({"action": random.choice(self._actions)})
         if self._words and random.random() < 0.1:
@@ -149,11 +153,13 @@ class Game:
             self._state, play.score = message["state"], message.get("score", 0)
             self._to_act = message.get("toAct", True)
             play.frame_rate = message.get("frameRate", play.frame_rate)
-            self._break_seconds = message.get("nextIn", 0.0)
+            self._break_seconds = message.get("nextIn", 0.0) + message.get("startsIn", 0.0)
+            by_itself = "nextIn" in message  # otherwise there is a page to read, and a button after it
             if self._state in ("ready", "paused", "break"):
                 self._last_frame = None
-            # Of those who are offered a break, every second one waits for its end.
-            if self._state in ("ready", "paused") or (self._state == "break" and self._random.random() < 0.5):
+            # Of those who are offered a break that ends by itself, every second one waits for its end.
+            goes_on = self._state == "break" and (not by_itself or self._random.random() < 0.5)
+            if self._state in ("ready", "paused") or goes_on:
                 await self._say({"command": "start"})
 
     async def _move(self, hands: Hands) -> None:

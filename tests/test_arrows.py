@@ -17,7 +17,7 @@ MAY: dict[str, set[str]] = {
     "lambdas": {"hippodrome"},
     "trial": {"protocol"},
     "export": {"console", "hippodrome"},
-    "bots": {"hippodrome", "trial"},
+    "bots": {"hippodrome", "protocol", "trial"},
     "local": {"hippodrome", "lambdas", "protocol", "bots", "trial"},
     "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "bots", "trial"},
     "testing": {"deploy", "hippodrome", "lambdas", "local", "protocol", "trial"},

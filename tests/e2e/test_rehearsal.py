@@ -24,6 +24,7 @@ from bots.game import Hands
 from bots.links import with_project, with_user
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
 from testing import preloaded
+from trial.recordings.recording import read
 
 TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the system call that names a thread
 Process = preloaded.Forked | subprocess.Popen[str]
@@ -67,6 +68,33 @@ def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Pa
     assert process.returncode == 0, text
     assert "copy" not in text
     assert "9 of 9" in text
+
+
+def test_to_the_end_of_a_game_with_pages_keys_and_limits_of_its_own(project: Any, tmp_path: Path) -> None:
+    """The environment would go on for long; there are pages to read before it and between its episodes."""
+    folder = project(
+        length=100_000,
+        instructions="after",
+        betweenEpisodes="about",
+        resetFreeze=0.5,
+        maxSteps=20,
+        keys={"ArrowLeft": "left", "a": "left", "ArrowRight": "right", "ArrowLeft+ArrowRight": "noop"},
+        input="single",
+    )
+    data = tmp_path / "data"
+    process = rehearsal(folder, "--bots", "2", "--play", "0", "--data", data)
+    text = said(process)
+    assert process.returncode == 0, text
+    assert "2 of 2" in text
+    recordings = [read(path.read_bytes()) for path in sorted(data.glob("tiny/users/*/trials/*/*.gz"))]
+    assert len(recordings) == 4
+    for lines in recordings:
+        steps = [line for line in lines if line["kind"] == "step"]
+        assert [line["truncated"] for line in steps] == [False] * 19 + [True]
+        (end,) = [line for line in lines if line["kind"] == "end"]
+        assert (end["why"], end["limit"]) == ("truncated", "maxSteps")
+        if [line for line in lines if line["kind"] == "break"]:
+            assert [line["why"] for line in lines if line["kind"] == "break"] == ["start"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -250,6 +278,14 @@ def test_hands_press_only_what_the_game_knows() -> None:
     said = [message for _ in range(300) for message in hands.move()]
     assert {message["action"] for message in said if "action" in message} == {"left", "up", "jump"}
     assert {message["command"] for message in said if "command" in message} == {"good"}
+
+
+def test_hands_press_the_keys_that_the_project_names() -> None:
+    keys = {"ArrowLeft": "left", "x+y": "jump"}
+    hands = Hands(Random(1), {"UI": ["left", "up"], "actionSpace": ["noop", "left", "jump"], "keys": keys})
+    said = [message for _ in range(300) for message in hands.move()]
+    assert {message["key"] for message in said if "held" in message} == {"ArrowLeft", "x", "y"}
+    assert {message["action"] for message in said if "action" in message} == {"left", "jump"}
 
 
 def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
