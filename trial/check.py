@@ -19,12 +19,12 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protocol import environment
-from protocol.trial import check
+from protocol.trial import Trial, check
 from trial.agent import tracebacks
 from trial.server import process_group
 
@@ -110,43 +110,37 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
     from trial.pictures.reader import PictureReader  # noqa: PLC0415
     from trial.settings import DEFAULT_GAME  # noqa: PLC0415
 
-    scene = check(dict(section))[0].scene
+    config, _ = check(dict(section))
+    scene = config.scene
     reader = PictureReader(scene, assets.load(folder, scene.assets) if scene is not None else assets.Assets())
-
     # One player takes the first action alone, which every game has.
-    names = tuple(section.get("actionSpace") or ("noop",))
-    teams = _teams(section.get("players") or {})
-    adapter = AgentAdapter(folder, section.get("game") or DEFAULT_GAME, names, reader)
-    player = start(adapter, tuple(map(str, teams[0])))
+    adapter = AgentAdapter(folder, config.game or DEFAULT_GAME, config.action_space or ("noop",), reader)
+    player = start(adapter, config.player_names())
     if isinstance(player, AgentAdapter):
         player.reset(1)
         player.render()
         player.step(0)
         player.render()
     else:
-        _play_jointly(player, teams, folder)
+        _play_jointly(player, config, folder)
 
 
-def _teams(players: Mapping[str, Any]) -> list[Mapping[str, str]]:
-    """Who plays whom, in each group."""
-    groups = [team for team in players.values() if isinstance(team, Mapping)]
-    return groups or [players]
-
-
-def _play_jointly(adapter: JointAdapter, teams: Sequence[Mapping[str, str]], folder: Path) -> None:
+def _play_jointly(adapter: JointAdapter, config: Trial, folder: Path) -> None:
     """One step, in which all who are to act take their first action and each policy is asked for one."""
-    from trial.policies.team import load_all  # noqa: PLC0415 - as above
+    from trial.core.players import who_plays  # noqa: PLC0415 - as above
+    from trial.policies.seats import load_policies  # noqa: PLC0415
 
     now, _ = adapter.reset(1)
     adapter.pictures()
-    for team in teams:
-        for player, policy in load_all({str(name): plays for name, plays in team.items()}, adapter, folder).items():
+    for group in config.groups() or (None,):
+        players = who_plays(config, adapter.action_spaces, group)
+        policies = load_policies(players, folder, adapter.agent_module, adapter.observation_spaces)
+        for player, policy in policies.items():
             policy.reset(1)
             if player in now.to_act:
                 policy.act(now.observations.get(player), now.infos.get(player, {}), now.masks.get(player))
             policy.close()
-    first = {player: now.masks[player].index(True) if player in now.masks else 0 for player in now.to_act}
-    adapter.step(first)
+    adapter.step({})
     adapter.pictures()
 
 

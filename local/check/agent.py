@@ -312,8 +312,13 @@ class _Reading:
             return self._in_config(("trial", key), short(said))
         if error["type"] not in ("PolicyError", "PolicyFileMissing"):
             return None
-        player = self._asked_policy() or text.partition(": ")[0]
-        said = text.removeprefix(f"{player}: ")
+        player, said = self._asked_policy(), text
+        for name, plays in self._config.trial.players_of(self._group).items():
+            before = f"trial.players: {name} cannot be played by {plays}: "
+            if text.startswith(before):
+                player, said = name, text.removeprefix(before)
+        if player is None:
+            return None
         if place is None or self._plays(player).endswith(".onnx"):
             return self._in_config(self._player(player), short(f"{said}{self._where()}"))
         return self._at(place, short(f"{said}{self._where()}"))

@@ -32,6 +32,7 @@ def moves(
     found = False
     for state in _STATES:
         seen: dict[int, bool] = {}
+        first: Any = None  # the pictures before and after the idle action
         for action in [idle, idle, *sorted(set(range(min(count, _MOST_ACTIONS))) - {idle})]:
             if time.monotonic() > until:
                 return None if not found else sorted(still)
@@ -40,10 +41,12 @@ def moves(
                 return sorted(still) if found else None
             before = picture()
             step(action)
-            changed = not same(before, picture())
-            if seen.setdefault(action, changed) != changed:
+            after = picture()
+            first = first or (before, after)
+            if not same(before, first[0]) or (action == idle and not same(after, first[1])):
                 return None  # it plays differently each time
-            if changed:
+            seen[action] = not same(before, after)
+            if seen[action]:
                 still.discard(action)
         found = found or (seen[idle] and not all(seen.values()))
     return sorted(still) if found else None

@@ -20,7 +20,7 @@ from trial.agent.joint import Joint, JointAdapter
 from trial.core.players import Player
 from trial.core.seeds import policy_seed
 from trial.policies.policy import Policy, legal
-from trial.policies.team import load_all
+from trial.policies.seats import load_policies
 
 
 class Reporting(Protocol):
@@ -54,9 +54,11 @@ class Game:
 
     def load(self) -> bool:
         """Load the policies; whether that went well."""
-        plays = {player.name: player.plays for player in self._players}
-        idle = {player.name: player.idle for player in self._players}
-        if not self._progress.call("policies", lambda: load_all(plays, self._adapter, self._folder, idle)):
+        agent = self._adapter
+        if not self._progress.call(
+            "policies",
+            lambda: load_policies(self._players, self._folder, agent.agent_module, agent.observation_spaces),
+        ):
             return False
         self._policies = self._progress.result
         self._paces = {name: Pace() for name in self._policies}

@@ -694,8 +694,13 @@ class Lost:
         ("agent:Partner", "", 0, WELL),
         ("random", "", 0, WELL),
         ("agent:Lost", "", 1, "No module named 'nosuch' => write the package that brings nosuch into requirements.txt"),
-        ("policies/p.onnx", "", 1, "right: there is no file policies/p.onnx => put the file there"),
-        ("policies/p.onnx", "no ONNX", 0, "right: policies/p.onnx is no ONNX file"),
+        (
+            "policies/p.onnx",
+            "",
+            1,
+            "right cannot be played by policies/p.onnx: there is no file policies/p.onnx => put the file there",
+        ),
+        ("policies/p.onnx", "no ONNX", 0, "right cannot be played by policies/p.onnx: policies/p.onnx is no ONNX file"),
     ],
 )
 def test_policies_are_tried_too(
