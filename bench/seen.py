@@ -198,16 +198,16 @@ def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], press
                 page.add_init_script(WATCH)
                 page.goto(address)
                 page.click("#overlay-button")
-                _until(page, "draws", 20)
-                _frames(page, pid, rate, seen)
+                until(page, "draws", 20)
+                frames(page, pid, rate, seen)
                 if rate == pressed_at:
-                    seen.waits = _presses(page)
+                    seen.waits = presses(page)
             finally:
                 context.close()
     return seen
 
 
-def _until(page: Any, what: str, count: int) -> None:
+def until(page: Any, what: str, count: int) -> None:
     """Wait until the page has noted so many. Raises Playwright's Error after PATIENCE."""
     page.evaluate(
         """([what, count, patience]) => new Promise((done, fail) => {
@@ -223,7 +223,8 @@ def _until(page: Any, what: str, count: int) -> None:
     )
 
 
-def _frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
+def frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
+    """Watch the page for SECONDS."""
     cpu = cpu_seconds(pid)
     draws = page.evaluate(
         """(ms) => new Promise((done) => {
@@ -239,12 +240,13 @@ def _frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
     seen.cpu[rate] = 1000 * spent / len(draws)
 
 
-def _presses(page: Any) -> list[float]:
+def presses(page: Any) -> list[float]:
+    """Press keys; the milliseconds until each showed."""
     moments = random.Random(7)
     for number in range(2 * PRESSES):
         page.wait_for_timeout(moments.uniform(20, 120))  # so that keys come at any moment between two frames
         press = page.keyboard.down if number % 2 == 0 else page.keyboard.up
         press("ArrowLeft")
-        _until(page, "waits", number + 1)
+        until(page, "waits", number + 1)
     waits: list[float] = page.evaluate("benchSeen.waits")
     return waits

@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -53,11 +53,13 @@ def chromium() -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def game_page(url: str, *, user: str, token: str, step: str = "1") -> Iterator[str]:
-    """The address of Hippodrome's own game page, for the trial server at `url`."""
+def game_page(
+    url: str, *, user: str, token: str, step: str = "1", trial: Mapping[str, Any] | None = None
+) -> Iterator[str]:
+    """The address of Hippodrome's own game page, for the trial server at `url` of a project with this `trial`."""
     state = {"state": "ready", "seconds": 0, "attempt": 1, "url": url, "userId": user, "token": token}
     game = Step(step, "game")
-    project = Project(id="bench", name="Bench", steps=[game], researcher="Bench")
+    project = Project(id="bench", name="Bench", steps=[game], researcher="Bench", trial=trial or {})
     view = pages.GameView(project, game, user, state, "/?poll=1", "/", "/", "", "ws://127.0.0.1:*")
     page = pages.game_page(view)
     with html_page(page.html, page.headers, {"/?poll=1": json.dumps(state)}) as address:

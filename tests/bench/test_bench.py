@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, data, gym, memory, pages, pictures, scale, seen, table, trial, warm
+from bench import control, data, gym, memory, pages, pictures, scale, scenes, seen, table, trial, warm
 from bench.bill import bill
 from deploy.cost import estimate
 from deploy.cost.prices import Prices
@@ -429,6 +429,17 @@ def test_frames_that_are_dear_or_late_or_changed_miss_their_goals(monkeypatch: p
     late = seen.Seen(dict.fromkeys(trial.RATES, 0.9), rates, rates, [30.0] * 40)
     missed = [row["name"] for row in trial._seen("a game", late, bare) if row["met"] is False]
     assert len(missed) == len(trial.RATES) + 2
+
+
+def test_objects_that_are_late_or_large_miss_their_goals() -> None:
+    def shown(share: float, wait: float, size: float, weight: int) -> scenes.Shown:
+        return scenes.Shown(seen.Seen({scenes.RATE: share}, {}, {scenes.RATE: 1.0}, [wait] * 9), size, weight)
+
+    good, bad = shown(1.0, 30.0, 400.0, 18_000), shown(0.9, 40.0, 4_000.0, 50_000)
+    rows = list(scenes.judged(good, shown(1.0, 30.0, 4_000.0, 14_000)))
+    assert_well_formed(rows)
+    assert all(row["met"] is not False for row in rows)
+    assert sum(row["met"] is False for row in scenes.judged(bad, bad)) == sum(row["met"] is not None for row in rows)
 
 
 def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.MonkeyPatch) -> None:

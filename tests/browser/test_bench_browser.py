@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from bench import seen
+from bench import scenes, seen
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
@@ -23,3 +23,14 @@ def test_drawn_frames_and_effects_of_keys_are_timed(
     assert 0 < found.share[30] <= 1.1
     assert found.gaps[30] > 0
     assert found.cpu[30] >= 0
+
+
+@pytest.mark.parametrize("objects", [True, False], ids=["objects", "frames"])
+def test_scenes_and_effects_of_keys_are_timed(chromium: Any, monkeypatch: pytest.MonkeyPatch, objects: bool) -> None:
+    monkeypatch.setattr(seen, "SECONDS", 1.0)
+    monkeypatch.setattr(seen, "PRESSES", 3)
+    found = scenes.look(chromium, objects=objects)
+    assert len(found.seen.waits) == 6
+    assert 0 < found.seen.share[scenes.RATE] <= 1.1
+    assert 0 < found.bytes_a_tick < 100_000
+    assert 0 < found.weight < scenes.MOST_WEIGHT
