@@ -72,7 +72,7 @@ const draws = {
     fill(fields);
   },
   rectangle(fields) {
-    const [left, top] = turn(fields, fields.width, fields.height);
+    const [left, top] = turned(fields, fields.width, fields.height);
     brush.beginPath();
     brush.rect(left, top, fields.width, fields.height);
     fill(fields);
@@ -100,7 +100,7 @@ const draws = {
     brush.font = `${pixelsHigh}px ${font}, sans-serif`;
     brush.textBaseline = "top";
     const lines = text.split("\n");
-    const [, top] = turn(fields, 0, 1.2 * pixelsHigh * lines.length);
+    const [, top] = turned(fields, 0, 1.2 * pixelsHigh * lines.length);
     brush.textAlign = "left";
     const share = fields.origin?.[0] ?? 0; // each line has its own width
     lines.forEach((each, number) => brush.fillText(each, -share * brush.measureText(each).width, top + 1.2 * pixelsHigh * number));
@@ -112,7 +112,7 @@ const draws = {
     const box = name === undefined ? image && [0, 0, image.bitmap.width, image.bitmap.height] : image?.frames.get(name);
     const width = fields.width ?? (box ? (fields.height ? fields.height * box[2] / box[3] : box[2]) : 32);
     const height = fields.height ?? (box ? width * box[3] / box[2] : 32);
-    const [left, top] = turn(fields, width, height);
+    const [left, top] = turned(fields, width, height);
     brush.imageSmoothingEnabled = !picture.pixelArt;
     if (box) brush.drawImage(image.bitmap, ...box, left, top, width, height);
     else {
@@ -124,7 +124,7 @@ const draws = {
 };
 
 // Turns about the object's origin, which lies at its x and y. Returns where its left and its top are then.
-function turn({ x, y, angle = 0, origin = [0, 0] }, width, height) {
+function turned({ x, y, angle = 0, origin = [0, 0] }, width, height) {
   brush.translate(x * unitX, y * unitY);
   brush.rotate(angle * Math.PI / 180);
   return [-origin[0] * width, -origin[1] * height];
