@@ -39,8 +39,8 @@ def steps(server, name="a1"):
 
 
 def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
-    server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 10})
-    client = played(server, open_client, frames=8, keys=["up"])
+    server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 5})
+    client = played(server, open_client, frames=6, keys=["up"])
     assert client.errors == [], server.said()
     assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
     lines = steps(server)
@@ -108,12 +108,14 @@ def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
     ],
 )
 def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_client, act, said):
-    server = launch(two_players(act=act), trial=TRIAL | {"startingFrameRate": 30})
-    client = played(server, open_client, frames=12)
+    server = launch(two_players(act=act), trial=TRIAL | {"startingFrameRate": 10})
+    client = played(server, open_client, frames=8)
     assert client.errors == [], "the participant can do nothing about it"
     parts = [line["players"]["right"] for line in steps(server)]
-    assert len(parts) >= 10
-    assert {(part["by"], part["action"]) for part in parts[1:]} == {("none", 0)}, "it idles"
+    assert len(parts) >= 6
+    assert {part["action"] for part in parts} == {0}, "it idles"
+    assert {part["by"] for part in parts} <= {"none", "late"}
+    assert parts[-1]["by"] == "none"
     (told,) = [line for line in server.said().splitlines() if "the policy of right (agent:Partner) failed: " in line]
     assert said in told
     assert "it idles until the episode is over" in server.said()

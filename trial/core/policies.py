@@ -45,7 +45,6 @@ class _Seat:
 
     def __init__(self, player: Player) -> None:
         self.player = player
-        self.late = 0
         self.begin()
 
     def begin(self) -> None:
@@ -104,10 +103,10 @@ class Policies:
         for name, seat in self._seats.items():
             if not due or name not in view.to_act or seat.player.by_program or seat.idles:
                 continue
-            if seat.asked is not None and self._seconds is None:
-                continue
+            if self._seconds is None and (seat.asked is not None or seat.answer is not None):
+                continue  # it still thinks, or what came late is taken first
             self._asks += 1
-            seat.asked, seat.asked_at, seat.asked_after = self._asks, now, steps
+            seat.asked, seat.asked_at, seat.asked_after, seat.answer = self._asks, now, steps, None
             seat.mask = view.masks.get(name)
             found.append(AskPolicy(name, self._asks, view.observations.get(name), view.infos.get(name), seat.mask))
         return found
