@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.browser.test_pages_browser import FLAWS, World, play, shot, tab, tell, world
+from tests.trial.conftest import Running, grid_agent
 
 __all__ = ["tab", "world"]  # fixtures
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
@@ -236,3 +238,75 @@ def test_the_words_of_the_projects_pages_are_not_taken_for_the_game_pages_own(to
     told.connections[0].send(json.dumps({"state": "playing", "episode": 1, "score": 5, "frameRate": 30}))
     tab.wait_for_selector(".hud #score:text('5')")
     assert tab.text_content("#text-instructions #score") == "1"
+
+
+# On a real server
+
+
+@pytest.mark.parametrize(("width", "height", "touch"), [(360, 740, True), (1280, 800, False)])
+def test_a_game_with_all_of_it_on_a_real_server(
+    world: World, chromium: Any, tmp_path: Path, width: int, height: int, touch: bool
+) -> None:
+    """Instructions, a countdown, the project's own keys, a limit, a page between two games, the last picture."""
+    section = {
+        **{"maxEpisodes": 2, "maxSteps": 25, "resetFreeze": 1.5, "episodeSeconds": 60, "startingFrameRate": 20},
+        **{"actionSpace": ["noop", "left", "right"], "keys": {"ArrowLeft": "left", "a": "left", "Enter": "right"}},
+        **{"labels": {"right": "Go right"}, "instructions": "rules", "betweenEpisodes": "pause"},
+    }
+    context = chromium.new_context(
+        viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch, reduced_motion="reduce"
+    )
+    tab, wrong = context.new_page(), []
+    tab.on("pageerror", lambda error: wrong.append(str(error)))
+    server = Running(tmp_path, grid_agent(1000), section, {})
+    try:
+        world.trial, world.texts, world.step = section, {"instructions": RULES, "betweenEpisodes": PAUSE}, 2
+        ready = {"state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
+        world.state = {**world.state, **ready}
+        tab.goto(world.url)
+        tab.click("text=Go to the game")
+        tab.wait_for_selector("#overlay-title:text('Ready?')")
+        shot(tab, f"{width}-real-ready")
+        assert tab.is_visible("#legend") is not touch
+        tab.click("#overlay-button")
+        tab.wait_for_selector("#overlay-title:text('Get ready')")
+        shot(tab, f"{width}-real-countdown")
+        tab.wait_for_selector("#overlay", state="hidden")
+        hold(tab, "#controls .others button" if touch else "Enter", touch)
+        tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
+        shot(tab, f"{width}-real-over")
+        tab.click("#overlay-button")
+        tab.click("text=Next game")
+        world.step, world.source = 3, "<h1>Next page</h1>"
+        tab.wait_for_selector("#overlay-title:text('The game is over')")
+        shot(tab, f"{width}-real-end")
+        assert tab.evaluate(FLAWS) == []
+        tab.click("#overlay-button")
+        tab.wait_for_selector("text=Next page")
+    finally:
+        server.process.kill()
+        server.wait()
+        context.close()
+    assert not wrong
+    recorded = [line for lines in server.recordings().values() for line in lines]
+    taken = [line["actionName"] for line in recorded if line["kind"] == "step" and line["human"] is not None]
+    assert taken
+    assert set(taken) == {"right"}
+    assert [line["limit"] for line in recorded if line["kind"] == "end"] == ["maxSteps", "maxSteps"]
+    said = [message for line in recorded for message in line.get("messages", ()) if "key" in message]
+    assert {message["key"] for message in said} == {"Enter"}
+
+
+def hold(tab: Any, what: str, touch: bool) -> None:
+    """Hold a key, or a finger on a button, for a while."""
+    if touch:
+        box = tab.locator(what).bounding_box()
+        finger = tab.context.new_cdp_session(tab)
+        point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        finger.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+        tab.wait_for_timeout(300)
+        finger.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    else:
+        tab.keyboard.down(what)
+        tab.wait_for_timeout(300)
+        tab.keyboard.up(what)
