@@ -221,13 +221,13 @@ _CODE_OR_TEXT = re.compile(
     r"""(?P<text>"(?:[^"\\\n]|\\.)*"|`(?:[^`\\$]|\\.|\$(?!\{)|\$\{(?:[^`{}]|`[^`]*`)*\})*`)|[^"`]+"""
 )
 """A text, a template with the code in it (which may have templates of its own), or other code."""
-_AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|[=?:{},;<>]) ?")
-"""Operators and brackets around which spaces mean nothing. Not + and -: `a + +b` is something else without spaces."""
+_AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|\*|[+-](?= [^-+])|[=?:{},;<>()[\]]) ?")
+"""Operators and brackets around which spaces mean nothing. `a + +b` is something else without them."""
 
 
 def _dense(code: str) -> str:
-    """Code without most spaces and line ends that mean nothing."""
-    return re.sub(r"([;{,(\[])\n", r"\1", _AROUND.sub(r"\1", code))
+    """Code without most spaces and line ends: each of our statements ends with a semicolon or a block."""
+    return re.sub(r"([;{},(\[])\n", r"\1", _AROUND.sub(r"\1", code))
 
 
 def _plain(name: str, text: str) -> str:

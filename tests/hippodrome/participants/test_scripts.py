@@ -119,11 +119,11 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
     ("source", "carried"),
     [
         ("  const a = (b) => ({ c: 1, d });\n", "const a=(b)=>({c:1,d});"),
-        ("  if (a !== b && c) return;\n", "if (a!==b&&c) return;"),
+        ("  if (a !== b && c) return;\n", "if(a!==b&&c)return;"),
         ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);'),
         ("a + +b - -c;\n", "a + +b - -c;"),
         ("a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`, 1);\n", "a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`,1);"),
-        ("{\n  a;\n}\nb()\n", "{a;}\nb()\n"),
+        ("{\n  a;\n}\nb()\n", "{a;}b()\n"),
     ],
 )
 def test_a_page_carries_a_script_without_comments_spaces_and_line_ends_but_texts_as_they_are(
