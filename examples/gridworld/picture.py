@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from forest import ACORNS, HEIGHT, WIDTH, Forest, Place
 
-FIELD, TOP = 80, 64  # pixels: the side of a field, and the room for words above the forest
-INK, MINE = "#26323a", "#1864aa"
+FIELD = 80  # pixels: the side of a field
+RING = "#1864aa"
 GRASS = ("#dcebcf", "#d2e4c3")
 GLIDE = 250  # milliseconds in which a player is seen to move
 
@@ -15,14 +15,14 @@ Object = dict[str, object]
 def draw(forest: Forest) -> dict[str, object]:
     objects = [*_ground(), *(_sprite(f"tree {place}", "tree", place) for place in sorted(forest.trees))]
     objects += [_sprite(f"acorn {place}", "acorn", place) for place in sorted(forest.acorns)]
-    objects += [_whose_turn(forest), _words(forest)]
+    objects.append(_whose_turn(forest))
     for player in ("partner", "you"):
         objects.append({**_sprite(player, player, forest.places[player]), "tween": GLIDE, "depth": 3})
     return {"objects": objects, "hud": f"{ACORNS - len(forest.acorns)} of {ACORNS} acorns, {forest.left} turns left"}
 
 
 def _corner(place: Place) -> tuple[int, int]:
-    return place[0] * FIELD, TOP + place[1] * FIELD
+    return place[0] * FIELD, place[1] * FIELD
 
 
 def _ground() -> list[Object]:
@@ -41,18 +41,7 @@ def _sprite(name: str, image: str, place: Place) -> Object:
 
 
 def _whose_turn(forest: Forest) -> Object:
-    """A ring around whoever is to move."""
+    """A ring around the player who is to move. The page says it in words."""
     x, y = _corner(forest.places[forest.turn])
     ring: Object = {"x": x + FIELD / 2, "y": y + FIELD / 2, "radius": FIELD / 2 - 3, "color": "#ffffff88"}
-    return {**ring, "id": "turn", "type": "circle", "outline": MINE, "outline_width": 4, "depth": 1, "tween": GLIDE}
-
-
-def _words(forest: Forest) -> Object:
-    if not forest.acorns:
-        said = "All acorns are collected!"
-    elif not forest.left:
-        said = "The turns are over"
-    else:
-        said = "Your turn: one step" if forest.turn == "you" else "Your partner thinks …"
-    middle: Object = {"x": WIDTH * FIELD / 2, "y": TOP / 2, "origin": (0.5, 0.5), "size": 28, "color": INK}
-    return {**middle, "id": "words", "type": "text", "text": said}
+    return {**ring, "id": "turn", "type": "circle", "outline": RING, "outline_width": 4, "depth": 1, "tween": GLIDE}
