@@ -149,7 +149,10 @@ def world() -> Iterator[World]:
 
     web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     game = serve(
-        here.play, "127.0.0.1", 0, select_subprotocol=lambda _, offered: here.spoken if here.spoken in offered else None
+        lambda connection: here.play(connection),  # noqa: PLW0108 - a test may put another `play` there
+        "127.0.0.1",
+        0,
+        select_subprotocol=lambda _, offered: here.spoken if here.spoken in offered else None,
     )
     here.url = f"http://127.0.0.1:{web.server_port}/"
     here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
+import struct
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +17,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser.test_pages_browser import FLAWS, World, shot, tab, world  # noqa: F401
+from local.rehearsal.study_process import ROOT
+from tests.browser.test_pages_browser import FLAWS, World, deflated_zeros, shot, tab, world  # noqa: F401
 from tests.trial.conftest import Running
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
@@ -193,3 +198,67 @@ def test_images_are_not_loaded_again_when_the_connection_comes_back(game: Any, w
     finally:
         again.process.kill()
         again.wait()
+
+
+def big(number: int) -> bytes:
+    """A PNG of a few bytes that says it has so many pixels on each side."""
+    head = b"IHDR" + struct.pack("!IIBBBBB", number, number, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack("!I", 13) + head + struct.pack("!I", zlib.crc32(head))
+
+
+SIZE_OF = """async (bytes) => {
+    const { width, height } = sizeOf(new DataView(new Uint8Array(bytes).buffer));
+    return [width, height];
+}"""
+
+
+@pytest.mark.parametrize(("form", "options"), [("PNG", {}), ("JPEG", {}), ("WEBP", {}), ("WEBP", {"lossless": True})])
+def test_the_page_knows_how_large_an_image_is_before_it_is_decoded(
+    tab: Any, form: str, options: dict[str, Any]
+) -> None:
+    out = io.BytesIO()
+    Image.new("RGB", (300, 77), "red").save(out, form, **options)
+    sizes = (ROOT / "web/game/sprites.js").read_text()
+    function = re.search(r"^function sizeOf\(view\).*?^}", sizes, re.DOTALL | re.MULTILINE)
+    jpeg = re.search(
+        r"^export (function jpegSize.*?^})", (ROOT / "web/game/frames.js").read_text(), re.DOTALL | re.MULTILINE
+    )
+    assert function is not None
+    assert jpeg is not None
+    tab.goto("about:blank")
+    script = f"(bytes) => {{ {jpeg[1]} {function[0]} return ({SIZE_OF})(bytes); }}"
+    assert tab.evaluate(script, list(out.getvalue())) == [300, 77]
+
+
+def test_a_hostile_server_cannot_fill_the_memory_with_images_or_scenes(world: World, tab: Any) -> None:
+    """It announces an image of gigabytes, sends one of absurd size, and a scene that unpacks to gigabytes."""
+    world.spoken = "hippodrome.3"
+    world.trial = {"scene": SCENE}
+    lost: list[int] = []
+    about = json.dumps({"type": "image/png"}).encode()
+    image = struct.pack("!I", len(about)) + about + big(60_000)
+
+    def play(connection: Any) -> None:
+        for text in connection:
+            message = json.loads(text)
+            if "token" in message:
+                assets = [{"name": "a", "bytes": 2**40, "hash": "a"}, {"name": "b", "bytes": len(image), "hash": "b"}]
+                said = {"UI": ["start"], "actionSpace": ["noop"], "state": "ready", "episode": 1, "maxEpisodes": 1}
+                connection.send(
+                    json.dumps({**said, "score": 0, "scene": SCENE | {"coordinates": "relative"}, "assets": assets})
+                )
+                connection.send(b"\x04" + struct.pack("!I", 1) + json.dumps({"new": True, "set": {}}).encode())
+            elif message.get("asset"):
+                lost.append(1)
+                connection.send(b"\x06" + struct.pack("!HI", 1, 0) + image)
+            elif message.get("command") == "start":
+                connection.send(b"\x05" + struct.pack("!I", 2) + deflated_zeros(2**28))
+
+    world.play = play  # type: ignore[method-assign]
+    world.step = 2
+    world.ready()
+    tab.goto(world.url)
+    tab.wait_for_selector("#overlay-button:visible")  # both images are given up
+    assert lost == [1]
+    tab.click("#overlay-button")
+    tab.wait_for_selector("text=Connection lost")

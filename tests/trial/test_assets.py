@@ -121,7 +121,14 @@ def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(assets, "MOST_ASSETS", 2)
     found = loaded(tmp_path, a_png=image(), b_png=image(), c_png=image())
     assert list(found.by_name) == ["a", "b"]
-    assert found.problems == ("assets: more than 2 images or 20 MB; assets/c.png and all after it are not shown",)
+    assert found.problems == (
+        "assets: more than 2 images, 20 MB or 64 megapixels; assets/c.png and all after it are not shown",
+    )
+
+
+def test_the_pixels_of_all_images_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assets, "MOST_PIXELS_IN_ALL", 8)
+    assert list(loaded(tmp_path, a_png=image(), b_png=image()).by_name) == ["a"]
 
 
 # ---- drawn on the server

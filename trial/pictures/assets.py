@@ -23,6 +23,8 @@ MOST_BYTES = 4 * 2**20
 MOST_BYTES_IN_ALL = 20 * 2**20
 LONGEST_SIDE = 4096
 """Pixels; some phones draw no larger images."""
+MOST_PIXELS_IN_ALL = 64 * 2**20
+"""A browser needs four bytes for each."""
 MOST_FRAMES = 2_000
 
 IMAGE = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)
@@ -83,7 +85,7 @@ def load(project: Path, folder: str) -> Assets:
         return Assets()
     found: dict[str, Asset] = {}
     problems: list[str] = []
-    total = 0
+    total = pixels = 0
     try:
         paths = list(_files(place))
     except OSError as error:
@@ -100,10 +102,11 @@ def load(project: Path, folder: str) -> Assets:
                 raise AssetError("has the name of another image, apart from its extension")
             asset = read(path, name)
             total += len(asset.packed)
-            if len(found) == MOST_ASSETS or total > MOST_BYTES_IN_ALL:
+            pixels += asset.size[0] * asset.size[1]
+            if len(found) == MOST_ASSETS or total > MOST_BYTES_IN_ALL or pixels > MOST_PIXELS_IN_ALL:
                 problems.append(
-                    f"{folder}: more than {MOST_ASSETS} images or {MOST_BYTES_IN_ALL >> 20} MB; "
-                    f"{shown} and all after it are not shown"
+                    f"{folder}: more than {MOST_ASSETS} images, {MOST_BYTES_IN_ALL >> 20} MB or "
+                    f"{MOST_PIXELS_IN_ALL >> 20} megapixels; {shown} and all after it are not shown"
                 )
                 break
             found[name] = asset

@@ -37,7 +37,7 @@ async function inflateRows({ width, height, channels }, buffer) {
 }
 
 // No more than the header says is unpacked: a small message must not become a huge picture.
-async function inflate(packed, least, most) {
+export async function inflate(packed, least, most) {
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
   const reader = stream.getReader();
   const pieces = [];
@@ -65,7 +65,7 @@ async function decodeLossy({ width, height }, buffer) {
 }
 
 // What the frame header (SOF) of a JPEG says. Segments begin with 0xff, a marker and their length.
-function jpegSize(view) {
+export function jpegSize(view) {
   for (let at = 2; at + 9 <= view.byteLength; at += 2 + view.getUint16(at + 2)) {
     const marker = view.getUint16(at);
     if (marker < 0xffc0 || marker === 0xffda) return null;

@@ -1,12 +1,13 @@
 // Games that are drawn by objects (docs/wire.md, "A scene"): what the server says of them, put together and shown.
 import { SUBPROTOCOLS } from "./connection.js";
-import { canDecode, DIFFERENCE, HEADER, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
+import { canDecode, DIFFERENCE, HEADER, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { askForSprites, takeSpritePart } from "./sprites.js";
 import { find, make, setText } from "./page.js";
 import { paint, place, prepare, putAway } from "./painter.js";
 
 const SCENE_HEADER = 5; // bytes: kind, id
+const LARGEST_SCENE = 16 * 2 ** 20; // bytes, unpacked; trial/pictures/scene.py makes none so large
 const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
 const UNSAID = { angle: 0, alpha: 1 }; // what these are if the server leaves them out
 
@@ -27,8 +28,8 @@ sheet.replaceSync(`.hud { flex-wrap: wrap; }
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, sheet];
 
 async function unpackScene(kind, buffer) {
-  const stream = kind === 5 && new Blob([buffer.slice(SCENE_HEADER)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
-  const bytes = stream ? await new Response(stream).arrayBuffer() : buffer.slice(SCENE_HEADER);
+  const body = buffer.slice(SCENE_HEADER);
+  const bytes = kind === 5 ? await inflate(body, 2, LARGEST_SCENE) : body;
   const said = JSON.parse(utf8.decode(bytes));
   return { draw: () => change(said) };
 }

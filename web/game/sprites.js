@@ -1,11 +1,14 @@
 // The images of a game that is drawn by objects: asked for before it begins, with a bar that shows how far they are.
 import { send } from "./connection.js";
+import { jpegSize } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { showOverlay } from "./overlay.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const PART_HEADER = 7; // bytes: kind, number, offset
+const LARGEST_ASSET = 8 * 2 ** 20; // bytes; trial/pictures/assets.py sends none so large
+const SPRITE_SIDE = 4096; // pixels
 const AT_ONCE = 16; // images that are asked for; a server refuses more than 200 messages a second
 
 const loaded = new Map(); // hash -> `{ bitmap, frames, animations }`, kept while the page is open; null if it is broken
@@ -13,6 +16,7 @@ let table = []; // of the server's
 let arrived = new Map(); // number -> the bytes so far
 let asked = 0; // numbers below this were asked for on this connection, unless they were there already
 let underWay = 0;
+let pixelsLeft = 64 * 2 ** 20; // pixels of all images, of which a browser needs four bytes each
 const bar = make("progress", { max: 1, value: 0, hidden: true });
 bar.setAttribute("aria-label", "Pictures of the game");
 find("overlay-hint").after(bar);
@@ -23,6 +27,7 @@ const loading = () => table.some((each) => !loaded.has(each.hash));
 
 export function askForSprites(assets) {
   table = assets;
+  for (const { bytes, hash } of assets) if (!(bytes <= LARGEST_ASSET)) loaded.set(hash, null);
   askForMore();
   tell();
 }
@@ -60,8 +65,23 @@ export async function takeSpritePart(buffer, ready) {
 async function opened(bytes) {
   const end = 4 + new DataView(bytes.buffer).getUint32(0);
   const { type, frames = {}, animations = {} } = JSON.parse(new TextDecoder().decode(bytes.subarray(4, end)));
+  const image = new DataView(bytes.buffer, end);
+  const { width, height } = sizeOf(image);
+  if (!(width <= SPRITE_SIDE && height <= SPRITE_SIDE && pixelsLeft >= width * height)) throw new Error("no such image");
+  pixelsLeft -= width * height;
   const bitmap = await createImageBitmap(new Blob([bytes.subarray(end)], { type }));
   return { bitmap, frames: new Map(Object.entries(frames)), animations: new Map(Object.entries(animations)) };
+}
+
+// What the file says of its size: no more is decoded than there is room for.
+function sizeOf(view) {
+  if (view.getUint32(0) === 0x89504e47) return { width: view.getUint32(16), height: view.getUint32(20) }; // PNG
+  if (view.getUint32(0) !== 0x52494646) return jpegSize(view) ?? {};
+  const three = (at) => view.getUint16(at, true) + (view.getUint8(at + 2) << 16); // WebP: of one of three kinds
+  if (view.getUint8(15) === 0x58) return { width: 1 + three(24), height: 1 + three(27) };
+  if (view.getUint8(15) === 0x20) return { width: view.getUint16(26, true) & 0x3fff, height: view.getUint16(28, true) & 0x3fff };
+  const bits = view.getUint32(21, true);
+  return { width: 1 + (bits & 0x3fff), height: 1 + ((bits >> 14) & 0x3fff) };
 }
 
 let told = false; // the overlay shows how far they are
