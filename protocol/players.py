@@ -16,6 +16,8 @@ AGENT_PLAYER = "agent:"
 """Before the name of a class of agent.py."""
 SAMPLE = "sample:"
 """Before a policy's file: actions are drawn by its output."""
+ONNXRUNTIME = "onnxruntime==1.32.0"
+"""The package that runs policies' files, in the version that was tested (requirements/dev.txt)."""
 WHO = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
 
 MOST_PLAYERS = 64

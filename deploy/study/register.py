@@ -197,7 +197,12 @@ def register(account: Account, installation: Installation, folder: Path, request
 
 def _remarks(folder: Path, found: project_folder.Study) -> list[str]:
     """What to say of a project without mistakes."""
-    lacking = [*agent_imports.requirement_remarks(folder), *agent_imports.missing(folder)] if found.plays else []
+    lacking = [
+        *agent_imports.requirement_remarks(folder),
+        *agent_imports.missing(folder),
+        *agent_imports.of_players(folder, found.config),
+    ]
+    lacking = lacking if found.plays else []
     return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *lacking]]
 
 

@@ -19,8 +19,10 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from hippodrome.config import Config, Diagnostic, hippo_requirements, layout
-from hippodrome.config.diagnostics import printable
+from hippodrome.config.diagnostics import Keys, printable
+from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT, REQUIREMENTS
+from protocol import players
 
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Python's image brings
@@ -71,13 +73,41 @@ def missing(folder: Path) -> list[Diagnostic]:
     return list(found.values())
 
 
-def loaded(folder: Path, names: Iterable[str]) -> list[str]:
+def of_players(folder: Path, config: Config) -> list[Diagnostic]:
+    """A mistake for each package that config.yml needs and the image lacks: what runs the files of policies, and that
+    of a game which is a module and is made without an agent.py. A remark if it may come with another package."""
+    image, source = _image(folder), read_source(folder)
+    found: dict[str, Diagnostic] = {}
+    for path, what, line in _needed_by_players(folder, config):
+        name = canonicalize_name(line.partition("==")[0])
+        if name in image.held or line in found:
+            continue
+        needs, reason = f"{what} needs the package {name}", _unknown(image)
+        sentence = f"{needs}, which is not in the servers' image; write {line} into {REQUIREMENTS}"
+        if reason:
+            sentence = f"{needs}; whether it is in the servers' image is not checked, because {reason}"
+        found[line] = source.diagnostic(path, sentence, remark=bool(reason))
+    return list(found.values())
+
+
+def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str, str]]:
+    """What in config.yml needs a package, and the line for requirements.txt that brings it."""
+    for path, file in players.files(config.trial.players):
+        yield ("trial", "players", *path), file, players.ONNXRUNTIME
+    game = config.trial.game or ""
+    package = game.partition(".")[0]
+    if package != game and all(map(str.isidentifier, game.split("."))) and layout.find(folder).agent is None:
+        yield ("trial", "game"), "this game", wanted(package) or package
+
+
+def loaded(folder: Path, config: Config, names: Iterable[str]) -> list[str]:
     """What to say of top-level modules that were loaded while the agent played, if the image lacks them and no file of
     the project imports them itself: such as pygame, with which Gymnasium draws CartPole."""
     if missing(folder):  # what the missing packages bring is not said again
         return []
     image = _image(folder)
     named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
+    named |= {line.partition("==")[0] for _, _, line in _needed_by_players(folder, config)}
     lacking = (_lacking(name, image)[0] for name in sorted(set(names) - named))
     return [f"playing loads a package that {AGENT} does not name: {message}" for message in lacking if message]
 

@@ -277,7 +277,7 @@ class _Reading:
         """What was loaded here, and participants' servers lack."""
         if not agent_imports.may_run_on_aws(self._config):
             return []
-        found = agent_imports.loaded(self._folder, self._report.get("loaded", ()))
+        found = agent_imports.loaded(self._folder, self._config, self._report.get("loaded", ()))
         return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:

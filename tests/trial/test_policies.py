@@ -15,9 +15,9 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from onnx import TensorProto, helper
 
+from protocol.players import ONNXRUNTIME
 from testing import onnx_files
 from trial.core.seeds import policy_seed
-from trial.policies import onnx as policies_onnx
 from trial.policies.load import load
 from trial.policies.policy import PolicyError
 from trial.policies.thread import PolicyThread
@@ -336,7 +336,7 @@ def test_without_onnxruntime_it_says_what_to_install(tmp_path: Path, monkeypatch
     assert refusal("p.onnx", tmp_path) == (
         f"p.onnx needs the package onnxruntime, which is not installed; write {wanted} into requirements.txt"
     )
-    assert wanted == policies_onnx.PACKAGE
+    assert wanted == ONNXRUNTIME
 
 
 # ---- the thread

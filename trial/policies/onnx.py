@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from protocol.players import ONNXRUNTIME
 from trial.policies.observations import MASK, Array, Encoding, Shape, encodings, fitted, shown, without_mask, zero
 from trial.policies.policy import Mask, PolicyError, legal
 
-PACKAGE = "onnxruntime==1.32.0"
-"""What runs the files, in the version that was tested (requirements/dev.txt)."""
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
 """Inputs that are no observation, by their value where one observation comes at a time."""
@@ -164,7 +163,7 @@ def _session(spec: str, file: Path) -> Any:
         import onnxruntime  # noqa: PLC0415 - a server without such a policy does without
     except ImportError as error:
         raise PolicyError(
-            f"{spec} needs the package onnxruntime, which is not installed; write {PACKAGE} into requirements.txt"
+            f"{spec} needs the package onnxruntime, which is not installed; write {ONNXRUNTIME} into requirements.txt"
         ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import agent_imports, read_project
+from protocol.players import ONNXRUNTIME
 from tests.local.check.test_check import config, run
 from tests.local.conftest import ROOT, write_study
 
@@ -184,3 +185,44 @@ def test_what_playing_loads_is_said_of_nothing_else(folder: Path) -> None:
     begin(folder, "import numpy, PIL.Image\ntry:\n    import psutil\nexcept ImportError:\n    psutil = None")
     status, lines = run(folder)
     assert (status, [line for line in lines if "image" in line]) == (0, [])
+
+
+# --- what config.yml needs
+
+
+def needed(folder: Path) -> list[str]:
+    return [str(problem) for problem in agent_imports.of_players(folder, read_project(folder))]
+
+
+def test_what_runs_the_files_of_policies_is_to_be_named(folder: Path) -> None:
+    config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx, c: sample:policies/q.onnx}")
+    (line,) = needed(folder)
+    assert line.endswith(
+        "trial.players.b: policies/p.onnx needs the package onnxruntime, which is not in the servers' image; "
+        f"write {ONNXRUNTIME} into requirements.txt"
+    )
+    status, lines = run(folder)
+    assert (status, line in lines) == (1, True)
+    (folder / "requirements.txt").write_text("onnxruntime\n")
+    assert needed(folder) == []
+
+
+def test_the_package_of_a_game_that_is_a_module_is_to_be_named(folder: Path) -> None:
+    config(folder, "game: ", "game: pettingzoo.classic.rps_v2 # ")
+    assert needed(folder) == [], "agent.py makes the game"
+    (folder / "agent.py").unlink()
+    (line,) = needed(folder)
+    assert (
+        "trial.game: this game needs the package pettingzoo, which is not in the servers' image; write pettingzoo"
+        in line
+    )
+    (folder / "requirements.txt").write_text("pettingzoo==1.27.0\n")
+    assert needed(folder) == []
+
+
+def test_what_policies_need_is_left_open_where_requirements_are_not_known(folder: Path) -> None:
+    config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx}")
+    (folder / "requirements.txt").write_text("not_installed_of_nobody\n")
+    (line,) = needed(folder)
+    assert "remark: " in line
+    assert "is not checked, because not-installed-of-nobody is not installed here" in line
