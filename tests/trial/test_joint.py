@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.joint import Joint, JointAdapter
@@ -410,3 +412,64 @@ def test_spaces_may_be_one_dictionary_space_for_all_players(tmp_path: Path) -> N
     adapter = joint(tmp_path, DICT_SPACES)
     assert adapter.action_spaces == {"left": ("0", "1"), "right": ("0", "1", "2")}
     assert adapter.observation_spaces["right"].shape == (5,)
+
+
+# ---- whatever is returned
+
+PART = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.floats(),
+    st.text(max_size=3),
+    st.lists(st.integers(-1, 2), max_size=3),
+    st.builds(np.zeros, st.integers(0, 3)),
+    st.dictionaries(
+        st.sampled_from(["to_act", "action_mask", "a"]), st.lists(st.integers(0, 1), max_size=3), max_size=2
+    ),
+)
+PARTS = st.one_of(PART, st.dictionaries(st.sampled_from([0, 1, "0", "__all__", "x", None]), PART, max_size=3))
+RETURNED_BY_STEP = st.one_of(
+    PART,
+    st.lists(PARTS, min_size=3, max_size=6),
+    st.dictionaries(st.sampled_from(["observation", "rewards", "done", "truncated", "infos", "more"]), PARTS),
+)
+
+
+@given(results=st.lists(RETURNED_BY_STEP, max_size=4))
+def test_whatever_step_returns_is_read_or_refused_with_a_sentence(results: list[Any]) -> None:
+    class Returning:
+        possible_agents = (0, 1)
+
+        def start(self, _game: str) -> None: ...
+
+        def reset(self) -> Any:
+            return {0: 0, 1: 0}, {}
+
+        def step(self, _actions: Any) -> Any:
+            return self.result
+
+        def render(self) -> None: ...
+
+        def close(self) -> None: ...
+
+    agent = Returning()
+    adapter = AgentAdapter(Path("/nowhere"), "none", ("left", "right"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("trial.agent.agent.load", lambda _folder: agent)
+        found = start(adapter)
+    assert isinstance(found, JointAdapter)
+    now, _ = found.reset(1)
+    for result in results:
+        agent.result = result
+        if now.over:
+            return
+        try:
+            now = found.step(dict.fromkeys(now.to_act, 0))
+        except AgentError as error:
+            assert str(error).strip()
+            continue
+        assert set(now.rewards) == set(now.terminated) == set(now.truncated) == {"0", "1"}
+        assert now.to_act <= {"0", "1"}
+        assert all(len(mask) == 2 and any(mask) for mask in now.masks.values())
+        assert now.over == all(now.terminated[name] or now.truncated[name] for name in ("0", "1"))
+        assert not (now.over and now.to_act)

@@ -183,8 +183,8 @@ class JointAdapter:
     def _end(self, said: Mapping[Any, Any], ended: dict[str, bool]) -> None:
         """Note for whom it is over. The value for all counts for those who are still in the game."""
         for player, value in self._by_player("step", said).items():
-            ended[player] = ended[player] or bool(value)
-        if bool(said.get(ALL)):
+            ended[player] = ended[player] or _truth(value, f"step() returned for {player}, as its end,")
+        if _truth(said.get(ALL), f"step() returned for {ALL}"):
             ended.update(dict.fromkeys((player for player in self.players if player not in self._gone), True))
 
     def _by_player(self, method: str, values: Mapping[Any, Any]) -> dict[str, Any]:
@@ -209,15 +209,14 @@ class JointAdapter:
         return set(self.players) - {str(key) for key in now}
 
     def _to_act(self, infos: Mapping[str, Mapping[str, Any]]) -> frozenset[str]:
-        """Who chooses an action now: whom PettingZoo or the agent's `to_act` names, else all whose info allows it."""
+        """Who chooses an action now: whom the agent's `to_act` or PettingZoo names, else all whose info allows it."""
         there = [player for player in self.players if player not in self._gone]
+        method = getattr(self._adapter.agent, TO_ACT, None)
         named: Any = None
-        if self._turns is not None:
+        if callable(method):
+            named = method()
+        elif self._turns is not None:
             named = self._turns.selected()
-        else:
-            method = getattr(self._adapter.agent, TO_ACT, None)
-            if callable(method):
-                named = method()
         if named is not None:
             several = isinstance(named, Iterable) and not isinstance(named, str)
             names = {str(name) for name in (named if several else (named,))}
@@ -225,7 +224,9 @@ class JointAdapter:
             if unknown:
                 raise AgentError(f"to_act() returned {unknown[0]!r}; the players are {self._shown()}")
             return frozenset(player for player in there if player in names)
-        return frozenset(player for player in there if infos.get(player, {}).get(TO_ACT, True))
+        return frozenset(
+            player for player in there if _truth(infos.get(player, {}).get(TO_ACT, True), f"{TO_ACT} of {player} is")
+        )
 
     def _masks(
         self, observations: Mapping[str, Any], infos: Mapping[str, Mapping[str, Any]]
@@ -239,7 +240,12 @@ class JointAdapter:
                 observation = observations.get(player)
                 mask = observation.get(MASK) if isinstance(observation, Mapping) else None
             if mask is not None:
-                legal = tuple(np.asarray(mask).reshape(-1).astype(bool).tolist())
+                try:
+                    legal = tuple(np.asarray(mask).reshape(-1).astype(bool).tolist())
+                except (TypeError, ValueError):
+                    raise AgentError(
+                        f"{MASK} of {player} is {type(mask).__name__}, and no array of zeros and ones"
+                    ) from None
                 count = len(self.action_spaces[player])
                 if len(legal) != count:
                     raise AgentError(f"{MASK} of {player} has {len(legal)} values; there are {count} actions")
@@ -250,6 +256,13 @@ class JointAdapter:
 
 def _info(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {} if value is None else {"info": value}
+
+
+def _truth(value: Any, what: str) -> bool:
+    try:
+        return bool(value)
+    except (TypeError, ValueError):  # such as an array of several numbers
+        raise AgentError(f"{what} {type(value).__name__}, which is neither true nor false") from None
 
 
 def _reward(player: str, value: Any) -> float:
