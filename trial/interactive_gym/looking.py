@@ -25,7 +25,8 @@ class Look:
     actions: int
     """How many there are; of several players, the most that one has."""
     human: Any
-    dict_observations: bool
+    joined_as_sorted: bool
+    """The policies' observations are arrays, or dictionaries whose keys come in their sorted order."""
     objects: bool
     """The game is drawn by objects, and not by pixels."""
     game: Any
@@ -50,7 +51,7 @@ def look(config: RemoteConfig) -> Look:
             several=agent.several,
             actions=max(counts.values()),
             human=next(iter(agent.game.human_players)) if agent.game else None,
-            dict_observations=isinstance(seen, Mapping),
+            joined_as_sorted=not isinstance(seen, Mapping) or list(seen) == sorted(seen, key=str),
             objects=isinstance(picture, Mapping),
             game=agent.game,
         )
@@ -61,9 +62,8 @@ def look(config: RemoteConfig) -> Look:
 def is_file(config: RemoteConfig, plays: Any) -> bool:
     """Whether a policy is an ONNX file that Hippodrome plays by itself: no function of the experiment's own does."""
     ours = (onnx_inference_utils.load_onnx_policy_fn, onnx_inference_utils.onnx_model_inference_fn)
-    own = (config.load_policy_fn, config.policy_inference_fn) != ours
-    none = config.load_policy_fn is None and config.policy_inference_fn is None
-    return isinstance(plays, str) and plays.endswith(".onnx") and (none or not own)
+    functions = (config.load_policy_fn, config.policy_inference_fn)
+    return isinstance(plays, str) and plays.endswith(".onnx") and functions in (ours, (None, None))
 
 
 def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ from trial.interactive_gym.inference_utils import sample_action_via_softmax
 
 ORT_SESSIONS: dict[str, Any] = {}
 """Models by their paths."""
+_TYPES = {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(double)": np.float64}
 
 
 def load_onnx_policy_fn(onnx_model_path: str) -> str:
@@ -27,18 +28,24 @@ def load_onnx_policy_fn(onnx_model_path: str) -> str:
 
 
 def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
-    """The model's outputs for these inputs. Inputs that it does not have are left out."""
+    """The model's output for these inputs. Others that it asks for, such as recurrent states, are zeros."""
     session = ORT_SESSIONS[model_path]
-    known = {each.name for each in session.get_inputs()}
-    return session.run(["output"], {name: value for name, value in input_dict.items() if name in known})
+    feeds = {
+        each.name: input_dict[each.name] if each.name in input_dict else _zeros(each) for each in session.get_inputs()
+    }
+    return session.run(["output"], feeds)
+
+
+def _zeros(port: Any) -> Any:
+    """What an input gets that is no observation: zeros; a plain `seq_lens` is 1."""
+    shape = [size if isinstance(size, int) else 1 for size in port.shape]
+    fill = 1 if port.name == "seq_lens" and len(shape) <= 1 else 0
+    return np.full(shape, fill, _TYPES.get(port.type, np.float32))
 
 
 def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
     """The action that a model draws for an observation; the parts of a dictionary are joined in their order."""
     if isinstance(observation, Mapping):
         observation = np.hstack([np.asarray(part).reshape(-1) for part in observation.values()])
-    inputs = {
-        "obs": np.asarray(observation, np.float32).reshape(1, -1),
-        "state_ins": np.zeros(1, np.float32),  # RLlib's exports ask for it
-    }
+    inputs = {"obs": np.asarray(observation, np.float32).reshape(1, -1)}
     return sample_action_via_softmax(inference_onnx_model(inputs, onnx_model_path)[0])

@@ -198,7 +198,7 @@ def _players(
             files[f"policies/{file.name}"] = file.read_bytes()
         elif isinstance(plays, str) and plays.endswith(".onnx"):
             remark(f"the policy of {player} is not found: {plays}")
-        if looking.is_file(config, plays) and not look.dict_observations:
+        if looking.is_file(config, plays) and look.joined_as_sorted:
             found[player] = (f"sample:policies/{Path(plays).name}", "")
         else:
             found[player] = (f"agent:Policy{number}", f"Policy{number}")
