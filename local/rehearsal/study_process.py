@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +22,7 @@ from bots.verification import document
 from hippodrome.config.folder import read_source
 from protocol import environment, handover
 from protocol.keys import handover_key
+from protocol.players import SAMPLE
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
@@ -157,6 +159,7 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
             (folder / path.name).symlink_to(path.resolve())
     tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+    _copy_policies(project, folder, (tree.get("trial") or {}).get("players"))
     known_as = source.adapted.at(("project", "id"))  # it may come from the folder's name, which the copy has not
     if isinstance(known_as, str):
         tree["project"]["id"] = known_as
@@ -179,6 +182,25 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         changes.append("the game may be stopped (`ui.stop`)")
     (folder / config.name).write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return changes
+
+
+def _copy_policies(project: Path, folder: Path, players: object) -> None:
+    """Copy the policies' files and what lies beside them: a server reads none that a link leads to."""
+    for top in {Path(file).parts[0] for file in _policy_files(players) if (project / file).is_file()}:
+        (folder / top).unlink()
+        if (project / top).is_dir():
+            shutil.copytree(project / top, folder / top)
+        else:
+            shutil.copy2(project / top, folder / top)
+
+
+def _policy_files(players: object) -> Iterator[str]:
+    """The files of policies that `trial.players` names, for all groups. What is wrong there is said by local mode."""
+    for plays in players.values() if isinstance(players, dict) else ():
+        if isinstance(plays, dict):
+            yield from _policy_files(plays)
+        elif isinstance(plays, str) and plays.endswith(".onnx"):
+            yield plays.removeprefix(SAMPLE)
 
 
 def logs_of(data: Path) -> Path:

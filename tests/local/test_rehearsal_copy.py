@@ -1,0 +1,29 @@
+"""The copy of a project that bots walk through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from local.rehearsal.study_process import copy_of
+from trial.policies.load import _file
+
+CONFIG = """
+project: {id: pair, name: Pair, steps: {1: hello, 2: game, finalStep: bye}}
+trial:
+  game: pair
+  players: {0: {a: human, b: policies/one.onnx}, 1: {a: human, b: "sample:two.onnx"}}
+"""
+
+
+def test_the_policies_of_the_copy_can_be_read(tmp_path: Path) -> None:
+    project, copy = tmp_path / "mine", tmp_path / "copy"
+    for name in ("policies/one.onnx", "two.onnx", "steps/hello.html", "steps/bye.html"):
+        (project / name).parent.mkdir(parents=True, exist_ok=True)
+        (project / name).write_text(name)
+    (project / "config.yml").write_text(CONFIG)
+    copy_of(project, copy)
+    for name in ("policies/one.onnx", "two.onnx"):
+        assert _file(copy, name).read_text() == name
+    assert yaml.safe_load((copy / "config.yml").read_text())["trial"]["ui"]["stop"]
