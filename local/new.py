@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -21,11 +22,13 @@ ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = "examples"
 OF_A_STUDY = ("config.yml", "agent.py", "steps", "requirements.txt")
 """What belongs to the study at the top, whose folder holds Hippodrome too."""
+README = "README.md"
 LEFT_OUT = shutil.ignore_patterns("data", "data-*", "erased-*.json", "__pycache__", "*.pyc", ".*")
 """Data, caches and hidden files, wherever they lie in a template."""
 
 _ID = ("project", "id")
 _ID_LINE = re.compile(r"(?P<key>\s*id:\s*)[^#\s]+(?P<comment>.*)", re.DOTALL)
+_LINK = re.compile(r"\]\((\.\./[^)#\s]+)")
 _NO_LETTERS = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -72,6 +75,7 @@ def make_study(template: Template, folder: Path) -> str:
         folder.mkdir(parents=True, exist_ok=True)
         _copy(template, folder)
         _name(folder, project_id)
+        _lead(template, folder)
     except OSError as error:
         raise NotMade(f"{folder} cannot be written: {error.strerror or error}") from None
     return project_id
@@ -123,6 +127,22 @@ def _name(folder: Path, project_id: str) -> None:
         raise NotMade(f"{file}: the id is not on a line of its own; write id: {project_id} there yourself")
     lines[number] = f"{found['key']}{project_id}{found['comment']}"
     file.write_text("".join(lines), encoding="utf-8")
+
+
+def _lead(template: Template, folder: Path) -> None:
+    """Let the commands and links in README.md and config.yml lead to the new folder, and to Hippodrome from there."""
+    example = re.compile(rf"(?<![\w/]){EXAMPLES}/{re.escape(template.folder.name)}(?=[/\s`]|$)")
+    for file in (folder / README, folder / OF_A_STUDY[0]):
+        if template.at_top or not file.is_file():
+            continue
+        text = example.sub(lambda _: shlex.quote(str(folder)), file.read_text(encoding="utf-8"))
+        text = _LINK.sub(lambda link: f"]({_from(folder, template.folder / link[1])}", text)
+        file.write_text(text, encoding="utf-8")
+
+
+def _from(folder: Path, target: Path) -> str:
+    """The path of a target as a link in the folder has it."""
+    return Path(os.path.relpath(target.resolve(), folder.resolve())).as_posix()
 
 
 def _id_of(folder: Path) -> str:

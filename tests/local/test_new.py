@@ -102,6 +102,27 @@ def test_only_the_id_changes_in_the_file(root: Path, tmp_path: Path) -> None:
     assert (tmp_path / "mine" / "config.yml").read_text() == before.replace("id: maze", "id: mine")
 
 
+def test_commands_and_links_of_the_copy_lead_where_they_should(root: Path, tmp_path: Path) -> None:
+    (root / "docs").mkdir()
+    (root / "docs" / "objects.md").write_text("# Objects")
+    readme = "make run PROJECT=examples/maze\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
+    (root / "examples" / "maze" / "README.md").write_text(readme)
+    folder = tmp_path / "deep" / "mine"
+    new.make_study(new.templates(root)["maze"], folder)
+    command, rest = (folder / "README.md").read_text().split("\n")
+    assert command == f"make run PROJECT={folder}"
+    assert rest == f"`python {folder}/draw.py` tests/examples/maze [objects](../../clone/docs/objects.md#types)"
+
+
+@pytest.mark.parametrize("name", sorted(set(new.templates()) - {TOP}))
+def test_the_links_of_each_copy_lead_somewhere(tmp_path: Path, name: str) -> None:
+    new.make_study(new.templates()[name], tmp_path / "mine")
+    text = (tmp_path / "mine" / "README.md").read_text()
+    links = re.findall(r"\]\((?!http)([^)#]+)", text)
+    assert [link for link in links if not (tmp_path / "mine" / link).exists()] == []
+    assert f"make run PROJECT={tmp_path}/mine" in text
+
+
 def test_an_empty_folder_is_filled(root: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     new.make_study(new.templates(root)["maze"], tmp_path / "mine")
