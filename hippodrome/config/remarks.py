@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import Source, read_source
+from protocol import keyboard
+from protocol.values import printable
 
 START: Keys = ("project", "events", "startServerStep")
 STEPS: Keys = ("project", "steps")
@@ -21,6 +23,8 @@ UI: Keys = ("trial", "ui")
 ARROWS = ("left", "right", "up", "down")
 PARTS = frozenset({*ARROWS, "fire"})
 """Keys that act together with others: "up" and "right" are "upright" (`trial/core/controls.py`)."""
+
+KEYS: Keys = ("trial", "keys")
 
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = "no effect: servers get the certificate of the installation"
@@ -69,7 +73,7 @@ def without_a_key(config: Config) -> Remark | None:
 def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
     """What to say about arrows of `ui` that none of these actions is called after, alone or together with others."""
     names = [name.strip().lower() for name in actions]
-    if not names or not config.game_steps:
+    if not names or not config.game_steps or config.trial.keys:
         return
     keys = "|".join(re.escape(key) for key in sorted({*PARTS, *names}))
     for arrow in ARROWS:
@@ -81,7 +85,7 @@ def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator
 def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
     """What to say about arrows of `ui` if the environment has so many actions, whose names are not known."""
     arrows = [arrow for arrow in ARROWS if getattr(config.trial.ui, arrow)]
-    if not arrows or not config.game_steps:
+    if not arrows or not config.game_steps or config.trial.keys:
         return
     *first, last = arrows
     shown = f"the arrows {', '.join(first)} and {last} are" if first else f"the arrow {last} is"
@@ -91,6 +95,43 @@ def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
         f"{shown} not shown: the environment has {count} actions without names; name them all, in their order: "
         f"actionSpace: [{example}]",
     )
+
+
+def keys_by_player(config: Config) -> Iterator[tuple[Keys, Mapping[str, str]]]:
+    """The maps of keys, each with its path."""
+    keys = config.trial.keys
+    if any(isinstance(each, dict) for each in keys.values()):
+        yield from (((*KEYS, player), each) for player, each in keys.items())
+    else:
+        yield KEYS, keys
+
+
+def combined_after_single(config: Config) -> Iterator[Remark]:
+    """What to say about keys that act together, if one of them acts by itself as soon as it goes down."""
+    if config.trial.input != "single":
+        return
+    for path, keys in keys_by_player(config):
+        for combined in keys:
+            parts = keyboard.parts(combined)
+            alone = [part for part in parts if len(parts) > 1 and part in keys]
+            if alone:
+                first = keyboard.shown(alone[0])
+                said = f'with input: single, {first} does "{keys[alone[0]]}" before the other key is down'
+                yield Remark((*path, combined), said)
+
+
+def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
+    """What to say about keys of actions that the environment does not have, whose names it gives itself."""
+    names = [name.strip().lower() for name in actions]
+    for path, keys in keys_by_player(config):
+        if path != KEYS:
+            continue  # players may have different actions
+        for combined, action in keys.items():
+            if action not in names:
+                known = printable(", ".join(names), 100)
+                yield Remark(
+                    (*path, combined), f"the key does nothing: no action is called {action}; there are {known}"
+                )
 
 
 def _names_a_certificate(config: Config) -> bool:
@@ -113,6 +154,7 @@ def remarks(config: Config) -> Iterator[Remark]:
     if config.project.plain_clients:
         links = "; signedLinks does not protect the game then" if config.project.signed_links else ""
         yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")
+    yield from combined_after_single(config)
     idle = without_a_key(config)
     if idle is not None:
         yield idle

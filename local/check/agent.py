@@ -373,7 +373,7 @@ class _Reading:
         return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
 
     def _arrows(self) -> list[Diagnostic]:
-        """Arrows of `ui` without an action, if the environment says what its actions are called, or does not."""
+        """Arrows of `ui` and keys that do nothing, as far as the environment says what its actions are called."""
         names, source = self._report.get("actions", ()), read_source(self._folder)
         if not names:
             return []
@@ -381,7 +381,9 @@ class _Reading:
             found = remarks.arrows_of_unnamed_actions(self._config, len(names))
         else:
             found = remarks.arrows_without_an_action(self._config, names)
-        return [self._in_config(*said, remark=True) for said in found if source.names(said.path)]
+        arrows = [said for said in found if source.names(said.path)]
+        keys = [] if self._config.trial.action_space else remarks.keys_without_an_action(self._config, names)
+        return [self._in_config(*said, remark=True) for said in (*arrows, *keys)]
 
     def _call(self) -> str:
         call = self._report.get("call", "start")

@@ -46,6 +46,10 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
     used = _pages(names, config)
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
     found = [_unused(folder, unused)] if unused else []
+    for file in dict.fromkeys(file for page in config.game_pages for file in page.files):
+        if fragments.prepare(source_of(file)).has_fields:
+            message = "its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
+            found.append(Diagnostic(f"{folder.name}/{file.name}", None, "", message, remark=True))
     if config.project.use_aws:
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
         found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]

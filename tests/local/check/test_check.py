@@ -524,6 +524,39 @@ def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) 
     assert looked(folder) == []
 
 
+def test_a_key_without_an_action_of_the_environment_is_remarked(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "  keys:\n    ArrowLeft: left\n    Space: jump\n")
+    agent(folder, "class Env:", "class Env:\n    def get_action_meanings(self):\n        return ['NOOP', 'LEFT']")
+    (line,) = tried(folder)
+    assert line.endswith("the key does nothing: no action is called jump; there are noop, left")
+
+
+def test_with_keys_the_arrows_of_ui_are_not_remarked(folder: Path) -> None:
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  keys: {a: left}")
+    config(folder, "left: true", "left: true, right: true")
+    assert looked(folder) == []
+
+
+def test_keys_that_act_before_their_combination_are_remarked(folder: Path) -> None:
+    keys = "keys: {a: left, b+a: noop, c+d: noop}"
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: [noop, left]\n  {keys}")
+    assert looked(folder) == []
+    config(folder, keys, f"{keys}\n  input: single")
+    (line,) = looked(folder)
+    assert line.endswith('trial.keys.b+a: with input: single, a does "left" before the other key is down')
+
+
+def test_fields_of_a_page_that_the_game_page_shows_are_remarked(folder: Path) -> None:
+    (folder / "steps" / "rules.html").write_text("<h1>Rules</h1><label>Age <input name='age'></label>")
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  instructions: rules")
+    (line,) = looked(folder)
+    assert line == (
+        "steps/rules.html: remark: its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
+    )
+    (folder / "steps" / "rules.html").write_text("<h1>Rules</h1><p>{{ nobody.knows }}</p>")
+    assert any("nobody" in line for line in looked(folder))
+
+
 @pytest.mark.parametrize(
     ("seconds", "slow"),
     [
