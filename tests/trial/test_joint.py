@@ -427,11 +427,14 @@ PART = st.one_of(
         st.sampled_from(["to_act", "action_mask", "a"]), st.lists(st.integers(0, 1), max_size=3), max_size=2
     ),
 )
-PARTS = st.one_of(PART, st.dictionaries(st.sampled_from([0, 1, "0", "__all__", "x", None]), PART, max_size=3))
+BY_PLAYER = st.fixed_dictionaries({}, optional={0: PART, 1: PART, "__all__": PART})
+PARTS = st.one_of(BY_PLAYER, PART, st.dictionaries(st.sampled_from(["0", "x", None]), PART, max_size=3))
+NUMBERS = st.fixed_dictionaries({}, optional={0: st.integers(-9, 9), 1: st.none()})
 RETURNED_BY_STEP = st.one_of(
-    PART,
+    st.tuples(BY_PLAYER, NUMBERS, BY_PLAYER, BY_PLAYER, BY_PLAYER),
     st.lists(PARTS, min_size=3, max_size=6),
     st.dictionaries(st.sampled_from(["observation", "rewards", "done", "truncated", "infos", "more"]), PARTS),
+    PART,
 )
 
 
