@@ -120,6 +120,36 @@ def test_an_object_that_did_not_change_is_the_same_one() -> None:
     assert second.objects["other"] is not first.objects["other"]
 
 
+def test_an_object_that_was_changed_in_place_is_seen() -> None:
+    ball, path = dict(BALL), {"id": "path", "type": "line", "points": [[0, 0], [1, 1]]}
+    first = as_scene([ball, path])
+    ball["x"] = 0.75
+    path["points"][0][0] = 0.5  # type: ignore[index]
+    second = as_scene([ball, path], first)
+    assert (second.objects["ball"]["x"], second.objects["path"]["points"][0]) == (0.75, [0.5, 0])
+    assert first.objects["path"]["points"][0] == [0, 0]
+
+
+def test_an_object_whose_number_becomes_an_array_is_checked() -> None:
+    first = as_scene([BALL])
+    scene = as_scene([BALL | {"x": np.zeros(3)}], first)
+    assert scene.problems == ("the object 'ball' cannot be drawn: its x is no number",)
+
+
+def test_a_permanent_object_that_comes_again_unchanged_can_become_an_ordinary_one() -> None:
+    wall = BALL | {"id": "wall", "permanent": True}
+    again = as_scene([wall], as_scene([wall]))
+    assert again.permanent == {"wall"}
+    assert as_scene([wall | {"permanent": False}], again).permanent == frozenset()
+
+
+def test_what_came_last_of_an_id_is_what_counts_in_the_next_scene_too() -> None:
+    first = as_scene([BALL, BALL | {"x": 0.9, "origin": 3}])
+    assert as_scene([BALL], first).objects["ball"]["x"] == 0.5
+    removed = as_scene([BALL, {"id": "ball", "remove": True}], first)
+    assert list(as_scene([BALL], removed).objects) == ["ball"]
+
+
 # ---- what is wrong
 
 
@@ -191,7 +221,7 @@ def test_all_points_of_a_scene_are_bounded() -> None:
     lines = [{"id": n, "type": "line", "points": [(0, 0)] * MOST_POINTS} for n in range(6)]
     scene = as_scene(lines)
     assert len(scene.objects) == 4
-    assert scene.problems == ("the scene has more than 20000 points; the objects after these are left out",)
+    assert scene.problems == ("the scene has more than 20000 points; some objects are left out",)
 
 
 @pytest.mark.parametrize(

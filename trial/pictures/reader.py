@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from protocol.trial import Scene as SceneSection
+from trial.pictures import frames
 from trial.pictures.assets import Assets
 from trial.pictures.picture import Picture, as_picture
 from trial.pictures.scene import Scene, images_of
@@ -42,6 +45,8 @@ class PictureReader:
     def read(self, value: Any, view: str = "") -> Picture:
         """The picture that `render()` returned, for this player's view. Raises FrameError or SceneError."""
         self.due = False
+        if isinstance(value, np.ndarray):  # the usual case, with nothing around it
+            return frames.as_frame(value)
         picture = as_picture(value, self._before.get(view), scenes=self._section is not None)
         if isinstance(picture, Scene):
             self._before[view] = picture

@@ -58,6 +58,8 @@ class Scene:
     """The ids of objects that stay until the episode ends, though `render()` does not return them again."""
     problems: tuple[str, ...] = field(default=(), compare=False)
     """What is wrong with single objects, in sentences for the researcher. What cannot be drawn is left out."""
+    given: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, compare=False, repr=False)
+    """What `render()` returned of objects that need no second check if it returns the same again."""
 
 
 def is_scene(picture: Any) -> bool:
@@ -76,42 +78,84 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
     the same object in both scenes. Raises SceneError if `value` is neither form or has far too many objects.
     """
     given, hud = _parts(value)
-    problems: list[str] = []
-    objects: dict[str, CheckedObject] = {}
-    permanent: set[str] = set()
-    known: Mapping[str, CheckedObject] = {} if before is None else before.objects
-    if before is not None and before.permanent:
-        objects = {name: each for name, each in before.objects.items() if name in before.permanent}
-        permanent = set(before.permanent)
-    kept = set(objects)
-    points = 0
+    making = _Making(before or Scene({}))
     for index, each in enumerate(given):
+        making.add(each, index)
+    return making.scene(hud)
+
+
+class _Making:
+    """A scene in the making, after the scene `before`."""
+
+    def __init__(self, before: Scene) -> None:
+        self._before = before
+        self._permanent = set(before.permanent)
+        self._objects = {name: each for name, each in before.objects.items() if name in before.permanent}
+        self._kept = set(self._objects)
+        """Permanent objects that were not returned again so far."""
+        self._given: dict[str, Mapping[str, Any]] = {}
+        self._problems: list[str] = []
+        self._points = 0
+
+    def add(self, value: Any, index: int) -> None:
+        """Add an object, change it or remove it."""
+        said = len(self._problems)
         try:
-            name, fields = _fields(each, index, problems)
+            given = _mapping(value)
+            name = self._unchanged(given)
+            if name is not None:
+                self._put(name, self._before.objects[name], given)
+                self._given[name] = self._before.given[name]
+                return
+            name, fields = _fields(given, index, self._problems)
+            self._given.pop(name, None)
             if fields.get("remove"):
-                objects.pop(name, None)
-                permanent.discard(name)
-                continue
-            checked = _checked(fields, name, problems)
+                self._objects.pop(name, None)
+                self._permanent.discard(name)
+                return
+            checked = _checked(fields, name, self._problems)
         except Wrong as error:
-            problems.append(f"{_called(each, index)} {error}")
-            continue
-        points += len(checked.get("points", ()))
-        if points > MOST_POINTS_IN_ALL:
-            problems.append(
-                f"the scene has more than {MOST_POINTS_IN_ALL} points; the objects after these are left out"
-            )
-            break
-        if name in objects and name not in kept:
-            problems.append(f"two objects have the id {name!r}; the later one counts")
-        kept.discard(name)
-        (permanent.add if fields.get("permanent") else permanent.discard)(name)
-        same = known.get(name)
-        objects[name] = same if same == checked and same is not None else checked
-    if permanent:  # in the scenes after this one they come first in any case
-        stays = {name: each for name, each in objects.items() if name in permanent}
-        objects = stays | {name: each for name, each in objects.items() if name not in permanent}
-    return Scene(objects, hud, frozenset(permanent), tuple(dict.fromkeys(problems))[:MOST_PROBLEMS])
+            self._problems.append(f"{_called(value, index)} {error}")
+            return
+        self._points += len(checked.get("points", ()))
+        if self._points > MOST_POINTS_IN_ALL:
+            self._problems.append(f"the scene has more than {MOST_POINTS_IN_ALL} points; some objects are left out")
+            return
+        earlier = self._before.objects.get(name)
+        self._put(name, earlier if earlier is not None and earlier == checked else checked, fields)
+        # What may change in place, and what something was to be said of, is checked again each time.
+        if said == len(self._problems) and all(type(each) in _SCALARS for each in given.values()):
+            self._given[name] = dict(given)
+
+    def _unchanged(self, given: Mapping[str, Any]) -> str | None:
+        """The object's id if just the same was given before, and found well."""
+        name = given.get("id") or given.get("uuid")
+        try:
+            return name if type(name) is str and self._before.given.get(name) == given else None
+        except ValueError:  # an array of NumPy's
+            return None
+
+    def _put(self, name: str, checked: CheckedObject, fields: Mapping[str, Any]) -> None:
+        if name in self._objects and name not in self._kept:
+            self._problems.append(f"two objects have the id {name!r}; the later one counts")
+        self._kept.discard(name)
+        if fields.get("permanent"):
+            self._permanent.add(name)
+        else:
+            self._permanent.discard(name)
+        self._objects[name] = checked
+
+    def scene(self, hud: str) -> Scene:
+        """What was made. Permanent objects come first, as they will in the scenes after this one."""
+        objects, permanent = self._objects, self._permanent
+        if permanent:
+            stays = {name: each for name, each in objects.items() if name in permanent}
+            objects = stays | {name: each for name, each in objects.items() if name not in permanent}
+        problems = tuple(dict.fromkeys(self._problems))[:MOST_PROBLEMS]
+        return Scene(objects, hud, frozenset(permanent), problems, self._given)
+
+
+_SCALARS = frozenset({str, int, float, bool, type(None)})
 
 
 def images_of(scene: Scene) -> frozenset[str]:
