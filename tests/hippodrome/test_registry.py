@@ -107,6 +107,22 @@ def test_a_page_nobody_uploaded_is_named(platform: FakePlatform) -> None:
     assert MASTER_LIST not in platform.documents.kept
 
 
+def test_a_page_of_the_game_nobody_uploaded_is_named(platform: FakePlatform) -> None:
+    told = registration(trial={"game": "x/Y-v0", "instructions": "rules"}, gamePages={"instructions": 2})
+    told["events"]["stopServerStep"] = "finalStep"
+    told["steps"].insert(1, {"key": "2", "page": "game", "variants": 0})
+    assert register(told) == {
+        "problems": [f"trial.instructions: rules-{number}.html has not been uploaded" for number in (0, 1)]
+    }
+
+
+@pytest.mark.parametrize("pages", [{"betweenEpisodes": 1}, {"instructions": -1}, {"instructions": "2"}, [], None])
+def test_groups_of_pages_that_the_trial_does_not_name_are_refused(platform: FakePlatform, pages: object) -> None:
+    told = registration(trial={"instructions": "rules"}, gamePages=pages)
+    (problem,) = register(told)["problems"]
+    assert problem.startswith("gamePages")
+
+
 @pytest.mark.parametrize("project", [None, [], "x", {}, {"id": "../x"}, {"id": "maze", "steps": "all"}, {"id": 7}])
 def test_what_is_not_a_project_is_refused_in_words(platform: FakePlatform, project: object) -> None:
     assert register(project)["problems"]
