@@ -65,7 +65,9 @@ def test_a_participant_says_good_and_bad_and_sees_that_it_was_heard(
     chromium: Any, study: StudyProcess, width: int, height: int
 ) -> None:
     narrow, name = width < 600, f"teacher-{width}"
-    context = chromium.new_context(viewport={"width": width, "height": height}, has_touch=narrow, is_mobile=narrow)
+    context = chromium.new_context(
+        viewport={"width": width, "height": height}, has_touch=narrow, is_mobile=narrow, reduced_motion="reduce"
+    )
     context.set_default_timeout(45_000)
     page = context.new_page()
     come_to_the_game(page, with_user(study.link, name))
