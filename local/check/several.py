@@ -141,10 +141,13 @@ class Game:
         return self._config.pace == "turns" or step % self._config.frame_skip == 0
 
     def _asked(self, name: str, now: Joint) -> int | None:
-        policy, seen, info = self._policies[name], now.observations.get(name), now.infos.get(name, {})
-        began = time.monotonic()
-        if not self._progress.call(f"policy {name} act", lambda: policy.act(seen, info, now.masks.get(name))):
+        def act() -> int:
+            began = time.monotonic()
+            action = self._policies[name].act(now.observations.get(name), now.infos.get(name, {}), now.masks.get(name))
+            self._paces[name].took(time.monotonic() - began)  # without what reporting takes
+            return action
+
+        if not self._progress.call(f"policy {name} act", act):
             return None
-        self._paces[name].took(time.monotonic() - began)
         self._last[name] = self._progress.result
         return self._last[name]
