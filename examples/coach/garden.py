@@ -7,7 +7,7 @@ import numpy as np
 WIDTH, HEIGHT = 8, 5
 START, STATION = (0, 0), (7, 0)
 FLOWERS = frozenset((column, 0) for column in range(1, 7))
-"""As in the simulated grid of the COACH paper, the straight way leads through what is to be avoided."""
+"""The straight way leads through what is to be avoided."""
 MOVES = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
 AT_STATION, ON_FLOWERS = 5.0, -1.0
 LONGEST = 40
