@@ -93,7 +93,7 @@ def _try(report: Path) -> None:
     if not progress.call("players", lambda: who_plays(config, spaces, group)):
         return
     players = progress.result
-    progress.callbacks = _callbacks(player, progress, config.callback_seconds)
+    progress.callbacks = _callbacks(player, players, progress, config.callback_seconds)
     if isinstance(player, JointAdapter):
         game = Game(player, players, config, folder, progress)
         if not player.steps_itself and progress.known["names"] > (progress.known["count"] or math.inf):
@@ -165,11 +165,14 @@ def _seen_idle(
     return True
 
 
-def _callbacks(player: AgentAdapter | JointAdapter, progress: _Progress, seconds: float) -> Callbacks:
+def _callbacks(
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: _Progress, seconds: float
+) -> Callbacks:
     """The agent's callbacks, which are told what happens as on a server."""
+    humans = tuple(each.name for each in players if each.human)
     return Callbacks(
         player.callbacks,
-        About("check", "check", None),
+        About("check", "check", None, tuple(each.name for each in players), humans),
         lambda: player.env,
         seconds=seconds,
         stamp=dict,

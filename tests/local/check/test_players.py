@@ -267,3 +267,16 @@ def test_an_idle_action_of_which_that_cannot_be_said_is_not_remarked(folder: Pat
     """Action 0 does nothing; the game moves by itself; it plays differently each time."""
     world(folder, wind, still)
     assert not [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
+
+
+def test_callbacks_are_told_of_all_players(folder: Path) -> None:
+    (folder / "agent.py").write_text(
+        AGENT.replace(
+            "    def close(self):",
+            "    def on_tick(self, session):\n"
+            "        assert (session.players, session.humans) == (('left', 'right'), ('left',))\n"
+            "        assert set(session.actions) == set(session.scores) == {'left', 'right'}\n\n"
+            "    def close(self):",
+        )
+    )
+    assert tried(folder, "random") == []
