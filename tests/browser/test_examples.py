@@ -1,0 +1,121 @@
+"""The examples with two players in a real Chromium: a participant plays by keys or fingers, wide and on a phone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bots.links import with_user
+from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from testing.held_study import HeldStudy
+from tests.browser.conftest import SHOTS
+from trial.recordings.recording import read
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytest.importorskip("onnxruntime")
+pytest.importorskip("slime_volleyball")
+pytest.importorskip("cogrid")
+
+FLAWS = (Path(__file__).parent / "flaws.js").read_text()
+SIZES = [(1280, 800), (360, 740)]
+STATE = "wanted => document.getElementById('mode').dataset.state === wanted"
+COLOURS = """() => {
+  const canvas = document.getElementById("screen");
+  const { width, height } = canvas;
+  const copy = Object.assign(document.createElement("canvas"), { width, height });
+  const context = copy.getContext("2d");
+  context.drawImage(canvas, 0, 0);
+  const { data } = context.getImageData(0, 0, width, height);
+  const found = new Set();
+  for (let at = 0; at < data.length; at += 4) found.add((data[at] << 16) | (data[at + 1] << 8) | data[at + 2]);
+  return found.size;
+}"""
+"""How many colours the picture has."""
+
+Held = Callable[[str], StudyProcess]
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
+    """An example, held once for all tests of the file, in a copy whose game can be ended with a button."""
+    studies: dict[str, HeldStudy] = {}
+
+    def hold(name: str) -> StudyProcess:
+        if name not in studies:
+            folder = tmp_path_factory.mktemp(name)
+            copy_of(ROOT / "examples" / name, folder / "project")
+            studies[name] = HeldStudy(folder / "project", folder / "data")
+            studies[name].start()
+        return studies[name]
+
+    yield hold
+    for study in studies.values():
+        study.clear()
+
+
+def come_to_the_game(page: Any, link: str) -> None:
+    page.goto(link)
+    for box in page.get_by_role("checkbox").all():
+        box.check()
+    page.get_by_role("button", name="I agree").click()
+    page.get_by_role("combobox").select_option("no")
+    page.get_by_role("button", name="Continue").click()
+    page.wait_for_selector("#play:not([hidden])")
+    page.wait_for_function(STATE, arg="ready")
+
+
+def press(page: Any, key: str, button: str, *, narrow: bool, milliseconds: int) -> None:
+    """Hold the key, or on a phone the button on the screen."""
+    if narrow:
+        box = page.get_by_role("button", name=button, exact=True).bounding_box()
+        point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        touch = page.context.new_cdp_session(page)
+        touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+        page.wait_for_timeout(milliseconds)
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    else:
+        page.keyboard.down(key)
+        page.wait_for_timeout(milliseconds)
+        page.keyboard.up(key)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    ("example", "presses", "wanted"),
+    [
+        ("slime-volleyball", [("ArrowRight", "right", 600), ("ArrowUp", "Jump", 200)], {"right", "up"}),
+        ("overcooked", [("ArrowLeft", "left", 60)] * 3 + [(" ", "Take / put", 60)], {"left", "pickup"}),
+    ],
+)
+def test_a_participant_plays(
+    chromium: Any, held: Held, example: str, presses: list[Any], wanted: set[str], width: int, height: int
+) -> None:
+    study, narrow, name = held(example), width < 600, f"ada-{width}"
+    context = chromium.new_context(viewport={"width": width, "height": height}, has_touch=narrow, is_mobile=narrow)
+    context.set_default_timeout(45_000)
+    page, complaints = context.new_page(), []
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    come_to_the_game(page, with_user(study.link, name))
+    page.locator("#overlay-button").click()
+    page.wait_for_function(STATE, arg="playing")
+    page.wait_for_timeout(4_000)  # the first picture stands for a while
+    for key, button, milliseconds in presses:
+        press(page, key, button, narrow=narrow, milliseconds=milliseconds)
+        page.wait_for_timeout(150)
+    assert page.evaluate(COLOURS) > 20
+    SHOTS.mkdir(exist_ok=True)
+    page.screenshot(path=SHOTS / f"{width}-{example}.png", full_page=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate(FLAWS) == []
+    page.once("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="End the game").click()
+    page.wait_for_selector("body[data-step='4']")
+    assert complaints == []
+    context.close()
+    (recording,) = (study.data / example / "users" / name / "trials").glob("*/*.gz")
+    steps = [line for line in read(recording.read_bytes()) if line["kind"] == "step"]
+    assert {step["actionName"] for step in steps if step["by"] == "human"} == wanted
