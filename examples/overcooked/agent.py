@@ -51,12 +51,13 @@ def _sprite(name, frame, cell, **more):
 
 
 def _room(kitchen):
-    """Floor and tables: they never change."""
+    """Floor and tables: they never change. They overlap by a pixel, so that no line is seen between them."""
     rows, columns = kitchen.size
     cells = [(row, column) for row in range(rows) for column in range(columns)]
-    floor = [_sprite(f"floor {cell}", "floor", cell, depth=-2, permanent=True) for cell in cells]
+    still = {"width": TILE + 1, "height": TILE + 1, "permanent": True}
+    floor = [_sprite(f"floor {cell}", "floor", cell, depth=-2, **still) for cell in cells]
     return floor + [
-        _sprite(f"table {cell}", "counter" if name == "wall" else name, cell, depth=-1, permanent=True)
+        _sprite(f"table {cell}", "counter" if name == "wall" else name, cell, depth=-1, **still)
         for cell, name in kitchen.fixed.items()
         if name != "pot"
     ]

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import copy
+import sys
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from cogrid.cogrid_env import CoGridEnv
-from cogrid.envs import cramped_room_config
-from cogrid.envs.overcooked.agent import OvercookedAgent
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
+
+# Where pygame is installed, cogrid loads it for its windows, which take time and memory and are never opened here.
+HIDDEN = [name for name in ("pygame",) if name not in sys.modules]
+sys.modules.update(dict.fromkeys(HIDDEN))
+from cogrid.cogrid_env import CoGridEnv  # noqa: E402
+from cogrid.envs import cramped_room_config  # noqa: E402
+from cogrid.envs.overcooked.agent import OvercookedAgent  # noqa: E402
+
+for _name in HIDDEN:
+    del sys.modules[_name]
 
 Cell = tuple[int, int]
 """Row and column, from the upper left corner."""
 
-ACTIONS = ("up", "down", "left", "right", "pickup", "toggle", "noop")
-UP, DOWN, LEFT, RIGHT, PICKUP, TOGGLE, NOOP = range(len(ACTIONS))
+ACTIONS = ("up", "down", "left", "right", "pickup", "noop")
+UP, DOWN, LEFT, RIGHT, PICKUP, NOOP = range(len(ACTIONS))
+OF_THE_PACKAGE = (0, 1, 2, 3, 4, 6)
+"""The package's numbers of these actions. Its action 5, `toggle`, does nothing in these kitchens."""
+
 STEPS = {UP: (-1, 0), DOWN: (1, 0), LEFT: (0, -1), RIGHT: (0, 1)}
 FACING = (RIGHT, DOWN, LEFT, UP)
 """The package's directions, as the actions that turn there."""
@@ -102,7 +113,7 @@ class Overcooked(ParallelEnv):
         return self._game.reset(seed=seed)
 
     def step(self, actions: dict[int, int]) -> tuple[dict[int, Any], ...]:
-        given = {agent: int(actions[agent]) for agent in self.possible_agents}
+        given = {agent: OF_THE_PACKAGE[int(actions[agent])] for agent in self.possible_agents}
         observations, rewards, terminations, truncations, infos = self._game.step(given)
         self.soups += rewards[0] >= SOUP_REWARD
         self.agents = list(self._game.agents)

@@ -1,4 +1,4 @@
-"""Draw the pictures of this study: `python make_assets.py` writes `assets/kitchen.png` and `.json`. Needs Pillow.
+"""Draw the pictures of this study: `python make_assets.py` writes `assets/kitchen.png` and `.json` (Pillow and numpy).
 
 `kitchen.png` is an atlas: all pictures in one file. `kitchen.json` says where each is in it.
 """
@@ -9,6 +9,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageDraw
 
 ASSETS = Path(__file__).parent / "assets"
@@ -17,6 +18,9 @@ FINER = 4
 """Pictures are drawn so many times larger, and then made smaller: smooth edges."""
 
 COLUMNS = 6
+EDGE = 2
+"""Around each picture its outermost pixels are repeated so often: a browser that scales it would mix in the next."""
+
 Colour = tuple[int, ...]
 
 FLOOR, JOINT = (232, 222, 204), (218, 206, 184)
@@ -175,11 +179,13 @@ def pictures() -> dict[str, Image.Image]:
 def main() -> None:
     found = pictures()
     rows = math.ceil(len(found) / COLUMNS)
-    atlas, frames = Image.new("RGBA", (COLUMNS * TILE, rows * TILE)), {}
+    cell = TILE + 2 * EDGE
+    atlas, frames = Image.new("RGBA", (COLUMNS * cell, rows * cell)), {}
     for number, (name, picture) in enumerate(found.items()):
         row, column = divmod(number, COLUMNS)
-        atlas.paste(picture, (column * TILE, row * TILE))
-        frames[name] = {"frame": {"x": column * TILE, "y": row * TILE, "w": TILE, "h": TILE}}
+        wider = np.pad(np.asarray(picture), ((EDGE, EDGE), (EDGE, EDGE), (0, 0)), mode="edge")
+        atlas.paste(Image.fromarray(wider), (column * cell, row * cell))
+        frames[name] = {"frame": {"x": column * cell + EDGE, "y": row * cell + EDGE, "w": TILE, "h": TILE}}
     ASSETS.mkdir(exist_ok=True)
     atlas.quantize(128, Image.Quantize.FASTOCTREE).save(ASSETS / "kitchen.png", optimize=True)
     (ASSETS / "kitchen.json").write_text(json.dumps({"frames": frames}, indent=1) + "\n")

@@ -146,7 +146,7 @@ def by_network(network: Network, chance: random.Random, astray: float) -> Player
 
 
 def export(network: Network, path: Path, about: str) -> None:
-    """Write the network as ONNX: observation (batch, numbers) to the values of the actions (batch, 7)."""
+    """Write the network as ONNX: observation (batch, numbers) to the values of the actions (batch, 6)."""
     first, bias, second, last = network.weights
     # The scaling is part of the first layer.
     scaled = first / network.deviation[:, None]
