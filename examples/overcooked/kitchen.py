@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-# Where pygame is installed, cogrid loads it for its windows, which take time and memory and are never opened here.
-HIDDEN = [name for name in ("pygame",) if name not in sys.modules]
+# Where these are installed, cogrid loads them for its own drawing: time and memory for what is never drawn here.
+HIDDEN = [name for name in ("cv2", "pygame") if name not in sys.modules]
 sys.modules.update(dict.fromkeys(HIDDEN))
 from cogrid.cogrid_env import CoGridEnv  # noqa: E402
 from cogrid.envs import cramped_room_config  # noqa: E402
