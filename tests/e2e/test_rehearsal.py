@@ -260,23 +260,6 @@ def test_the_copy_differs_only_where_it_must(project: Any, tmp_path: Path) -> No
     assert copy_of(tmp_path / "copy", tmp_path / "second") == []
 
 
-def test_policies_lie_in_the_copy_itself(project: Any, tmp_path: Path) -> None:
-    """A trial takes none from outside of the project's folder."""
-    import yaml
-
-    folder = project(players={"a": "human", "b": "policies/deep/b.onnx", "c": "c.onnx", "d": "random"})
-    for name in ("policies/deep/b.onnx", "c.onnx", "other/e.onnx"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(name.encode())
-    copy_of(folder, tmp_path / "copy")
-    copy = (tmp_path / "copy").resolve()
-    assert yaml.safe_load((copy / "config.yml").read_text())["trial"]["players"]["c"] == "c.onnx"
-    for name in ("policies/deep/b.onnx", "c.onnx"):
-        assert (copy / name).resolve().is_relative_to(copy)
-        assert (copy / name).read_bytes() == name.encode()
-    assert not (copy / "other" / "e.onnx").resolve().is_relative_to(copy)
-
-
 def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: Path) -> None:
     import yaml
 
