@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_files import CLOSING, StepFileError, open_folder
 from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
+from protocol import players
 from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
 
 if TYPE_CHECKING:
@@ -71,7 +73,7 @@ def read_project(folder: Path) -> Config:
     checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
     steps, missing_files = _step_files(folder, checked)
     game_pages, more_missing = _game_pages(folder, checked, steps)
-    missing_files += more_missing
+    missing_files += [*more_missing, *_missing_policies(source.layout, checked)]
     mistakes = [source.diagnostic(m.path, m.message, line=m.line) for m in (*checked.mistakes, *missing_files)]
     mistakes += [source.diagnostic(m.path, m.message, line=m.line) for m in source.parsed.mistakes]
     agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
@@ -85,6 +87,19 @@ def read_project(folder: Path) -> Config:
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
     return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
+
+
+def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
+    """Policies' files that `trial.players` names and that there are not."""
+    for path, file in players.files(checked.trial.players):
+        if not (layout.agent_folder / file).is_file():
+            near = sorted(one.relative_to(layout.agent_folder).as_posix() for one in _policies(layout.agent_folder))
+            hint = f"; there are {', '.join(near[:5])}" if near else ""
+            yield Mistake(("trial", "players", *path), f"there is no file {file} beside agent.py{hint}")
+
+
+def _policies(folder: Path) -> Iterator[Path]:
+    return folder.glob("policies/**/*.onnx")
 
 
 def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:

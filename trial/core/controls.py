@@ -125,6 +125,8 @@ class Controls:
         """The action of the step that begins now: its index, and whether a human asked for it."""
         if self._presses:
             return self._presses.popleft(), True
+        if not self._held and not self._tapped and self._press_left <= 0:
+            return self.default, False
         keys = [*self._tapped, *(key for key in self._held if key not in self._tapped)]
         self._tapped.clear()
         self._unseen.clear()

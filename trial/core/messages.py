@@ -284,6 +284,8 @@ def state(
 
 
 def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]:
+    if starts_in is None and time_left is None:
+        return {}
     times = {"startsIn": starts_in, "timeLeft": time_left}
     return {name: round(seconds, 3) for name, seconds in times.items() if seconds is not None}
 

@@ -425,6 +425,8 @@ class Trial:
         return False
 
     def _do_commands(self) -> None:
+        if not self._commands:
+            return
         commands, self._commands = self._commands, []
         for command in commands:
             self._timing.skip()

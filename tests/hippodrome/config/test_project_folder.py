@@ -33,6 +33,18 @@ def test_a_page_in_the_game_that_is_not_there_is_named(folder: Path) -> None:
     assert one(folder, text) == "trial.instructions: there is no brief.html in steps/; did you mean briefing?"
 
 
+def test_a_policys_file_that_is_not_there_is_named_with_those_that_there_are(folder: Path) -> None:
+    (folder / "policies/small").mkdir(parents=True)
+    (folder / "policies/small/partner.onnx").touch()
+    text = small(trial="players: {left: human, right: policies/partner.onnx}\n")
+    assert one(folder, text) == (
+        "trial.players.right: there is no file policies/partner.onnx beside agent.py; there are "
+        "policies/small/partner.onnx"
+    )
+    text = small(trial="players: {0: {left: human, right: 'sample:policies/small/partner.onnx'}}\n")
+    assert read(folder, text).trial.players == {"0": {"left": "human", "right": "sample:policies/small/partner.onnx"}}
+
+
 def test_a_study_without_a_game_needs_no_pages_of_one(folder: Path) -> None:
     text = "project: {id: paper, steps: {1: consent, 2: survey}}\ntrial: {instructions: nowhere}"
     assert read(folder, text).game_pages == ()
