@@ -84,7 +84,10 @@ class Raster:
         brush.polygon(points, fill=_fill(each), outline=_outline(each), width=_outline_width(each))
 
     def _text(self, canvas: Image.Image, each: CheckedObject) -> None:
-        font, text, ink = ImageFont.load_default(each.get("size", 16)), each["text"], _fill(each)
+        size = each.get("size", 16)
+        most = int(4 * max(self._size) / size) + 1  # letters and lines beyond the picture would cost memory
+        text = "\n".join(line[:most] for line in each["text"].split("\n")[:most])
+        font, ink = ImageFont.load_default(size), _fill(each)
         _, _, right, bottom = ImageDraw.Draw(canvas).multiline_textbbox((0, 0), text, font)
         width, height = min(2_000, round(right) + 1), min(2_000, round(bottom) + 1)
         if width < 1 or height < 1:

@@ -1,0 +1,66 @@
+"""Whatever `render()` returns: a scene that can be sent and drawn, or a SceneError with a sentence."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.trial import Scene as SceneSection
+from trial.pictures.assets import Assets
+from trial.pictures.raster import Raster
+from trial.pictures.scene import TYPES, Scene, SceneError, as_scene
+from trial.pictures.scene_encoder import SceneDecoder, SceneEncoder
+
+RASTER = Raster(SceneSection(width=40, height=30), Assets())
+
+_NUMBERS = st.floats() | st.integers() | st.sampled_from([np.float32(0.5), np.int64(3), np.array(1.5), True, 10**400])
+_ODD = st.none() | st.text(max_size=5) | st.binary(max_size=3) | st.lists(_NUMBERS, max_size=3) | st.just(object())
+_POINTS = st.lists(st.tuples(_NUMBERS, _NUMBERS) | _ODD, max_size=6) | st.just(np.ones((4, 2)))
+_COLORS = st.sampled_from(["#fff", "#ff000080", "red", "RED", "rgb(1,2,3)", "#12", "javascript:x", ""])
+_FIELDS = {
+    **dict.fromkeys(("x", "y", "width", "height", "radius", "angle", "depth", "alpha", "size"), _NUMBERS | _ODD),
+    **dict.fromkeys(("color", "outline"), _COLORS | _ODD),
+    **{"points": _POINTS | _ODD, "origin": _POINTS | st.just((0.5, 0.5)), "tween": _NUMBERS, "outline_width": _NUMBERS},
+    **{
+        "text": st.text(max_size=20) | _NUMBERS,
+        "font": st.sampled_from(["Arial", "a;b", ""]),
+        "frame": _NUMBERS | _ODD,
+    },
+    **{"image": st.sampled_from(["a.png", "../../x", ""]) | _ODD, "permanent": _NUMBERS, "remove": st.booleans()},
+    "fill_below": st.booleans(),
+}
+_GOOD = {
+    **{key: st.integers(-5, 50) for key in ("x", "y", "depth", "angle")},
+    **{key: st.integers(0, 20) for key in ("width", "height", "radius")},
+    **{"points": st.just([(0, 0), (1, 1), (0, 1)]), "text": st.just("hi"), "image": st.just("a")},
+}
+_OBJECTS = (
+    st.fixed_dictionaries(
+        {"id": st.sampled_from(["a", "b", "\ud800", 7, "", None]), "type": st.sampled_from([*TYPES, "blob", None, 3])},
+        optional=_FIELDS,
+    )
+    | st.fixed_dictionaries({"id": st.sampled_from(["a", "b"]), "type": st.sampled_from([*TYPES]), **_GOOD})
+    | st.dictionaries(st.text(max_size=3) | st.integers(), _ODD, max_size=3)
+    | _ODD
+)
+
+
+@given(st.lists(st.lists(_OBJECTS, max_size=5) | st.fixed_dictionaries({"objects": _ODD, "hud": _ODD}), max_size=4))
+def test_whatever_render_returns_is_a_scene_or_an_error_with_a_sentence(pictures: list[Any]) -> None:
+    before: Scene | None = None
+    encoder, decoder = SceneEncoder(), SceneDecoder()
+    for number, picture in enumerate(pictures):
+        try:
+            scene = as_scene(picture, before)
+        except SceneError as error:
+            assert str(error).startswith("render()")
+            continue
+        assert all(isinstance(sentence, str) and sentence for sentence in scene.problems)
+        json.dumps(dict(scene.objects), allow_nan=False)
+        decoder.decode(encoder.encode(scene, number))
+        assert RASTER.draw(scene).shape == (30, 40, 3)
+        before = scene
