@@ -533,6 +533,7 @@ def check(section: object) -> tuple[Trial, list[Problem]]:
         _frame_rates,
         _different_actions,
         _actions_that_exist,
+        _players_of_keys,
         _programs,
     )
     compared = [problem for rule in rules for problem in rule(trial, given)]
@@ -645,6 +646,15 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
         yield Problem(
             path, f"there is no action {values.show(action)} in actionSpace; {hint}", ("actionSpace", path[0])
         )
+
+
+def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """Keys by player name players of `players`, if that is given."""
+    known = trial.player_names
+    for player, keys in trial.keys.items():
+        if known and isinstance(keys, dict) and player not in known:
+            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
+            yield Problem(("keys", player), sentence, ("players", "keys"))
 
 
 def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:

@@ -101,6 +101,14 @@ def test_keys_and_labels_of_actions_that_do_not_exist_are_said() -> None:
     assert said(keys={"a": "anything"}) == []  # the environment may name its actions itself
 
 
+def test_keys_of_players_that_do_not_exist_are_said() -> None:
+    players = {"player_0": "human", "player_1": "random"}
+    assert said(players=players, keys={"player_0": {"a": "left"}, "player_2": {"b": "left"}}) == [
+        "keys.player_2: there is no such player in players; there are player_0, player_1"
+    ]
+    assert said(keys={"player_2": {"b": "left"}}) == []  # the environment says which players there are
+
+
 def test_keys_are_a_map_of_names() -> None:
     assert said(keys=["a"]) == [
         'keys: must be a section: indented lines such as "ArrowLeft: left" below it, not a list'
