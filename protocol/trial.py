@@ -650,7 +650,7 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
 
 def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     """Keys by player name players of `players`, if that is given."""
-    known = trial.player_names
+    known = trial.player_names()
     for player, keys in trial.keys.items():
         if known and isinstance(keys, dict) and player not in known:
             sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
