@@ -136,7 +136,7 @@ class JointAdapter:
             "step", returned.observations, returned.infos, returned.rewards, over=over, extra=returned.extra
         )
 
-    def pictures(self) -> Mapping[str, Picture] | Picture:
+    def pictures(self) -> dict[str, Picture] | Picture:
         """The present picture; by player, for those in `views`, if `render` takes a player."""
         if self._adapter.renders_by_player:
             draw, keys = self._adapter.draw, self._players.keys

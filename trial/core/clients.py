@@ -85,8 +85,8 @@ class Clients:
         for client in self._by_human.values():
             self.send(client, text)
 
-    def send_state(self, progress: Progress, times: Callable[[], StateTimes]) -> None:
-        """Send the state to those clients that were sent another one, with the times as they are then."""
+    def send_state(self, progress: Progress, times: Callable[[], StateTimes] | None) -> None:
+        """Send the state to those clients that were sent another one, with the times as they are then, if there are."""
         for client in self._by_human.values():
             player = client.player
             state = state_of(progress, player)
@@ -99,7 +99,7 @@ class Clients:
                 progress.scores[player],
                 progress.frame_rate,
                 episode_score=progress.episode_scores[player],
-                **of_state(progress, player, times()),
+                **(of_state(progress, player, times()) if times is not None else {}),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
@@ -112,7 +112,7 @@ class Clients:
 
     def show_again(self, client: Client) -> None:
         """Show a client its present picture, if there is one."""
-        picture = self.pictures.get(client.player) if isinstance(self.pictures, Mapping) else self.pictures
+        picture = self.pictures.get(client.player) if isinstance(self.pictures, dict) else self.pictures
         if picture is not None:
             self._emit(SendFrame(client.connection, picture, self.frame_id))
 

@@ -16,7 +16,7 @@ from trial.core.progress import Break, Episode
 from trial.core.unfinished import UnfinishedEpisode
 from trial.pictures.picture import Picture
 
-Pictures = Picture | Mapping[str, Picture]
+Pictures = Picture | dict[str, Picture]
 """One picture for all, or one for each human."""
 
 # ---- to a client

@@ -312,7 +312,7 @@ class Progress:
         name = player.name
         index, human = self.controls[name].take()
         advice = self._advice.get(name) if self._advice and not human else None
-        mask = self._mask(name)
+        mask = None if self._view is None else self._view.masks.get(name)
         if advice is not None and allowed(advice, mask):
             return Action(advice, player.action_space[advice], "advice")
         if mask is not None and not allowed(index, mask):

@@ -137,6 +137,9 @@ class Trial:
         self._last_lines_written = False
         self._met: set[str] = set()  # players whose participants have been here
         self._said: set[str] = set()  # of policies, in the log
+        config = self.config
+        self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
+        """Clients are told of times also while the game goes on."""
         self._now = 0.0
 
     @property
@@ -747,7 +750,8 @@ class Trial:
 
     def _send_state(self) -> None:
         if not self.finished:
-            self._clients.send_state(self.progress, self._times)
+            progress = self.progress
+            self._clients.send_state(progress, self._times if self._timed or progress.on_break else None)
 
     def _times(self) -> StateTimes:
         progress, now = self.progress, self._now
