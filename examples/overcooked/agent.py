@@ -9,6 +9,9 @@ from kitchen import CRAMPED, DOWN, LEFT, POT_HOLDS, RIGHT, UP, Overcooked
 TILE = 96
 """Pixels of one tile; the kitchen has 5 x 4 tiles, and the scene in config.yml 480 x 384 pixels."""
 
+LARGER = {"width": TILE + 1, "height": TILE + 1}
+"""Of what fills a tile: neighbours overlap, so that no line is seen between them."""
+
 STEPS_PER_SECOND = 10
 """`startingFrameRate` of config.yml: the clock counts by it."""
 
@@ -51,10 +54,10 @@ def _sprite(name, frame, cell, **more):
 
 
 def _room(kitchen):
-    """Floor and tables: they never change. They overlap by a pixel, so that no line is seen between them."""
+    """Floor and tables: they never change."""
     rows, columns = kitchen.size
     cells = [(row, column) for row in range(rows) for column in range(columns)]
-    still = {"width": TILE + 1, "height": TILE + 1, "permanent": True}
+    still = {**LARGER, "permanent": True}
     floor = [_sprite(f"floor {cell}", "floor", cell, depth=-2, **still) for cell in cells]
     return floor + [
         _sprite(f"table {cell}", "counter" if name == "wall" else name, cell, depth=-1, **still)
@@ -66,7 +69,7 @@ def _room(kitchen):
 def _pot(cell, onions, timer):
     """The pot as full as it is; while it cooks a bar grows."""
     ready = onions == POT_HOLDS and timer == 0
-    found = [_sprite(f"pot {cell}", "pot-ready" if ready else f"pot-{onions}", cell)]
+    found = [_sprite(f"pot {cell}", "pot-ready" if ready else f"pot-{onions}", cell, **LARGER)]
     if onions == POT_HOLDS and not ready:
         x, y, full = cell[1] * TILE + 12, cell[0] * TILE + TILE - 14, TILE - 24
         done = full * (COOK_STEPS - timer) / COOK_STEPS

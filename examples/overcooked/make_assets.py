@@ -13,7 +13,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 ASSETS = Path(__file__).parent / "assets"
-TILE = 96
+TILE = 144
+"""Pixels; half as many again as in the scene, for large screens."""
+
 FINER = 4
 """Pictures are drawn so many times larger, and then made smaller: smooth edges."""
 
