@@ -194,7 +194,14 @@ def needed(folder: Path) -> list[str]:
     return [str(problem) for problem in agent_imports.of_players(folder, read_project(folder))]
 
 
+def policies(folder: Path) -> None:
+    (folder / "policies").mkdir()
+    for name in ("p", "q"):
+        (folder / f"policies/{name}.onnx").touch()
+
+
 def test_what_runs_the_files_of_policies_is_to_be_named(folder: Path) -> None:
+    policies(folder)
     config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx, c: sample:policies/q.onnx}")
     (line,) = needed(folder)
     assert line.endswith(
@@ -221,6 +228,7 @@ def test_the_package_of_a_game_that_is_a_module_is_to_be_named(folder: Path) -> 
 
 
 def test_what_policies_need_is_left_open_where_requirements_are_not_known(folder: Path) -> None:
+    policies(folder)
     config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx}")
     (folder / "requirements.txt").write_text("not_installed_of_nobody\n")
     (line,) = needed(folder)

@@ -108,7 +108,6 @@ def test_without_players_nobody_plays_the_others(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("plays", "said"),
     [
-        ("policies/none.onnx", "there is no file policies/none.onnx; there are policies/"),
         ("policies/text.onnx", "policies/text.onnx is no ONNX file that onnxruntime can read: "),
         ("policies/wide.onnx", "policies/wide.onnx takes observations of 5 numbers (its input 'obs'); the environment gives 2 numbers"),
         ("policies/many.onnx", "policies/many.onnx returns 4 numbers as 'output'; expected 3, one for each action"),
@@ -146,10 +145,12 @@ def test_each_group_is_tried_with_its_players(folder: Path) -> None:
     (folder / "steps" / "hello-0.html").write_text("<p>0</p>")
     (folder / "steps" / "hello-1.html").write_text("<p>1</p>")
     (folder / "steps" / "hello.html").unlink()
-    new = "\n    0: {left: human, right: agent:Partner}\n    1: {left: human, right: policies/none.onnx}"
+    new = "\n    0: {left: human, right: agent:Partner}\n    1: {left: human, right: policies/wide.onnx}"
+    onnx_files.linear(folder / "policies/wide.onnx", np.zeros((5, 3)))
     said: list[str] = []
     (line,) = tried(folder, "random", " {left: human, right: PLAYS}", new, said)
-    assert line.endswith("trial.players.1.right: there is no file policies/none.onnx (group 1)")
+    assert "trial.players.1.right: policies/wide.onnx takes observations of 5 numbers" in line
+    assert line.endswith("(group 1)")
     assert said == ["played in group 0: 3 of 3 episodes to the end, 60 steps"]
 
 
