@@ -150,7 +150,7 @@ def test_each_group_is_tried_with_its_players(folder: Path) -> None:
     said: list[str] = []
     (line,) = tried(folder, "random", " {left: human, right: PLAYS}", new, said)
     assert "trial.players.1.right: policies/wide.onnx takes observations of 5 numbers" in line
-    assert line.endswith("(group 1)")
+    assert line.endswith("group 1)")
     assert said == ["played in group 0: 3 of 3 episodes to the end, 60 steps"]
 
 
