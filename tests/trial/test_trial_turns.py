@@ -364,6 +364,16 @@ def test_a_program_plays_a_player_of_gym() -> None:
             game.trial.advise(3, player, game.now)
 
 
+def test_the_log_says_how_often_a_policy_was_late_in_an_episode() -> None:
+    game = Game().playing(seen("me", "it"))
+    game.stepped(seen("me", "it"))
+    game.acts(1)
+    game.wait(0.1)
+    game.stepped(seen(), over=True)
+    told = [one.text for one in game.all if isinstance(one, Log)]
+    assert "the policy of it was late at 1 of 2 steps" in told
+
+
 # ---- who plays
 
 

@@ -11,6 +11,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from tests.trial.two_players import TRIAL, two_players
 from trial.programs.watch import MOST, Watchers
 from trial.recordings import resume
 
@@ -237,3 +238,30 @@ def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
         assert not cut
         watchers.tell(b"x" * 1_000_000)
         assert (cut, len(lines)) == ([True], 16)
+
+
+def test_a_program_plays_one_of_two_players_in_its_turns(launch, open_client):
+    players = {"left": "human", "right": "gym://learner"}
+    keys = {"gym": "advise", "pace": "turns", "players": players, "startingFrameRate": 30, "policySeconds": 60}
+    server = launch(two_players(turns=True), trial=TRIAL | keys)
+
+    async def run() -> list[dict[str, Any]]:
+        async with open_client(server.address) as client, program(server) as learner:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            assert await ask(learner, "watch") is True
+            assert (await ask(learner, "action_space", player="right"))["names"] == ["noop", "up", "down"]
+            assert "no such player" in (await ask(learner, "advise", action=1, player="middle"))["error"]["message"]
+            await client.say(command="start")
+            await client.until(lambda: client.state.get("toAct"))
+            await client.say(action="up")
+            (mine,) = await steps(learner, 1)
+            assert mine["toAct"] == ["right"], "the program sees that it is its turn"
+            assert await ask(learner, "advise", action=2) is True
+            (its,) = await steps(learner, 1)
+            return [mine, its]
+
+    _, its = asyncio.run(run())
+    part = its["players"]["right"]
+    assert (part["action"], part["actionName"], part["by"]) == (2, "down", "advice")
+    assert its["players"]["left"]["action"] is None

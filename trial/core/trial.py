@@ -619,6 +619,9 @@ class Trial:
 
     def _record_end(self, call: FeedbackCall) -> None:
         over = self.progress.ended.pop(0)
+        if isinstance(over, Episode):
+            for player, late in self.progress.policies.late().items():
+                self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
         fields: dict[str, Any] = {"episode": _number(over)}
         if not isinstance(over, Break):
             fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
