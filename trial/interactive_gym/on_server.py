@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from trial.interactive_gym import playing
 from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.scenes import game_of
 
 _loading = False
 
@@ -43,7 +45,7 @@ def load(agent_file: str, module: str, name: str) -> Experiment:
     folder = Path(agent_file).resolve().parent
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
-    config = getattr(_imported(folder, module), name, None)
+    config = game_of(getattr(_imported(folder, module), name, None))
     if not isinstance(config, RemoteConfig):
         raise playing.Unplayable(f"{module} has no RemoteConfig called {name}; run the experiment's file again")
     return Experiment(folder, config)
@@ -60,7 +62,8 @@ def _imported(folder: Path, module: str) -> Any:
     sys.modules[module] = made
     _loading = True
     try:
-        spec.loader.exec_module(made)
+        with contextlib.chdir(folder):  # files that the experiment reads by their paths are there
+            spec.loader.exec_module(made)
     finally:
         _loading = False
     return made

@@ -25,6 +25,34 @@ def welcome(config: RemoteConfig) -> str:
     return _page(heading, config.welcome_text, plain="<p>Press the button to begin.</p>")
 
 
+def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
+    """The pages before and after the game, by their names, in their order."""
+    before: list[Any] = getattr(config, "before", [])
+    after: list[Any] = getattr(config, "after", [])
+    if not before and not after:
+        return {"welcome": welcome(config)}, {"final": final(config)}
+    first = {_name("before", number, scene): _static(scene) for number, scene in enumerate(before, 1)}
+    last = {_name("after", number, scene): _static(scene) for number, scene in enumerate(after, 1)}
+    return first or {"welcome": welcome(config)}, last or {"final": final(config)}
+
+
+def _name(where: str, number: int, scene: Any) -> str:
+    """A page's name: the scene's own, if it can be one."""
+    name = str(scene.scene_id or "")
+    fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name) and name not in ("game", "instructions", "between")
+    return f"{name}_{where}_{number}" if fits else f"{where}_{number}"
+
+
+def _static(scene: Any) -> str:
+    page = _page(
+        scene.scene_header, f"<p>{scene.scene_subheader}</p>" if scene.scene_subheader else "", scene.scene_body
+    )
+    if type(scene).__name__ == "CompletionCodeScene":
+        page += '<p class="code">{{ completion_code }}</p>\n'
+    url = getattr(scene, "url", None)
+    return page + (_onward(url, bool(scene.append_subject_id)) if url else "")
+
+
 def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, remark: Callable[[str], None]) -> str:
     """What is shown before the game; empty if there is nothing. `human` is the name of the human player."""
     parts = []
@@ -59,15 +87,22 @@ def final(config: RemoteConfig) -> str:
     if not address:
         return page
     appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect
-    whose = "{{ participant.userId|urlencode }}" if appended else ""
-    target = raw(html.escape(address, quote=True)) + whose
-    return page + (
-        f'<p><a id="onward" href="{target}">Go on</a></p>\n'
-        "<script>\n"
-        '  const onward = document.getElementById("onward");\n'
-        f"  setTimeout(() => location.assign(onward.href), {max(0, round(config.redirect_timeout))});\n"
-        "</script>\n"
+    return (
+        page
+        + _onward(address, bool(appended))
+        + (
+            "<script>\n"
+            '  const onward = document.getElementById("onward");\n'
+            f"  setTimeout(() => location.assign(onward.href), {max(0, round(config.redirect_timeout))});\n"
+            "</script>\n"
+        )
     )
+
+
+def _onward(address: str, appended: bool) -> str:
+    """A link to another site, with the participant's id at the end of its address or without."""
+    whose = "{{ participant.userId|urlencode }}" if appended else ""
+    return f'<p><a id="onward" href="{raw(html.escape(address, quote=True))}{whose}">Go on</a></p>\n'
 
 
 def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:

@@ -132,10 +132,12 @@ class ExperimentAgent:
         config, game = self._config, self._game
         hud = "" if config.hud_text_fn is None else str(config.hud_text_fn(game))
         if config.env_to_state_fn is None:
-            return self._raw.render()
-        found = [
-            each.as_dict() if hasattr(each, "as_dict") else each for each in config.env_to_state_fn(self._raw, config)
-        ]
+            drawn = self._raw.render()
+            if not isinstance(drawn, list):
+                return drawn
+        else:
+            drawn = config.env_to_state_fn(self._raw, config)
+        found = [each.as_dict() if hasattr(each, "as_dict") else each for each in drawn]
         pixels = next((each for each in found if _kind(each) == "rendered_env_rgb"), None)
         if pixels is not None:
             return _pixels(pixels)

@@ -32,13 +32,14 @@ class Made:
     """What has no effect, or is not as in Interactive Gym."""
 
 
-def make(config: RemoteConfig, folder: Path | None = None) -> Made:
+def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, ...] = ()) -> Made:
     """Make the project in `folder`, or beside the experiment's file.
 
     A file that was changed by hand since it was made stays. Raises Unplayable if the experiment cannot be played here
-    or the folder holds something else, OSError, and what the experiment's code raises.
+    or the folder holds something else, OSError, and what the experiment's code raises. `standing` are the objects of
+    which one must be a variable of the experiment's file, the one that is wanted most last.
     """
-    source = sources.find(config)
+    source = sources.find(*(standing or (config,)))
     target = (folder or source.file.parent / f"{_id(source.file.stem)}-study").resolve()
     remarks: list[str] = []
     files = files_of(config, source, target, remarks.append)
@@ -62,9 +63,10 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
         )
     players = _players(config, look, find, files, remark)
     files |= {f"assets/{name}": data for name, data in assets.of(config, find, remark).items()}
+    before, after = pages.around(config)
     steps = {
-        "welcome": pages.welcome(config),
-        "final": pages.final(config),
+        **before,
+        **after,
         "instructions": pages.instructions(config, look.game, look.human, find, remark),
         "between": pages.between(config),
     }
@@ -78,7 +80,10 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
         trial["betweenEpisodes"] = "between"
     if look.several:
         trial["players"] = {str(player): plays for player, (plays, _) in players.items()}
-    document = {"project": _project(config, source), "trial": trial}
+    max_steps = getattr(config, "max_steps", None)
+    if max_steps:
+        trial["maxSteps"] = int(max_steps)
+    document = {"project": _project(config, source, [*before, "game", *after]), "trial": trial}
     files["config.yml"] = _yaml(document, source).encode()
     files["agent.py"] = agent_file(source, [(name, key) for key, (_, name) in players.items() if name]).encode()
     if "requirements.txt" not in files:
@@ -92,7 +97,7 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
 
 def ignored(config: RemoteConfig) -> list[str]:
     """Sentences about options that the experiment sets and that have no effect here."""
-    return [
+    return [f"{name} has no effect: the game runs on a server" for name in getattr(config, "ignored", ())] + [
         f"{option.name} has no effect: {option.ignored}"
         for option in options.OPTIONS
         if option.ignored and option.name in config.given and getattr(config, option.name) != option.fresh()
@@ -205,12 +210,12 @@ def _players(
     return found
 
 
-def _project(config: RemoteConfig, source: Source) -> dict[str, Any]:
+def _project(config: RemoteConfig, source: Source, steps: list[str]) -> dict[str, Any]:
     named = "page_title" in config.given
     project: dict[str, Any] = {
         "id": _id(config.env_name or source.file.stem),
         "name": config.page_title if named else source.file.stem.replace("_", " "),
-        "steps": {1: "welcome", 2: "game", "finalStep": "final"},
+        "steps": {**dict(enumerate(steps[:-1], 1)), "finalStep": steps[-1]},
     }
     if "max_concurrent_games" in config.given:
         project["maxServers"] = config.max_concurrent_games

@@ -16,6 +16,7 @@ from trial.interactive_gym import on_server
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.project import make
 from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.scenes import game_of
 
 _HIPPODROME = Path(__file__).resolve().parents[2]
 _END_SECONDS = 60
@@ -31,9 +32,11 @@ def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bo
     if on_server.is_loading():
         return None
     try:
-        if not isinstance(config, RemoteConfig):
+        game = game_of(config)
+        if not isinstance(game, RemoteConfig):
             raise Unplayable(f"run() takes a RemoteConfig, not {type(config).__name__}")
-        made = make(config, None if project is None else Path(project))
+        standing = (config, getattr(config, "stager", None), game)
+        made = make(game, None if project is None else Path(project), standing)
     except Unplayable as error:
         sys.exit(f"This experiment cannot be played here: {error}")
     for remark in made.remarks:
@@ -42,7 +45,7 @@ def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bo
     print(f"The project is in {made.folder}.")
     print(f"Check it with `make check PROJECT={folder}`; deploy it as docs/aws-project.md says.", flush=True)
     if serve:
-        _hold(made.folder, config.port)
+        _hold(made.folder, game.port)
     return made.folder
 
 

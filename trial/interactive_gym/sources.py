@@ -36,8 +36,21 @@ class Source:
     names: Mapping[str, Any]
 
 
-def find(config: Any) -> Source:
-    """Where the config stands. Raises Unplayable unless it is a variable of a module of the researcher's."""
+def find(*configs: Any) -> Source:
+    """Where one of these stands. Raises Unplayable unless it is a variable of a module of the researcher's.
+
+    What stands below `if __name__ == "__main__"` is a variable too, but not on a server, so the last one counts most.
+    """
+    found = [source for source in map(_find, (each for each in reversed(configs) if each is not None)) if source]
+    if found:
+        return found[0]
+    raise Unplayable(
+        "the config must be a variable of the experiment's file, such as config = RemoteConfig()…, so that servers "
+        'find it there: write it above `if __name__ == "__main__"`'
+    )
+
+
+def _find(config: Any) -> Source | None:
     main = sys.modules.get("__main__")
     others = [module for module in list(sys.modules.values()) if module is not main and _file(module) is not None]
     for module in filter(None, (main, *others)):
@@ -47,10 +60,7 @@ def find(config: Any) -> Source:
         if variable is None or file is None or file.is_relative_to(_HIPPODROME / "trial"):
             continue
         return _source(module, variable, file)
-    raise Unplayable(
-        "the config must be a variable of the experiment's file, such as config = RemoteConfig()…, so that servers "
-        'find it there: write it above `if __name__ == "__main__"`'
-    )
+    return None
 
 
 def _source(module: ModuleType, variable: str, file: Path) -> Source:

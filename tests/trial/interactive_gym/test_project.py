@@ -160,6 +160,13 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
     assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
 
 
+def test_a_file_that_the_experiment_reads_as_it_is_imported_is_found_on_a_server(tmp_path: Path) -> None:
+    project, _ = made(tmp_path, ALONE.replace("LEFT, NOOP", "text = open('how.html').read()\nLEFT, NOOP"))
+    program = f"import sys; sys.path.append({str(project)!r}); import agent"
+    done = python(tmp_path.parent, "-c", program)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config, serve=False)\n")
@@ -216,3 +223,61 @@ def test_images_and_atlases_are_copied_under_their_names(tmp_path: Path) -> None
     assert sorted(path.name for path in (project / "assets").iterdir()) == ["chef.json", "chef.png", "plain.png"]
     assert '"walk": {"frames": ["EAST.png"], "frameRate": 8}' in (project / "assets/chef.json").read_text()
     assert "Remark: the image 'gone' is not found at static/gone.png; sprites that show it are grey boxes" in said
+
+
+SCENES = (
+    ALONE.partition("config = (")[0].replace("from trial import ", "from trial import experiment_config, gym_scene, stager, static_scene, ")
+    + """
+start_scene = static_scene.StartScene().scene(scene_id="hello").display(scene_header="Hi", scene_body="Welcome")
+more = static_scene.StaticScene().display(scene_body="<p>Read this</p>")
+game = (
+    gym_scene.GymScene()
+    .scene(scene_id="car", experiment_config={})
+    .policies(policy_mapping={"human": configuration_constants.PolicyTypes.Human})
+    .environment(env_creator=env_creator, env_config={"steps": 20})
+    .rendering(fps=60, env_to_state_fn=draw)
+    .gameplay(default_action=NOOP, action_mapping={"ArrowLeft": LEFT}, num_episodes=2, max_steps=15)
+    .user_experience(scene_header="Car", scene_body="How to drive", in_game_scene_body="Drive!")
+    .pyodide(restart_pyodide=False)
+)
+end = static_scene.EndScene().display(scene_header="Bye").redirect("https://example.org/?id=", append_subject_id=True)
+stager = stager.Stager(scenes=[start_scene, more, GAMES, end])
+if __name__ == "__main__":
+    config = experiment_config.ExperimentConfig().experiment(stager=stager, experiment_id="car_study").hosting(port=0)
+    server_app.run(config, serve=False)
+"""
+)  # fmt: skip
+
+
+def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", "game"))
+    done = python(tmp_path, "experiment.py")
+    assert done.returncode == 0, done.stderr
+    assert "Remark: restart_pyodide has no effect" in done.stdout
+    project = tmp_path / "experiment-study"
+    found = config_of(project)
+    assert found["project"]["steps"] == {1: "hello_before_1", 2: "before_2", 3: "game", "finalStep": "after_1"}
+    assert found["project"]["id"] == "car-study"
+    assert (found["trial"]["maxSteps"], found["trial"]["maxEpisodes"]) == (15, 2)
+    assert "How to drive" in (project / "steps/instructions.html").read_text()
+    last = (project / "steps/after_1.html").read_text()
+    assert 'href="https://example.org/?id={{ participant.userId|urlencode }}"' in last
+    read_project(project)
+    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("scenes", "said"),
+    [
+        ("game, game", "the stager has 2 games (GymScene); a study has one game step here"),
+        ("more", "the stager has 0 games (GymScene); a study has one game step here"),
+        ("game, type('OptionBoxes', (static_scene.StaticScene,), {})()", "a OptionBoxes is no page that can be shown"),
+    ],
+)
+def test_scenes_that_cannot_be_are_refused(tmp_path: Path, scenes: str, said: str) -> None:
+    write(tmp_path)
+    (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", scenes))
+    done = python(tmp_path, "experiment.py")
+    assert done.returncode == 1
+    assert said in done.stderr

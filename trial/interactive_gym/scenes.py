@@ -1,0 +1,162 @@
+"""Interactive Gym's scenes, as far as they are one game with pages before and after it.
+
+A `GymScene` is a `RemoteConfig` whose texts have other names.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Self
+
+from trial.interactive_gym.playing import Unplayable
+from trial.interactive_gym.remote_config import RemoteConfig
+
+_NAMES = {
+    "scene_header": "game_header_text",
+    "scene_body": "instructions",
+    "scene_body_filepath": "instructions_html_file",
+    "in_game_scene_body": "game_page_text",
+}
+_FILES = {
+    "in_game_scene_body_filepath": "game_page_text",
+    "environment_initialization_code_filepath": "environment_initialization_code",
+}
+_IGNORED = {"on_game_step_code", "restart_pyodide"}
+
+
+class _Scene:
+    scene_id: str | None = None
+
+    def scene(self, scene_id: str | None = None, experiment_config: Any = None, **_more: Any) -> Self:
+        """Name the scene."""
+        self.scene_id = scene_id or self.scene_id
+        return self
+
+
+class GymScene(_Scene, RemoteConfig):
+    """A game. Its options are those of `RemoteConfig`, with the names of scenes for texts."""
+
+    def __init__(self, scene_id: str | None = None, **_more: Any) -> None:
+        super().__init__()
+        self.scene_id = scene_id
+        self.max_steps: int | None = None
+        self.ignored: list[str] = []
+        """Options of scenes that have no effect."""
+        self.before: list[StaticScene] = []
+        self.after: list[StaticScene] = []
+
+    def _set(self, method: str, values: tuple[Any, ...], named: dict[str, Any]) -> Self:
+        given: dict[str, Any] = {}
+        for name, value in named.items():
+            if name in _FILES:
+                given[_FILES[name]] = Path(value).read_text(encoding="utf-8")
+            elif name == "max_steps":
+                self.max_steps = value
+            elif name in _IGNORED:
+                self.ignored.append(name)
+            else:
+                given[_NAMES.get(name, name)] = value
+        return super()._set(method, values, given)
+
+
+class StaticScene(_Scene):
+    """A page."""
+
+    def __init__(self) -> None:
+        self.scene_header = self.scene_subheader = self.scene_body = ""
+
+    def display(
+        self,
+        scene_header: str | None = None,
+        scene_subheader: str | None = None,
+        scene_body: str | None = None,
+        scene_body_filepath: str | None = None,
+    ) -> Self:
+        """Set its texts. Raises OSError if the file cannot be read."""
+        if scene_body_filepath is not None:
+            scene_body = Path(scene_body_filepath).read_text(encoding="utf-8")
+        self.scene_header = self.scene_header if scene_header is None else scene_header
+        self.scene_subheader = self.scene_subheader if scene_subheader is None else scene_subheader
+        self.scene_body = self.scene_body if scene_body is None else scene_body
+        return self
+
+
+class StartScene(StaticScene):
+    """The first page."""
+
+
+class EndScene(StaticScene):
+    """The last page."""
+
+    url: str | None = None
+    append_subject_id = False
+
+    def redirect(self, url: str | None = None, append_subject_id: bool | None = None) -> Self:
+        """Where a link on the page leads to, with the participant's id at its end or without."""
+        self.url = self.url if url is None else url
+        self.append_subject_id = self.append_subject_id if append_subject_id is None else append_subject_id
+        return self
+
+
+class CompletionCodeScene(EndScene):
+    """The last page, with the participant's completion code."""
+
+
+class Stager:
+    """Scenes in their order."""
+
+    def __init__(self, scenes: Iterable[Any] = ()) -> None:
+        self.scenes = list(scenes)
+
+
+class ExperimentConfig:
+    """An experiment of scenes."""
+
+    def __init__(self) -> None:
+        self.stager: Stager | None = None
+        self.experiment_id: str | None = None
+        self.hosted: dict[str, Any] = {}
+
+    def experiment(self, experiment_id: str | None = None, stager: Stager | None = None, **_more: Any) -> Self:
+        """The scenes, and the experiment's name."""
+        self.experiment_id = experiment_id or self.experiment_id
+        self.stager = stager or self.stager
+        return self
+
+    def hosting(self, **options: Any) -> Self:
+        """Where it is held: `host`, `port`, `max_ping`."""
+        self.hosted |= options
+        return self
+
+
+def game_of(config: Any) -> Any:
+    """The game of an experiment of scenes, with the pages before and after it; a RemoteConfig as it is.
+
+    Raises Unplayable unless there is one game, and pages that can be shown.
+    """
+    stager = config.stager if isinstance(config, ExperimentConfig) else config
+    if not isinstance(stager, Stager):
+        return config
+    games = [scene for scene in stager.scenes if isinstance(scene, GymScene)]
+    if len(games) != 1:
+        raise Unplayable(f"the stager has {len(games)} games (GymScene); a study has one game step here")
+    (game,) = games
+    place = stager.scenes.index(game)
+    game.before, game.after = stager.scenes[:place], stager.scenes[place + 1 :]
+    plain = (StaticScene, StartScene, EndScene, CompletionCodeScene)
+    for scene in [*game.before, *game.after]:
+        if type(scene) not in plain:
+            raise Unplayable(f"a {type(scene).__name__} is no page that can be shown; write a page of steps/ instead")
+    if isinstance(config, ExperimentConfig):
+        game.hosting(**config.hosted)
+        game.env_name = game.env_name or config.experiment_id or game.scene_id
+    return game
+
+
+def __getattr__(name: str) -> Any:
+    known = ("GymScene", "StaticScene", "StartScene", "EndScene", "CompletionCodeScene", "Stager", "ExperimentConfig")
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {near[0]}?" if near else "; its questions are written as a page of steps/ (docs/pages.md)"
+    raise AttributeError(f"there is no scene {name} here{hint}")
