@@ -162,7 +162,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 def test_a_file_that_the_experiment_reads_as_it_is_imported_is_found_on_a_server(tmp_path: Path) -> None:
     project, _ = made(tmp_path, ALONE.replace("LEFT, NOOP", "text = open('how.html').read()\nLEFT, NOOP"))
-    program = f"import sys; sys.path.append({str(project)!r}); import agent"
+    program = f"import sys; sys.path.insert(0, {str(project)!r}); import agent; agent._experiment"
     done = python(tmp_path.parent, "-c", program)
     assert done.returncode == 0, done.stderr
 
