@@ -155,6 +155,27 @@ def test_players_that_do_not_fit_are_named_before_anybody_plays(launch, open_cli
     assert "Traceback" not in server.said()
 
 
+def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_client):
+    trial = TRIAL | {"maxEpisodes": 1, "startingFrameRate": 10}
+    server = launch(two_players(length=3), trial=trial, GAME_STEPS="2,3")
+
+    async def run(step):
+        async with open_client(server.address) as client:
+            await client.hello(step=step)
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            await client.until(lambda: client.done)
+
+    for step in ("2", "3"):
+        asyncio.run(run(step))
+    assert server.wait() == 0
+    for step in ("2", "3"):
+        (lines,) = server.recordings(f"{step}-*.gz").values()
+        asked = [line["players"]["right"]["by"] for line in lines if line["kind"] == "step"]
+        assert len(asked) == 3
+        assert "policy" in asked, server.said()
+
+
 # ---- an interrupted game
 
 

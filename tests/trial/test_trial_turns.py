@@ -163,6 +163,18 @@ def test_a_press_out_of_turn_does_nothing_and_is_recorded() -> None:
     assert game.actions == {"me": (2, "human")}
 
 
+def test_the_projects_own_keys_choose_too() -> None:
+    game = in_turns(keys={"a": "up", "ArrowRight": "right"}).playing(seen("me"))
+    game.say(key="ArrowRight", held=True)
+    assert game.actions == {"me": (2, "human")}
+    game.stepped(seen("me"))
+    game.wait(5)
+    assert game.open_call is None
+    game.say(key="ArrowRight", held=False)
+    game.say(key="a", held=True)
+    assert game.actions == {"me": (1, "human")}
+
+
 def test_a_move_that_the_mask_forbids_is_refused_with_a_sentence() -> None:
     game = in_turns().playing(seen("me", masks={"me": [True, False, True]}))
     said = sent(game.say(action="up"), SendMessage)

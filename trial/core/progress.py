@@ -256,7 +256,8 @@ class Progress:
         """
         controls = self.controls[player or self.first]
         if self.turns is not None:
-            self._choose(player or self.first, name, held)
+            if controls.knows(name) or not lasts:  # a client of HIPPO's says by another name that nothing is pressed
+                self._choose(player or self.first, name, held)
             return
         if lasts:
             controls.keep(name)
