@@ -17,6 +17,7 @@ import botocore.auth
 import botocore.client
 import botocore.endpoint_provider
 import botocore.hooks
+import botocore.httpsession
 import botocore.regions
 import botocore.session
 import botocore.useragent
@@ -65,6 +66,8 @@ def _keep_clients() -> None:
         given=dict,
     )
     setattr(botocore.hooks._PrefixTrie, "__copy__", _copy_of_handlers)  # noqa: B010
+    make = botocore.httpsession.create_urllib3_context
+    setattr(botocore.httpsession, "create_urllib3_context", _context(make))  # noqa: B010
 
 
 def _keep_calls() -> None:
@@ -106,6 +109,16 @@ def _keep_moto() -> None:
     _keep(
         moto.core.serialize.XFormedAttributePicker, "get_possible_keys", _looked_for, given=iter, made=list, hold=True
     )
+
+
+def _context(make: Callable[..., Any]) -> Callable[..., Any]:
+    """`create_urllib3_context`, but the clients of moto's worlds, which connect to nothing, share what would be for TLS."""
+    shared = functools.cache(make)
+
+    def made(*arguments: Any, **more: Any) -> Any:
+        return (shared if moto.core.models.botocore_stubber.enabled else make)(*arguments, **more)
+
+    return made
 
 
 def _sign(sign: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
