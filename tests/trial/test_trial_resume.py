@@ -212,3 +212,11 @@ def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():
     add_lines(past, [{**step, "reward": float(number)} for number in range(5)])
     add_lines(past, [{"kind": "resume", "episode": 1, "steps": 3}, {**step, "reward": 10.0}])
     assert [step.reward for step in past.unfinished.steps] == [0.0, 1.0, 2.0, 10.0]
+
+
+@pytest.mark.parametrize(("by", "given"), [("random", 2), ("none", 2), ("agent", None)])
+def test_what_the_environment_was_given_is_taken_again(by, given):
+    recorded = RecordedTrial()
+    step = {"kind": "step", "episode": 1, "human": None, "action": 2, "by": by, "reward": 1.0}
+    add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 3}, step])
+    assert recorded.unfinished.steps[0].advice == given, "by agent: it was asked for another action than it took"
