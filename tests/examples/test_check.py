@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import subprocess
-from importlib import metadata
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 
 from local.rehearsal.study_process import ROOT
 from testing import preloaded
@@ -16,20 +14,8 @@ from testing import preloaded
 EXAMPLES = sorted(path.parent.name for path in (ROOT / "examples").glob("*/config.yml"))
 
 
-def needs_packages(example: str) -> None:
-    """Skip the test where the example's packages are not installed: `make test` installs them."""
-    file = ROOT / "examples" / example / "requirements.txt"
-    for line in file.read_text().splitlines() if file.is_file() else ():
-        if line and not line.startswith("#"):
-            try:
-                metadata.version(Requirement(line).name)
-            except metadata.PackageNotFoundError:
-                pytest.skip(f"pip install -r {file.relative_to(ROOT)}")
-
-
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_make_check_finds_neither_mistakes_nor_remarks(example: str, tmp_path: Path) -> None:
-    needs_packages(example)
     process = preloaded.start(
         "local.check",
         [str(ROOT / "examples" / example)],

@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 from PIL import Image
 
@@ -19,8 +20,6 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "overcooked"
 STEPS = 300
 """Of a round here: half a minute."""
 
-pytest.importorskip("cogrid", reason="pip install -r examples/overcooked/requirements.txt")
-onnxruntime = pytest.importorskip("onnxruntime")
 
 Chef = Callable[[Any, int, Any], int]
 """From what stands where, the chef's number and observation to an action."""
@@ -137,7 +136,8 @@ def test_it_cooks_with_a_partner_who_does_anything(kitchen: Any, policy: Chef) -
 
 
 def test_the_policy_is_small_and_says_how_it_was_made() -> None:
-    onnx = pytest.importorskip("onnx")
+    import onnx
+
     file = EXAMPLE / "policies" / "cook.onnx"
     assert file.stat().st_size < 200_000
     assert onnx.load(file).doc_string.startswith("train.py --rounds")
@@ -145,7 +145,6 @@ def test_the_policy_is_small_and_says_how_it_was_made() -> None:
 
 def test_a_short_training_already_learns(tmp_path: Path) -> None:
     """One round of it: most actions are those of the cook by rules."""
-    pytest.importorskip("onnx")
     said = subprocess.run(
         [sys.executable, "-W", "ignore", "train.py", "--rounds", "1", "--steps", "150", "--into", tmp_path / "made"],
         cwd=EXAMPLE,

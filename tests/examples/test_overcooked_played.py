@@ -7,8 +7,6 @@ from typing import Any
 import pytest
 
 pytestmark = pytest.mark.xdist_group("examples")
-pytest.importorskip("cogrid", reason="pip install -r examples/overcooked/requirements.txt")
-pytest.importorskip("onnxruntime")
 
 
 def test_a_person_and_the_policy_cook_together(play_example: Any, load_module: Any) -> None:

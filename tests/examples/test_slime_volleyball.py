@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 from PIL import Image
 
@@ -19,9 +20,6 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "slime-volleyball"
 LEFT, RIGHT = "agent_left", "agent_right"
 NOOP, TO_LEFT, JUMP, TO_RIGHT = 0, 1, 3, 5
 
-pytest.importorskip("slime_volleyball", reason="pip install -r examples/slime-volleyball/requirements.txt")
-onnxruntime = pytest.importorskip("onnxruntime")
-
 
 @pytest.fixture
 def volleyball(load_module: Callable[[str, str], ModuleType]) -> Any:
@@ -30,7 +28,6 @@ def volleyball(load_module: Callable[[str, str], ModuleType]) -> Any:
 
 @pytest.fixture
 def train(load_module: Callable[[str, str], ModuleType]) -> Any:
-    pytest.importorskip("onnx")
     return load_module("slime-volleyball", "train")
 
 
@@ -140,7 +137,8 @@ def test_it_returns_the_ball_in_the_environment(volleyball: Any, file: str, play
 
 
 def test_policies_are_small_and_say_how_they_were_made() -> None:
-    onnx = pytest.importorskip("onnx")
+    import onnx
+
     for name in ("left.onnx", "right.onnx"):
         file = EXAMPLE / "policies" / name
         assert file.stat().st_size < 200_000
@@ -170,7 +168,6 @@ def test_training_plays_by_the_packages_own_rules(volleyball: Any, train: Any) -
 
 def test_a_short_training_already_learns(tmp_path: Path) -> None:
     """Two rounds: the largest of the six values is then the teacher's action three times in four."""
-    pytest.importorskip("onnx")
     said = subprocess.run(
         [sys.executable, "train.py", "--rounds", "2", "--into", tmp_path / "made"],
         cwd=EXAMPLE,

@@ -12,8 +12,6 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "slime-volleyball"
 LEFT, RIGHT = "agent_left", "agent_right"
 
 pytestmark = pytest.mark.xdist_group("examples")
-pytest.importorskip("slime_volleyball", reason="pip install -r examples/slime-volleyball/requirements.txt")
-pytest.importorskip("onnxruntime")
 
 
 def test_a_person_plays_against_the_policy(play_example: Any, load_module: Any) -> None:
