@@ -96,3 +96,28 @@ def counter(
     if seq_lens is not None:
         inputs.append(("seq_lens", seq_lens))
     return save(file, nodes, inputs, [("output", ("batch", 3)), (state[1], ("batch", 1))], values)
+
+
+def endless(file: Path) -> Path:
+    """A policy of three actions that works for hours on any observation but zeros."""
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["more"], ["goes_on"]), helper.make_node("Sin", ["before"], ["after"])],
+        "body",
+        [
+            helper.make_tensor_value_info("index", TensorProto.INT64, []),
+            helper.make_tensor_value_info("more", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("before", TensorProto.FLOAT, [1, 3]),
+        ],
+        [
+            helper.make_tensor_value_info("goes_on", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("after", TensorProto.FLOAT, [1, 3]),
+        ],
+    )
+    nodes = [
+        helper.make_node("ReduceMax", ["obs"], ["largest"], keepdims=0),
+        helper.make_node("Mul", ["largest", "many"], ["product"]),
+        helper.make_node("Cast", ["product"], ["times"], to=TensorProto.INT64),
+        helper.make_node("Loop", ["times", "go_on", "start"], ["output"], body=body),
+    ]
+    constants = {"many": np.float32(1e12), "go_on": np.bool_(True), "start": np.zeros((1, 3), np.float32)}
+    return save(file, nodes, [("obs", (1, 2))], [("output", (1, 3))], constants)

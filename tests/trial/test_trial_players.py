@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from testing import onnx_files
 from tests.trial.two_players import TRIAL, two_players
 
 
@@ -129,6 +130,21 @@ def test_a_policy_that_hangs_holds_up_nothing(launch, open_client):
     began = time.monotonic()
     played(server, open_client, frames=15)
     assert time.monotonic() - began < 12
+    assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
+
+
+def test_a_file_that_takes_hours_does_not_make_the_server_fail_at_its_end(launch, open_client, tmp_path):
+    onnx_files.endless(tmp_path / "agent/policies/p.onnx")
+    players = {"left": "human", "right": "policies/p.onnx"}
+    server = launch(two_players(length=5), trial=TRIAL | {"players": players, "maxEpisodes": 1})
+
+    async def run():
+        async with open_client(server.address) as client:
+            await client.play(1)
+            await client.until(lambda: client.done)
+
+    asyncio.run(run())
+    assert server.wait() == 0, server.said()
     assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
 
 

@@ -13,6 +13,8 @@ from trial.policies.thread import Done
 class InlinePolicy:
     """Has the methods of `PolicyThread`. `done` is called soon, once for each question."""
 
+    busy = False
+
     def __init__(self, policy: Policy, done: Done) -> None:
         self.policy = policy
         self._done = done

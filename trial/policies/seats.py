@@ -48,6 +48,11 @@ class Seats:
         self.described: dict[str, Mapping[str, Any]] = {}
         """What the head of a recording says of each player."""
 
+    @property
+    def busy(self) -> bool:
+        """A policy has not returned, and may never."""
+        return any(policy.busy for policy in self._asked.values())
+
     def fill(self, players: Iterable[Player], policies: Mapping[str, Policy]) -> None:
         """These play. Each policy is asked from now on in this trial only."""
         for player in players:

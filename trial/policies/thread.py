@@ -28,9 +28,15 @@ class PolicyThread:
         self._loop = asyncio.get_running_loop()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._closed = False
+        self._running = False
         self._reset_error: Exception | None = None  # of the latest reset; the thread's own
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """A method of the policy has not returned (it may never)."""
+        return self._running
 
     def ask(self, ask_id: int, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> None:
         """Ask for an action; `done(ask_id, action, error)` follows, unless the thread was closed meanwhile."""
@@ -75,9 +81,13 @@ class PolicyThread:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             if not self._closed:
+                self._running = True
                 job()
+                self._running = False
+        self._running = True
         with contextlib.suppress(BaseException):  # the game is over; nothing depends on how a policy ends
             self.policy.close()
+        self._running = False
 
 
 def _plain(problem: BaseException) -> Exception:

@@ -105,9 +105,9 @@ class TrialLoop:
         }
 
     @property
-    def callback_runs(self) -> bool:
-        """A callback of the agent has not returned, and may never."""
-        return self._callbacks is not None and self._callbacks.busy
+    def stuck(self) -> bool:
+        """A callback of the agent or a policy has not returned, and may never."""
+        return self._seats.busy or (self._callbacks is not None and self._callbacks.busy)
 
     def begin(self, agent_ready: Awaitable[Started | None]) -> asyncio.Future[None]:
         """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""

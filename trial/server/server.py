@@ -86,6 +86,7 @@ class Server:
         self._agent_ready: asyncio.Task[Started | None]
         self._failure = 1  # the exit status if the server ends by an error
         self._trial: TrialLoop | None = None
+        self._trials: list[TrialLoop] = []  # also those that are over: a policy or a callback may still run
         self._finished_steps: set[str] = set()
         self._handover: warm.HandoverSearch
         self._connections: dict[Connection, asyncio.Task[None]] = {}
@@ -126,7 +127,7 @@ class Server:
     @property
     def stuck(self) -> bool:
         """The researcher's code is still running and may never return."""
-        return self._worker.busy or (self._trial is not None and self._trial.callback_runs)
+        return self._worker.busy or any(trial.stuck for trial in self._trials)
 
     async def _close(self, reason: str) -> None:
         for task in self._tasks:
@@ -367,6 +368,7 @@ class Server:
             watchers=self._watchers,
             assets=self._drawing.assets.table(),
         )
+        self._trials.append(trial)
         trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(self._trial_done)
         return trial
 
