@@ -17,9 +17,9 @@ from typing import Any, Protocol
 from local.check.pace import Pace
 from protocol.trial import Trial
 from trial.agent.joint import Joint, JointAdapter
-from trial.core.players import Player
+from trial.core.players import Player, legal_actions
 from trial.core.seeds import policy_seed
-from trial.policies.policy import Policy, legal
+from trial.policies.policy import Policy
 from trial.policies.seats import load_policies
 
 
@@ -120,7 +120,7 @@ class Game:
             name = player.name
             if name not in now.to_act:
                 continue
-            allowed = legal(len(player.action_space), now.masks.get(name))
+            allowed = legal_actions(len(player.action_space), now.masks.get(name))
             if player.human:
                 actions[name] = self._press(allowed)
             elif name in self._policies:

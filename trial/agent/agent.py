@@ -18,6 +18,7 @@ import numpy as np
 from trial.agent import callbacks, environments, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
+from trial.core.players import PLAYER
 from trial.pictures.picture import Picture
 from trial.pictures.reader import PictureReader
 
@@ -225,9 +226,7 @@ class AgentAdapter:
         """Whether `render` takes a player and draws the view of that one."""
         return signatures.PLAYER in self._signatures["render"].order
 
-    def _call(
-        self, method: str, *, action: Any = None, seed: int | None = None, player: Any = environments.ONLY
-    ) -> Any:
+    def _call(self, method: str, *, action: Any = None, seed: int | None = None, player: Any = PLAYER) -> Any:
         """Call a method with what it takes. Raises AgentError if it takes the environment, and that is not known."""
         env = self.env
         if env is None and self._signatures[method].needs_env:
@@ -278,7 +277,7 @@ class AgentAdapter:
         """What `step` returns for the actions of several players, which are given as they are."""
         return self._agent.step(actions) if self._unusual_step is None else self._unusual_step(actions)
 
-    def draw(self, player: Any = environments.ONLY) -> Any:
+    def draw(self, player: Any = PLAYER) -> Any:
         """What `render` returns, for this player if it takes one."""
         return self._call("render", player=player)
 
@@ -287,7 +286,7 @@ class AgentAdapter:
         value = self._agent.render() if self._unusual_render is None else self._unusual_render()
         return self.reader.read(value)
 
-    def feedback(self, word: str, player: Any = environments.ONLY) -> None:
+    def feedback(self, word: str, player: Any = PLAYER) -> None:
         """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.
 
         A method `feedback(word, player)` hears whose participant said it too.

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from trial.core.players import PLAYER
 from trial.recordings import recording
 from trial.recordings.recorded_values import text_of
 
@@ -78,7 +79,7 @@ class Session:
     scores: Mapping[str, float]
     """Sums of the episode's rewards."""
     why: str | None
-    """Why the episode ended: terminated, truncated, reset, stopped or failed; None while it goes on."""
+    """Why the episode ended: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
     replaying: bool
     """An earlier server's steps are taken again. What is recorded now stands in its recording already."""
     env: Any
@@ -93,8 +94,8 @@ class About:
     trial: str
     step: str
     group: int | None = None
-    players: tuple[str, ...] = ("player_0",)
-    humans: tuple[str, ...] = ("player_0",)
+    players: tuple[str, ...] = (PLAYER,)
+    humans: tuple[str, ...] = (PLAYER,)
 
 
 @dataclass(slots=True)

@@ -9,7 +9,7 @@ from typing import Any
 from trial.agent.agent import AgentAdapter, StepResult
 from trial.agent.callbacks import Callbacks
 from trial.core.effects import Begun, Call, FeedbackCall, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
-from trial.core.players import PLAYER, View
+from trial.core.players import ACTION_MASK, PLAYER, View
 from trial.core.progress import Episode
 from trial.recordings import recording
 
@@ -190,7 +190,7 @@ class AgentCalls(Calls):
 
 def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:
     """The `action_mask` of an info, as Gymnasium's environments give it: one value for each action."""
-    mask = info.get("action_mask")
+    mask = info.get(ACTION_MASK)
     try:
         found = None if mask is None else [bool(one) for one in mask]
     except (TypeError, ValueError):

@@ -9,9 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-ONLY = "player_0"
-"""The name of the one player of a Gymnasium environment."""
-
 
 class PlayersUnknown(ValueError):
     """It cannot be told who plays, or what they can do. The message is for the researcher."""
@@ -129,9 +126,9 @@ def players_of(
 ) -> Players:
     """The players with these keys, and their actions: the configured names first.
 
-    `stepped`: the environment itself gets the actions, so there are as many as its spaces have, and they begin there.
-    Raises PlayersUnknown if two
-    players have the same name as text, or if the actions of one cannot be told.
+    `of_env`: as in `Players`. `stepped`: the environment itself gets the actions, so there are as many as its spaces
+    have, and they begin there. Raises PlayersUnknown if two players have the same name as text, or if the actions of
+    one cannot be told.
     """
     by_name = {str(key): key for key in keys}
     if len(by_name) != len(keys):

@@ -15,11 +15,11 @@ import numpy as np
 
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.environments import Players, Turns
+from trial.core.players import ACTION_MASK
 from trial.pictures.picture import Picture
 
 ALL = "__all__"
 """In what an environment returns, a key beside the players: the value for all of them (RLlib's `MultiAgentEnv`)."""
-MASK = "action_mask"
 TO_ACT = "to_act"
 
 
@@ -235,20 +235,20 @@ class JointAdapter:
         for player in self.players:
             if player in self._gone:
                 continue
-            mask = infos.get(player, {}).get(MASK)
+            mask = infos.get(player, {}).get(ACTION_MASK)
             if mask is None:
                 observation = observations.get(player)
-                mask = observation.get(MASK) if isinstance(observation, Mapping) else None
+                mask = observation.get(ACTION_MASK) if isinstance(observation, Mapping) else None
             if mask is not None:
                 try:
                     legal = tuple(np.asarray(mask).reshape(-1).astype(bool).tolist())
                 except (TypeError, ValueError):
                     raise AgentError(
-                        f"{MASK} of {player} is {type(mask).__name__}, and no array of zeros and ones"
+                        f"{ACTION_MASK} of {player} is {type(mask).__name__}, and no array of zeros and ones"
                     ) from None
                 count = len(self.action_spaces[player])
                 if len(legal) != count:
-                    raise AgentError(f"{MASK} of {player} has {len(legal)} values; there are {count} actions")
+                    raise AgentError(f"{ACTION_MASK} of {player} has {len(legal)} values; there are {count} actions")
                 if any(legal):  # PettingZoo's games give zeros to those who are not to act
                     found[player] = legal
         return found

@@ -16,8 +16,11 @@ PLAYER = "player_0"
 NOOP = "noop"
 """The action of no key, if the environment has one of this name and `idleAction` names no other."""
 
+ACTION_MASK = "action_mask"
+"""Under this key an info or an observation says which actions are legal now."""
+
 Mask = Sequence[Any]
-"""One value for each action: whether it is possible now."""
+"""One value for each action: whether it is legal now."""
 
 
 class PlayersError(ValueError):
@@ -106,21 +109,26 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(shown) + (" and others" if len(names) > len(shown) else "")
 
 
-def legal(action: int, player: Player, mask: Mask | None) -> int:
-    """The action, or if the mask forbids it the idle one, or if that is forbidden the first that is allowed."""
-    if allowed(action, mask):
-        return action
-    if allowed(player.idle, mask):
-        return player.idle
-    return next((index for index in range(len(player.action_space)) if allowed(index, mask)), player.idle)
-
-
-def allowed(action: int, mask: Mask | None) -> bool:
+def is_legal(action: int, mask: Mask | None) -> bool:
     """Whether the mask allows the action. One that says nothing of it, or allows nothing, forbids nothing."""
     return mask is None or action >= len(mask) or bool(mask[action]) or not any(mask)
 
 
+def legal_actions(count: int, mask: Mask | None) -> list[int]:
+    """Those of `count` actions that are legal."""
+    return [action for action in range(count) if is_legal(action, mask)]
+
+
+def legal_or_idle(action: int, player: Player, mask: Mask | None) -> int:
+    """The action, or if the mask forbids it the idle one, or if that is forbidden the first that is legal."""
+    if is_legal(action, mask):
+        return action
+    if is_legal(player.idle, mask):
+        return player.idle
+    return next(iter(legal_actions(len(player.action_space), mask)), player.idle)
+
+
 def random_action(player: Player, mask: Mask | None, seed: int) -> int:
-    """One of the actions that the mask allows; the same for the same seed."""
-    choice = [index for index in range(len(player.action_space)) if allowed(index, mask)]
+    """One of the legal actions; the same for the same seed."""
+    choice = legal_actions(len(player.action_space), mask)
     return choice[seed % len(choice)] if choice else player.idle

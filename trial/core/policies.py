@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from trial.core.actions import Action, By
-from trial.core.players import Mask, Player, View, allowed, legal
+from trial.core.players import Mask, Player, View, is_legal, legal_or_idle
 
 FAILURES = 3
 """Failures in a row after which a policy is asked no more in the episode."""
@@ -125,7 +125,7 @@ class Policies:
         if not 0 <= index < count:
             self.failed(player, ask_id)
             return f"it chose action {str(index)[:20]}, but the actions are 0 to {count - 1}"
-        if not allowed(index, seat.mask):
+        if not is_legal(index, seat.mask):
             self.failed(player, ask_id)
             return f"it chose action {index}, which the environment's action mask forbids"
         seat.asked, seat.answer, seat.failures = None, index, 0
@@ -165,7 +165,7 @@ class Policies:
             index, by = self._last(seat), "late"
         else:
             index, by = self._last(seat), "policy" if self._goes_on and seat.last is not None else "none"
-        index = legal(index, player, mask)
+        index = legal_or_idle(index, player, mask)
         return Action(index, player.action_space[index], by)
 
     def _last(self, seat: _Seat) -> int:
@@ -175,7 +175,7 @@ class Policies:
         player, chosen = seat.player, seat.answer
         assert chosen is not None
         seat.answer = None
-        index = legal(chosen, player, mask)
+        index = legal_or_idle(chosen, player, mask)
         seat.last = index
         by: By = "advice" if player.by_program else "policy" if index == chosen else "none"
         return Action(index, player.action_space[index], by, None if player.by_program else seat.asked_after)
@@ -212,5 +212,5 @@ class Policies:
 
 
 def _idle(player: Player, mask: Mask | None, by: By) -> Action:
-    index = legal(player.idle, player, mask)
+    index = legal_or_idle(player.idle, player, mask)
     return Action(index, player.action_space[index], by)

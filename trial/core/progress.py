@@ -12,7 +12,7 @@ from enum import Enum
 from protocol.trial import Trial
 from trial.core.actions import Action
 from trial.core.controls import Controls
-from trial.core.players import NOOP, Mask, Player, View, allowed, legal, random_action
+from trial.core.players import NOOP, Mask, Player, View, is_legal, legal_or_idle, random_action
 from trial.core.policies import Policies
 from trial.core.seeds import policy_seed
 from trial.core.turns import Turns
@@ -284,7 +284,7 @@ class Progress:
         index = controls.choice(name, held)
         if index is None or not self.playing or self.frozen or not self.turns.waits_for(player):
             return
-        if not allowed(index, self._mask(player)):
+        if not is_legal(index, self._mask(player)):
             raise CommandRefused(NOT_POSSIBLE)
         self.turns.choose(player, Action(index, controls.names[index], "human"))
 
@@ -314,10 +314,10 @@ class Progress:
         index, human = self.controls[name].take()
         advice = self._advice.get(name) if self._advice and not human else None
         mask = None if self._view is None else self._view.masks.get(name)
-        if advice is not None and allowed(advice, mask):
+        if advice is not None and is_legal(advice, mask):
             return Action(advice, player.action_space[advice], "advice")
-        if mask is not None and not allowed(index, mask):
-            index, human = legal(index, player, mask), False
+        if mask is not None and not is_legal(index, mask):
+            index, human = legal_or_idle(index, player, mask), False
         return self._usual[name][index][human]
 
     # ---- turn by turn
@@ -342,7 +342,7 @@ class Progress:
             if turns is None or not player.human:
                 continue
             advice = self._advice.get(name)
-            if advice is not None and allowed(advice, mask):
+            if advice is not None and is_legal(advice, mask):
                 turns.choose(name, Action(advice, player.action_space[advice], "advice"))
             elif self.config.turn_ends == "episode":
                 self._good_episodes += 1
@@ -352,7 +352,7 @@ class Progress:
                 index = random_action(player, mask, policy_seed(self._seed, f"{name}/{self.steps}"))
                 turns.choose(name, Action(index, player.action_space[index], "random"))
             else:
-                index = legal(player.idle, player, mask)
+                index = legal_or_idle(player.idle, player, mask)
                 turns.choose(name, Action(index, player.action_space[index]))
 
     def _waiting(self) -> tuple[str, ...]:

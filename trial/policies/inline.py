@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
-from trial.policies.policy import Mask, Policy
+from trial.core.players import Mask
+from trial.policies.policy import Policy
 from trial.policies.thread import Done
 
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from protocol.players import AGENT_PLAYER, SAMPLE, WHO
 from trial.policies.policy import Policy, PolicyError, PolicyFileMissing
 from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
-
-SAMPLE = "sample:"
-"""Before a file: actions are drawn by the softmax of its output, instead of the best one being taken."""
-AGENT = "agent:"
 
 
 def load(
@@ -33,16 +30,14 @@ def load(
         return RandomPolicy(action_count)
     if spec == "idle":
         return IdlePolicy(action_count, idle)
-    if spec.startswith(AGENT):
+    if spec.startswith(AGENT_PLAYER):
         return of_class(spec, agent_module, player, action_count)
     if spec.endswith(".onnx"):
         from trial.policies import onnx  # noqa: PLC0415 - numpy and onnxruntime, which most projects do without
 
         name = spec.removeprefix(SAMPLE)
         return onnx.load(spec, _file(folder, name), action_count, observation_space, sample=spec != name)
-    raise PolicyError(
-        f"{spec!r} is no player; write human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
-    )
+    raise PolicyError(f"{spec!r} is no player; write {WHO}")
 
 
 def _file(folder: Path, name: str) -> Path:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-MASK = "action_mask"
+from trial.core.players import ACTION_MASK
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Shape = Sequence[int | str | None]
@@ -17,8 +17,8 @@ Encoding = Callable[[Any], Array]
 
 def without_mask(observation: Any) -> Any:
     """What is to be seen, without the mask that PettingZoo's games put beside it."""
-    if isinstance(observation, Mapping) and MASK in observation:
-        rest = {key: value for key, value in observation.items() if key != MASK}
+    if isinstance(observation, Mapping) and ACTION_MASK in observation:
+        rest = {key: value for key, value in observation.items() if key != ACTION_MASK}
         return next(iter(rest.values())) if len(rest) == 1 else rest
     return observation
 

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from protocol.players import ONNXRUNTIME
-from trial.policies.observations import MASK, Array, Encoding, Shape, encodings, fitted, shown, without_mask, zero
-from trial.policies.policy import Mask, PolicyError, legal
+from trial.core.players import ACTION_MASK, Mask, legal_actions
+from trial.policies.observations import Array, Encoding, Shape, encodings, fitted, shown, without_mask, zero
+from trial.policies.policy import PolicyError
 
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
@@ -121,7 +122,7 @@ class OnnxPolicy:
         found = row.astype(np.float64)
         if np.isnan(found).any():
             raise PolicyError(f"{self._spec} returned NaN instead of the actions' values")
-        allowed = legal(self._count, mask)
+        allowed = legal_actions(self._count, mask)
         if self._sample:
             return _drawn(found, allowed, self._random)
         return max(allowed, key=found.__getitem__)
@@ -136,7 +137,7 @@ class OnnxPolicy:
         action = int(row[0])
         if not 0 <= action < self._count:
             raise PolicyError(f"{self._spec} returned action {action}; there are 0 to {self._count - 1}")
-        if action not in legal(self._count, mask):
+        if action not in legal_actions(self._count, mask):
             raise PolicyError(f"{self._spec} returned action {action}, which action_mask forbids now")
         return action
 
@@ -186,7 +187,7 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
         raise PolicyError(f"{spec} has no {'output' if inputs else 'input'}")
     seen = _observed(inputs, first)
     rest = [port for port in inputs if port not in seen]
-    mask = next((port for port in rest if port.name in (MASK, "mask", "action_masks")), None)
+    mask = next((port for port in rest if port.name in (ACTION_MASK, "mask", "action_masks")), None)
     constants = {
         port.name: port.zeros(_CONSTANT[port.name]) for port in rest if port.name in _CONSTANT and len(port.shape) <= 1
     }
@@ -268,8 +269,8 @@ def _encoding(spec: str, ports: _Ports, space: Any, first: Any) -> Encoding:
 def _seen_space(space: Any) -> Any:
     """The space of what is to be seen, without the mask."""
     inner = getattr(space, "spaces", None)
-    if isinstance(inner, Mapping) and MASK in inner:
-        rest = {key: part for key, part in inner.items() if key != MASK}
+    if isinstance(inner, Mapping) and ACTION_MASK in inner:
+        rest = {key: part for key, part in inner.items() if key != ACTION_MASK}
         if len(rest) == 1:
             return next(iter(rest.values()))
     return space

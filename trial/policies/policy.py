@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol
 
-Mask = Sequence[bool]
-"""Of each action, whether it is legal now."""
+from trial.core.players import Mask
 
 
 class PolicyError(Exception):
@@ -35,11 +34,3 @@ class Policy(Protocol):
     def description(self) -> Mapping[str, Any]:
         """What a recording says of it: `kind`, `policy` as config.yml has it, `sha256` of a file."""
         ...
-
-
-def legal(count: int, mask: Mask | None) -> list[int]:
-    """The indices of the actions that may be taken, of `count` in all. All, if the mask allows none."""
-    if mask is None:
-        return list(range(count))
-    allowed = [index for index in range(min(count, len(mask))) if mask[index]]
-    return allowed or list(range(count))

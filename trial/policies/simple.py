@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
-from trial.policies.policy import Mask, PolicyError, legal
+from trial.core.players import Mask, is_legal, legal_actions
+from trial.policies.policy import PolicyError
 
 
 class RandomPolicy:
@@ -18,7 +19,7 @@ class RandomPolicy:
         self._random = Random(0)  # noqa: S311 - a game
 
     def act(self, _observation: Any, _info: Mapping[str, Any], mask: Mask | None) -> int:
-        return self._random.choice(legal(self._count, mask))
+        return self._random.choice(legal_actions(self._count, mask))
 
     def reset(self, seed: int) -> None:
         self._random.seed(seed)
@@ -37,7 +38,7 @@ class IdlePolicy:
         self._count, self._idle = count, idle
 
     def act(self, _observation: Any, _info: Mapping[str, Any], mask: Mask | None) -> int:
-        allowed = legal(self._count, mask)
+        allowed = legal_actions(self._count, mask)
         return self._idle if self._idle in allowed else allowed[0]
 
     def reset(self, seed: int) -> None:
@@ -92,7 +93,7 @@ def checked(action: Any, count: int, mask: Mask | None) -> int:
         raise PolicyError(f"act() returned {str(action)[:40]!r}, which is no action; return its number") from None
     if not 0 <= index < count:
         raise PolicyError(f"act() returned action {index}; there are 0 to {count - 1}")
-    if index not in legal(count, mask):
+    if not is_legal(index, mask):
         raise PolicyError(f"act() returned action {index}, which action_mask forbids now")
     return index
 

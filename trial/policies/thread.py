@@ -9,7 +9,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from trial.policies.policy import Mask, Policy
+from trial.core.players import Mask
+from trial.policies.policy import Policy
 
 Done = Callable[[int, int | None, Exception | None], None]
 """Takes the id of a question, and the action or else the exception that the policy raised."""
