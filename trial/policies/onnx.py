@@ -54,7 +54,7 @@ class _Ports:
 
     observation: tuple[_Port, ...]
     """One, or as many as the observation has parts, which they are named after."""
-    states: Mapping[str, tuple[_Port, str]]
+    states: Mapping[str, _Port]
     """Recurrent states: by the name of the output, the input that it becomes."""
     constants: Mapping[str, Array]
     mask: _Port | None
@@ -85,13 +85,13 @@ class OnnxPolicy:
         except Exception as error:
             raise PolicyError(f"{self._spec} fails: {_short(error)}") from error
         action = self._chosen(np.asarray(values), mask)
-        for (port, _), state in zip(self._ports.states.values(), states, strict=True):
+        for port, state in zip(self._ports.states.values(), states, strict=True):
             self._state[port.name] = state
         return action
 
     def reset(self, seed: int) -> None:
         self._random.seed(seed)
-        self._state = {port.name: port.zeros() for port, _ in self._ports.states.values()}
+        self._state = {port.name: port.zeros() for port in self._ports.states.values()}
 
     def close(self) -> None:
         self._session = None
@@ -212,17 +212,17 @@ def _observed(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
     return ((named or inputs)[0],)
 
 
-def _states(spec: str, wanted: list[_Port], outputs: list[_Port]) -> dict[str, tuple[_Port, str]]:
+def _states(spec: str, wanted: list[_Port], outputs: list[_Port]) -> dict[str, _Port]:
     """By the name of the output, the input that it becomes: paired by their names, the others in their order."""
     left = {port.name: port for port in outputs}
-    pairs: dict[str, tuple[_Port, str]] = {}
+    pairs: dict[str, _Port] = {}
     unpaired = []
     for port in wanted:
         name = next((name for name in _next_names(port.name) if name in left), None)
         if name is None:
             unpaired.append(port)
         else:
-            pairs[name] = (port, name)
+            pairs[name] = port
             del left[name]
     values = next(iter(left), "")  # the first output is not a state
     others = [port for name, port in left.items() if name != values]
@@ -234,7 +234,7 @@ def _states(spec: str, wanted: list[_Port], outputs: list[_Port]) -> dict[str, t
                 "no output has its shape"
             )
         others.remove(out)
-        pairs[out.name] = (port, out.name)
+        pairs[out.name] = port
     return pairs
 
 
