@@ -110,6 +110,15 @@ def test_a_file_that_cannot_be_used_is_named_with_the_reason(tmp_path: Path, fil
     assert problem(tmp_path, **files) == said
 
 
+@pytest.mark.parametrize("form", ["PNG", "JPEG", "WEBP"])
+def test_an_image_that_was_cut_off_is_named(tmp_path: Path, form: str) -> None:
+    whole = io.BytesIO()
+    Image.effect_noise((64, 64), 90).convert("RGB").save(whole, form)
+    content = whole.getvalue()
+    said = problem(tmp_path, **{f"ball_{form.lower()}": content[: len(content) // 2]})
+    assert said == f"assets/ball.{form.lower()} is no PNG, JPEG or WebP image, or is broken"
+
+
 def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(image())
     (tmp_path / "assets").mkdir()

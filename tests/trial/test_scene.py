@@ -106,6 +106,29 @@ def test_permanent_objects_come_first_from_the_beginning() -> None:
     assert list(first.objects) == list(as_scene([BALL], first).objects) == ["wall", "ball"]
 
 
+def test_permanent_objects_do_not_pile_up_without_end() -> None:
+    scene: Scene | None = None
+    for number in range(3):
+        drops = [BALL | {"id": f"{number}-{index}", "permanent": True} for index in range(MOST_OBJECTS // 2)]
+        scene = as_scene(drops, scene)
+    assert scene is not None
+    assert len(scene.objects) == MOST_OBJECTS
+    said = f"the scene has more than {MOST_OBJECTS} objects with those that are permanent; some are left out"
+    assert scene.problems == (said,)
+    assert as_scene([{"id": "0-0", "remove": True}, BALL], scene).objects.keys() >= {"ball"}, "there is room again"
+
+
+def test_points_of_permanent_objects_do_not_pile_up_without_end() -> None:
+    path = {"type": "line", "points": [(0, 0)] * (MOST_POINTS - 1), "color": "red", "permanent": True}
+    scene: Scene | None = None
+    for number in range(6):
+        scene = as_scene([path | {"id": str(number)}], scene)
+    assert scene is not None
+    assert list(scene.objects) == ["0", "1", "2", "3"]
+    again = as_scene([path | {"id": str(number)} for number in range(4)], scene)
+    assert (list(again.objects), again.problems) == (list("0123"), ()), "each counts once"
+
+
 def test_a_permanent_object_can_be_changed_and_removed() -> None:
     first = as_scene([BALL | {"permanent": True}])
     changed = as_scene([BALL | {"permanent": True, "x": 1}], first)
@@ -187,6 +210,32 @@ def test_what_came_last_of_an_id_is_what_counts_in_the_next_scene_too() -> None:
 )
 def test_an_object_that_cannot_be_drawn_is_left_out_with_a_sentence(fields: dict[str, Any], said: str) -> None:
     assert problem(**fields) == said
+
+
+class Raises:
+    """Its text raises."""
+
+    def __str__(self) -> str:
+        raise KeyError("x")
+
+
+def endless_list() -> list[Any]:
+    """A list in a list in a list …"""
+    inner: list[Any] = []
+    for _ in range(100_000):
+        inner = [inner]
+    return inner
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"), [({"text": Raises()}, "KeyError"), ({"text": endless_list()}, "RecursionError")]
+)
+def test_an_object_that_raises_is_left_out_with_a_sentence(fields: dict[str, Any], why: str) -> None:
+    scene = as_scene([{"id": "words", "type": "text", "x": 0, "y": 0, **fields}, BALL])
+    assert list(scene.objects) == ["ball"]
+    assert scene.problems == (f"object 1 of render() cannot be read ({why})",)
+    with pytest.raises(SceneError, match=rf"a hud that cannot be read \({why}\)"):
+        as_scene({"objects": [], "hud": fields["text"]})
 
 
 def test_the_other_objects_are_drawn() -> None:

@@ -170,6 +170,8 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
             warnings.simplefilter("ignore")  # a very large image is refused below
             with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
                 kind, size = _TYPES[str(picture.format)], picture.size
+                if max(size) <= LONGEST_SIDE:
+                    picture.load()  # the whole image: a file that was cut off begins as a good one does
     except Exception:  # noqa: BLE001 - of a broken file Pillow raises many kinds
         raise AssetError("is no PNG, JPEG or WebP image, or is broken") from None
     if max(size) > LONGEST_SIDE:

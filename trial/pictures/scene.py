@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 MOST_OBJECTS = 2_000
+"""Of one scene, with those that stay from scenes before it."""
 MOST_POINTS = 5_000
 """Points of one line or polygon."""
 MOST_POINTS_IN_ALL = 20_000
@@ -95,7 +96,7 @@ class _Making:
         """Permanent objects that were not returned again so far."""
         self._given: dict[str, Mapping[str, Any]] = {}
         self._problems: list[str] = []
-        self._points = 0
+        self._points = sum(len(each.get("points", ())) for each in self._objects.values())
 
     def add(self, value: Any, index: int) -> None:
         """Add an object, change it or remove it."""
@@ -110,17 +111,21 @@ class _Making:
             name, fields = _fields(given, index, self._problems)
             self._given.pop(name, None)
             if fields.get("remove"):
-                self._objects.pop(name, None)
+                self._points -= len(self._objects.pop(name, {}).get("points", ()))
                 self._permanent.discard(name)
                 return
             checked = _checked(fields, name, self._problems)
         except Wrong as error:
             self._problems.append(f"{_called(value, index)} {error}")
             return
-        self._points += len(checked.get("points", ()))
-        if self._points > MOST_POINTS_IN_ALL:
+        except Exception as error:  # noqa: BLE001 - methods of the researcher's objects, lists within lists without end
+            self._problems.append(f"object {index + 1} of render() cannot be read ({type(error).__name__})")
+            return
+        points = self._points + len(checked.get("points", ())) - len(self._objects.get(name, {}).get("points", ()))
+        if points > MOST_POINTS_IN_ALL:
             self._problems.append(f"the scene has more than {MOST_POINTS_IN_ALL} points; some objects are left out")
             return
+        self._points = points
         earlier = self._before.objects.get(name)
         self._put(name, earlier if earlier is not None and earlier == checked else checked, fields)
         # What may change in place, and what something was to be said of, is checked again each time.
@@ -138,6 +143,11 @@ class _Making:
     def _put(self, name: str, checked: CheckedObject, fields: Mapping[str, Any]) -> None:
         if name in self._objects and name not in self._kept:
             self._problems.append(f"two objects have the id {name!r}; the later one counts")
+        if name not in self._objects and len(self._objects) >= MOST_OBJECTS:
+            self._problems.append(
+                f"the scene has more than {MOST_OBJECTS} objects with those that are permanent; some are left out"
+            )
+            return
         self._kept.discard(name)
         if fields.get("permanent"):
             self._permanent.add(name)
@@ -176,7 +186,10 @@ def _parts(value: Any) -> tuple[Iterable[Any], str]:
         raise SceneError(f"render() must return a list of objects, not {type(value).__name__}")
     if len(value) > MOST_OBJECTS:
         raise SceneError(f"render() returned {len(value)} objects; a scene has at most {MOST_OBJECTS}")
-    return value, "" if hud is None else str(hud)[:LONGEST_TEXT]
+    try:
+        return value, "" if hud is None else str(hud)[:LONGEST_TEXT]
+    except Exception as error:
+        raise SceneError(f"render() returned a hud that cannot be read ({type(error).__name__})") from error
 
 
 def _has_fields(value: Any) -> bool:
