@@ -1,0 +1,43 @@
+"""The walks of docs/architecture.md lead through files and functions that exist."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+_FILE = re.compile(r"`(?P<file>[\w/.-]+\.(?:py|js))`(?: \((?P<names>`\w+`(?:, `\w+`)*)\))?")
+
+
+def rows() -> Iterator[tuple[str, str]]:
+    """Each row of the walks: what happens, and what to read."""
+    walks = (ROOT / "docs/architecture.md").read_text().partition("### One walk")[2].partition("\n## ")[0]
+    for line in walks.splitlines():
+        if line.startswith("| ") and line != "| what happens | read |":
+            happens, _, read = line.strip("| ").partition(" | ")
+            yield happens, read
+
+
+def named() -> Iterator[tuple[str, Path | None, list[str]]]:
+    """What each row names: the file, and functions or classes in it.
+
+    A file stands with its whole path, or in the folder of the one before it, or in one around that.
+    """
+    folder = ROOT
+    for happens, read in rows():
+        for found in _FILE.finditer(read):
+            around = [folder, *folder.parents]
+            places = [each / found["file"] for each in around if each.is_relative_to(ROOT)]
+            file = next((place for place in places if place.is_file()), None)
+            folder = folder if file is None else file.parent
+            yield f"{happens}: {found['file']}", file, re.findall(r"\w+", found["names"] or "")
+
+
+@pytest.mark.parametrize(("what", "file", "names"), list(named()))
+def test_a_walk_leads_to_what_exists(what: str, file: Path | None, names: list[str]) -> None:
+    assert file is not None, what
+    code = file.read_text()
+    assert [name for name in names if not re.search(rf"^ *(?:async )?(?:def|class) {name}\b", code, re.MULTILINE)] == []
