@@ -25,6 +25,7 @@ MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
 LONGEST_NAME = 64
 """Characters of the name of an action, or of a control of the project's own."""
+MOST_EPISODES = 1_000_000
 LONGEST_BREAK = 600
 """Seconds."""
 HIGHEST_RATE = 240
@@ -78,9 +79,19 @@ def _control() -> Any:
     return _key(values.flag, False, "", {"type": "boolean"})
 
 
-def _whole(low: int, high: int, default: int, meaning: str) -> Any:
+def _whole(low: int, high: int, default: int | None, meaning: str) -> Any:
     schema = {"type": "integer", "minimum": low, "maximum": high}
     return _key(values.whole(low, high), default, meaning, schema)
+
+
+def _seconds(most: int, default: float, meaning: str) -> Any:
+    """Seconds from 0."""
+    return _key(values.number(0, most), default, meaning, {"type": "number", "minimum": 0, "maximum": most})
+
+
+def _choice(words: tuple[str, ...], meaning: str) -> Any:
+    """One of these words; the first is the default."""
+    return _key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
 
 
 def _rate(default: int, meaning: str) -> Any:
@@ -154,11 +165,9 @@ class Scene:
         "Color behind all objects, as #rrggbb in quotes.",
         {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
     )
-    coordinates: str = _key(
-        values.one_of("relative", "pixels"),
-        "relative",
+    coordinates: str = _choice(
+        ("relative", "pixels"),
         "Whether x, y and points are shares of the picture, from 0 to 1, or pixels of it.",
-        {"enum": ["relative", "pixels"]},
     )
     pixel_art: bool = _flag(False, "Whether images keep hard edges when they are made larger.")
     assets: str = _key(_folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"})
@@ -260,7 +269,7 @@ class Trial:
     action_buffer_lifespan: int = _whole(
         1, 10_000, 1, "Environment steps for which an action stays in force unless another comes; 1 is no buffer."
     )
-    max_episodes: int = _whole(1, 1_000_000, 20, "Episodes until the trial is over.")
+    max_episodes: int = _whole(1, MOST_EPISODES, 20, "Episodes until the trial is over.")
     between_episodes: float | str = _key(
         _break,
         3,
@@ -274,18 +283,16 @@ class Trial:
         "A file of steps/ that the game page shows before the game, and again in a pause.",
         {"type": "string"},
     )
-    reset_freeze: float = _key(
-        values.number(0, 60),
+    reset_freeze: float = _seconds(
+        60,
         0,
         "Seconds for which each episode shows its first picture, with a countdown; keys do nothing.",
-        {"type": "number", "minimum": 0, "maximum": 60},
     )
     max_steps: int = _whole(0, 10**9, 0, "Steps after which an episode is truncated; 0 is no limit.")
-    episode_seconds: float = _key(
-        values.number(0, 86_400),
+    episode_seconds: float = _seconds(
+        86_400,
         0,
         "Seconds of play after which an episode is truncated; the page shows the time left. 0 is no limit.",
-        {"type": "number", "minimum": 0, "maximum": 86_400},
     )
     keys: dict[str, Any] = field(
         default_factory=dict,
@@ -314,11 +321,9 @@ class Trial:
             entries=_labels,
         ),
     )
-    input: str = _key(
-        values.one_of("held", "single"),
-        "held",
+    input: str = _choice(
+        ("held", "single"),
         "Whether an action goes on while its keys are held, or each press of a key is one action.",
-        {"enum": ["held", "single"]},
     )
     game: str | None = _key(
         values.text("the name of an environment"),
@@ -326,11 +331,9 @@ class Trial:
         "Name of the environment, given to the agent's start(). Needed if there is a game step.",
         {"type": "string"},
     )
-    data_file: str = _key(
-        values.one_of("episode", "trial"),
-        "episode",
+    data_file: str = _choice(
+        ("episode", "trial"),
         "Whether a recording is written after each episode or once at the end of the trial.",
-        {"enum": ["episode", "trial"]},
     )
     s3upload: bool = _flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
     action_space: tuple[str, ...] = _key(
@@ -356,18 +359,15 @@ class Trial:
     )
     record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
-    callback_seconds: float = _key(
-        values.number(0, 10),
+    callback_seconds: float = _seconds(
+        10,
         0.5,
         "Seconds for which the game waits for a callback of the agent; then it goes on without waiting.",
-        {"type": "number", "minimum": 0, "maximum": 10},
     )
-    gym: str = _key(
-        values.one_of("none", "watch", "advise", "environments"),
-        "none",
+    gym: str = _choice(
+        ("none", "watch", "advise", "environments"),
         "What programs that have the server's token may do at its path /gym: nothing, see each step, also advise, or "
         "make environments of their own.",
-        {"enum": ["none", "watch", "advise", "environments"]},
     )
     scene: Scene | None = field(
         default=None,
@@ -394,35 +394,29 @@ class Trial:
         ),
     )
     frame_skip: int = _whole(1, 1000, 1, "Policies choose anew at one step in so many.")
-    policy_seconds: float = _key(
-        values.number(0, 600),
+    policy_seconds: float = _seconds(
+        600,
         10,
         "With pace: turns, the seconds that a policy may think; then the idle action is taken.",
-        {"type": "number", "minimum": 0, "maximum": 600},
     )
-    seed: int | None = _key(
-        values.whole(0, 2**31 - 1_000_001),
+    seed: int | None = _whole(
+        0,
+        2**31 - MOST_EPISODES - 1,  # the last episode's seed too is below 2**31
         None,
         "Seed of the first episode; each one after it has the next number. Without it, each has a random one.",
-        {"type": "integer", "minimum": 0, "maximum": 2**31 - 1_000_001},
     )
-    pace: str = _key(
-        values.one_of("realtime", "turns"),
-        "realtime",
+    pace: str = _choice(
+        ("realtime", "turns"),
         "Whether a step is taken at each frame, or as soon as all have chosen who are to act.",
-        {"enum": ["realtime", "turns"]},
     )
-    turn_seconds: float = _key(
-        values.number(0, 86_400),
+    turn_seconds: float = _seconds(
+        86_400,
         0,
         "With pace: turns, the seconds in which a participant must choose; 0 is no limit.",
-        {"type": "number", "minimum": 0, "maximum": 86_400},
     )
-    turn_ends: str = _key(
-        values.one_of("idle", "random", "episode"),
-        "idle",
+    turn_ends: str = _choice(
+        ("idle", "random", "episode"),
         "What happens when turnSeconds are over: the idle action, a random possible one, or the episode ends.",
-        {"enum": ["idle", "random", "episode"]},
     )
     idle_action: str | dict[str, str] | None = field(
         default=None,

@@ -24,8 +24,8 @@ from trial.core.effects import (
     ResetCall,
     SaveAnswer,
     SendDone,
-    SendFrame,
     SendMessage,
+    SendPicture,
     SendState,
     StepCall,
     StepTaken,
@@ -186,7 +186,7 @@ def test_a_client_is_told_the_controls_and_shown_the_frame():
     controls, frame = driver.connect()
     assert json.loads(controls.text)["state"] == "ready"
     assert (frame.connection, frame.frame_id) == ("tab", 1)
-    assert frame.frame is FRAME
+    assert frame.picture is FRAME
 
 
 def test_a_second_tab_of_a_player_replaces_the_first_and_holds_the_game():
@@ -206,7 +206,7 @@ def test_another_player_is_shown_the_same_and_replaces_nobody():
     driver.connect("phone", player="P2")
     assert driver.of(Close) == []
     driver.step()
-    frames = driver.of(SendFrame)
+    frames = driver.of(SendPicture)
     assert [effect.connection for effect in frames] == ["tab", "phone"]
     assert len({effect.frame_id for effect in frames}) == 1
 
@@ -234,7 +234,7 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     driver.wait(STALLED_SECONDS)
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
-    assert [type(effect) for effect in driver.step()] == [WriteLine, SendFrame, Log, SendState]
+    assert [type(effect) for effect in driver.step()] == [WriteLine, SendPicture, Log, SendState]
     assert driver.trial.wake_at is None
 
 
@@ -347,7 +347,7 @@ def test_the_last_episode_ends_the_trial_and_its_answer_is_stored_after_the_reco
     driver.now += 0.5
     effects = driver.step(reward=2.5, terminated=True)
     kinds = [type(effect) for effect in effects]
-    assert kinds == [WriteLine, SendFrame, RecordLine, CloseRecording, SaveAnswer, SendState]
+    assert kinds == [WriteLine, SendPicture, RecordLine, CloseRecording, SaveAnswer, SendState]
     assert driver.of(SaveAnswer)[0].answers == {
         "episodes": 1,
         "score": 2.5,

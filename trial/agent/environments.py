@@ -36,7 +36,7 @@ class Players:
         return action + self.starts[player]
 
 
-class Turns:
+class AecTurns:
     """Who is to act in a PettingZoo `AECEnv` in which players take turns."""
 
     def __init__(self, aec: Any) -> None:
@@ -91,10 +91,10 @@ def playable(env: Any) -> Any:
     return conversions.turn_based_aec_to_parallel(env)
 
 
-def turns(env: Any) -> Turns | None:
+def turns(env: Any) -> AecTurns | None:
     """Whose turn it is in an `AECEnv`, or in what `playable` made of it; None if players act at the same time."""
     aec = env if is_aec(env) else getattr(env, "aec_env", None)
-    return None if aec is None or not is_aec(aec) or _at_once(aec) else Turns(aec)
+    return None if aec is None or not is_aec(aec) or _at_once(aec) else AecTurns(aec)
 
 
 def is_aec(env: Any) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from trial.agent.agent import AgentAdapter, AgentError
-from trial.agent.environments import Players, Turns
+from trial.agent.environments import AecTurns, Players
 from trial.core.players import ACTION_MASK
 from trial.pictures.picture import Picture
 
@@ -57,7 +57,7 @@ class Joint:
 class JointAdapter:
     """Calls an agent with several players. All methods run on the agent's thread (`trial/agent/worker.py`)."""
 
-    def __init__(self, adapter: AgentAdapter, players: Players, turns: Turns | None) -> None:
+    def __init__(self, adapter: AgentAdapter, players: Players, turns: AecTurns | None) -> None:
         """`adapter` has started its agent. `turns` says whose turn it is in a PettingZoo `AECEnv`."""
         self._adapter = adapter
         self._reader = adapter.reader

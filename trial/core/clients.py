@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from trial.core import messages
-from trial.core.effects import Close, Effect, Pictures, SendDone, SendFrame, SendMessage, SendState
+from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
 from trial.core.progress import Progress
 
@@ -114,7 +114,7 @@ class Clients:
         """Show a client its present picture, if there is one."""
         picture = self.pictures.get(client.player) if isinstance(self.pictures, dict) else self.pictures
         if picture is not None:
-            self._emit(SendFrame(client.connection, picture, self.frame_id))
+            self._emit(SendPicture(client.connection, picture, self.frame_id))
 
     def send_done(self, episodes: int, scores: Mapping[str, float], score: float) -> None:
         """Tell all clients that the trial is over and stored. `score` is that of a player who is not in `scores`."""

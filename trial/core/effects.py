@@ -40,11 +40,11 @@ class SendState:
 
 
 @dataclass(frozen=True, slots=True)
-class SendFrame:
+class SendPicture:
     """Send a picture. It replaces a picture that has not been sent yet."""
 
     connection: Hashable
-    frame: Picture
+    picture: Picture
     frame_id: int
 
 
@@ -245,7 +245,7 @@ class LogAgentError:
 Effect = (
     SendMessage
     | SendState
-    | SendFrame
+    | SendPicture
     | SendDone
     | Close
     | Call

@@ -29,8 +29,8 @@ from trial.core.effects import (
     ResetPolicy,
     SaveAnswer,
     SendDone,
-    SendFrame,
     SendMessage,
+    SendPicture,
     SendState,
     StepCall,
     TellMoved,
@@ -89,7 +89,7 @@ class TrialLoop:
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
-            SendFrame: lambda effect: effect.connection.send_picture(effect.frame, effect.frame_id),
+            SendPicture: lambda effect: effect.connection.send_picture(effect.picture, effect.frame_id),
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: lambda effect: self._write(effect.line),
