@@ -128,10 +128,14 @@ def test_a_class_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
 
     class Other: ...
 
-    agent = module(Helper=Helper, Other=Other)
+    class Few:
+        def act(self, observation: Any) -> int: ...
+
+    agent = module(Helper=Helper, Other=Other, Few=Few)
     for spec, where, said in (
-        ("agent:Partner", agent, "there is no class Partner in agent.py; classes with act() there: Helper"),
+        ("agent:Partner", agent, "there is no class Partner in agent.py; classes with act() there: Helper, Few"),
         ("agent:Other", agent, "class Other in agent.py has no act(observation, info)"),
+        ("agent:Few", agent, "act of class Few in agent.py takes other values; write act(self, observation, info)"),
         ("agent:Partner", None, "agent:Partner is a class of agent.py, and there is no agent.py"),
     ):
         with pytest.raises(PolicyError) as refused:

@@ -110,7 +110,10 @@ def of_class(spec: str, module: Any, player: str, count: int) -> AgentPolicy:
         raise PolicyError(f"there is no class {name} in agent.py{hint}")
     if not callable(getattr(made, "act", None)):
         raise PolicyError(f"class {name} in agent.py has no act(observation, info)")
-    return AgentPolicy(spec, made(player=player) if _names_player(made) else made(), count)
+    one = made(player=player) if _names_player(made) else made()
+    if _has_signature(one.act) and not (_takes(one.act, 2) or _takes(one.act, 3)):
+        raise PolicyError(f"act of class {name} in agent.py takes other values; write act(self, observation, info)")
+    return AgentPolicy(spec, one, count)
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
@@ -118,6 +121,14 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     try:
         inspect.signature(function).bind(*[None] * count)
     except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _has_signature(function: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(function)
+    except (TypeError, ValueError):  # what is written in C may have none
         return False
     return True
 
