@@ -17,11 +17,18 @@ def _has_scene(trial: Mapping[str, Any]) -> bool:
     return trial.get("scene") is not None
 
 
+def _jumps(trial: Mapping[str, Any]) -> bool:
+    """It has a button for up, and none for down."""
+    ui = trial.get("ui")
+    return isinstance(ui, Mapping) and ui.get("up") is True and not ui.get("down")
+
+
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "reading.js": lambda trial: any(isinstance(trial.get(key), str) for key in GAME_PAGES),
     "turns.js": lambda trial: trial.get("pace") == "turns",
     "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),
+    "thumbs.js": _jumps,
     **dict.fromkeys(("painter.js", "scene.js", "sprites.js"), _has_scene),
 }
 """By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""

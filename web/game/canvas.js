@@ -51,7 +51,13 @@ function beginPicture({ width, height, channels = 0 }) {
   size = now;
   pixels = imageData = null;
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-  document.body.style.setProperty("--ratio", width / height);
+  shapePicture(width / height);
+}
+
+// `ratio`: width by height of what is shown. The layout follows it.
+export function shapePicture(ratio) {
+  document.body.style.setProperty("--ratio", ratio);
+  document.body.classList.toggle("wide", ratio > 1);
 }
 
 function putRows(first, count, { width, height, channels }) {

@@ -12,6 +12,10 @@ let endsAt = null; // when the time is over, if the game goes on as it does
 let saidSoon = false;
 
 overlays.freeze = { title: "Get ready", band: true };
+// One line at the top: the picture below is what there is to be seen.
+hooks.overlay.push((name) => {
+  find("overlay").style.cssText = name === "freeze" ? "inset: 0 0 auto; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
+});
 document.querySelector(".hud").append(timeLeft);
 
 hooks.said.push((message) => {

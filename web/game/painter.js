@@ -1,4 +1,5 @@
 // Draws the objects of a scene on a canvas of their own, which lies on that of the frames.
+import { shapePicture } from "./canvas.js";
 import { find, make } from "./page.js";
 import { spriteOf } from "./sprites.js";
 
@@ -28,7 +29,7 @@ export function prepare(said, changed) {
 // Shows this canvas, in the shape of the scene.
 export function place() {
   const ratio = String(picture.width / picture.height);
-  if (document.body.style.getPropertyValue("--ratio") !== ratio) document.body.style.setProperty("--ratio", ratio);
+  if (document.body.style.getPropertyValue("--ratio") !== ratio) shapePicture(ratio);
   if (!easel.hidden) return;
   easel.hidden = false;
   fit();

@@ -1,0 +1,129 @@
+"""The game page on a phone: how large the picture is, what thumbs reach, and what is said of a connection that is dead."""
+# ruff: noqa: F811 - fixtures of other tests of pages
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.browser.test_pages_browser import World, shot, tell, world  # noqa: F401
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}
+
+
+@pytest.fixture
+def phone(chromium: Any) -> Iterator[Any]:
+    """A page on a phone of 360 by 640 pixels."""
+    context = chromium.new_context(viewport={"width": 360, "height": 640}, has_touch=True, is_mobile=True)
+    yield context.new_page()
+    context.close()
+
+
+def play(world: World, phone: Any, size: tuple[int, int], trial: dict[str, Any], ui: list[str]) -> None:
+    """Shows a running game that is drawn by objects, with a line of its own above it."""
+    width, height = size
+    phone.set_viewport_size({"width": width, "height": height})
+    scene = {**SCENE, **trial.get("scene", {})}
+    world.spoken = "hippodrome.3"
+    world.trial = {**trial, "scene": scene, "ui": dict.fromkeys(ui, True)}
+    world.controls = {
+        "UI": ui, "scene": scene, "assets": [], "maxEpisodes": 3, "actionSpace": ["noop", "up", "left", "right", "down", "wait"],
+        **{key: trial[key] for key in ("pace", "keys") if key in trial},
+    }  # fmt: skip
+
+    world.step = 2
+    world.ready()
+    phone.goto(world.url)
+    phone.wait_for_selector("#overlay-button:visible")
+    drawn = {"new": True, "set": {}, "hud": "0 of 8 acorns, 36 turns left"}
+    world.connections[0].send(struct.pack("!BI", 4, 3) + json.dumps(drawn).encode())
+    phone.wait_for_selector("#scene-hud:visible")
+    tell(world, state="playing", toAct=True)
+    phone.wait_for_selector("#mode[data-state=playing]", state="attached")
+
+
+def box(phone: Any, selector: str) -> dict[str, float]:
+    found: dict[str, float] = phone.locator(selector).bounding_box()
+    return found
+
+
+def overflow(phone: Any) -> list[int]:
+    """By how many pixels the page is wider and higher than the window."""
+    found: list[int] = phone.evaluate(
+        "[document.documentElement.scrollWidth - innerWidth, document.documentElement.scrollHeight - innerHeight]"
+    )
+    return found
+
+
+ALL = ["up", "down", "left", "right", "start", "pause"]
+
+
+def test_a_game_with_turns_and_a_line_of_its_own_fits_the_smallest_phone(world: World, phone: Any) -> None:
+    play(world, phone, (320, 568), {"pace": "turns", "scene": {"width": 640, "height": 480}}, ALL)
+    assert phone.inner_text("#turn") == "Your turn"
+    shot(phone, "320-turns")
+    assert overflow(phone) == [0, 0]
+
+
+def test_a_wide_picture_on_a_phone_held_sideways_is_larger_than_upright(world: World, phone: Any) -> None:
+    play(world, phone, (640, 360), {}, ALL)
+    assert overflow(phone) == [0, 0]
+    shot(phone, "640-wide")
+    sideways = box(phone, "#screen")["width"]
+    phone.set_viewport_size({"width": 360, "height": 640})
+    assert sideways > 1.15 * box(phone, "#screen")["width"]
+
+
+def test_on_a_small_phone_held_sideways_all_buttons_can_be_reached(world: World, phone: Any) -> None:
+    play(world, phone, (568, 320), {"scene": {"width": 480, "height": 384}}, ALL)
+    assert overflow(phone) == [0, 0]
+
+
+JUMPS = {"keys": {"ArrowLeft": "left", "ArrowUp": "up", "ArrowRight": "right"}}
+
+
+@pytest.mark.parametrize("size", [(360, 640), (320, 568), (640, 360), (568, 320)], ids=str)
+def test_the_left_thumb_goes_and_the_right_thumb_jumps(world: World, phone: Any, size: tuple[int, int]) -> None:
+    play(world, phone, size, JUMPS, ["up", "left", "right", "start", "pause"])
+    assert overflow(phone) == [0, 0]
+    shot(phone, f"{size[0]}-thumbs")
+    left, right, up = (box(phone, f".pad .{name}") for name in ("left", "right", "up"))
+    assert left["x"] < right["x"] < size[0] / 2 < up["x"]
+    assert min(up["x"] - right["x"] - right["width"], left["width"] - 43, up["height"] - 43) > 0
+    for touched in (right, up):
+        x, y = touched["x"] + touched["width"] / 2, touched["y"] + touched["height"] / 2
+        assert phone.evaluate("([x, y]) => Boolean(document.elementFromPoint(x, y).closest('.hold'))", [x, y])
+
+
+def test_two_thumbs_hold_two_buttons_at_once(world: World, phone: Any) -> None:
+    play(world, phone, (640, 360), JUMPS, ["up", "left", "right", "start", "pause"])
+    fingers = [
+        {"x": each["x"] + each["width"] / 2, "y": each["y"] + each["height"] / 2, "id": at}
+        for at, each in enumerate(box(phone, f".pad .{name}") for name in ("right", "up"))
+    ]
+    devtools = phone.context.new_cdp_session(phone)
+    for touching in (fingers[:1], fingers):
+        devtools.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": touching})
+    world.wait_for({"key": "ArrowUp", "held": True})
+    assert {"key": "ArrowRight", "held": True} in world.heard
+    assert {"key": "ArrowRight", "held": False} not in world.heard
+    devtools.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    world.wait_for({"key": "ArrowRight", "held": False})
+    world.wait_for({"key": "ArrowUp", "held": False})
+
+
+def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: World, phone: Any) -> None:
+    play(world, phone, (360, 640), {"resetFreeze": 2}, ALL)
+    tell(world, state="playing", startsIn=2)
+    phone.wait_for_selector("#overlay-title:text('Get ready')")
+    shot(phone, "360-freeze")
+    assert box(phone, "#overlay")["height"] < box(phone, "#screen")["height"] / 4
+    assert box(phone, "#overlay")["y"] < box(phone, "#screen")["y"] + 1
+    tell(world, state="paused")
+    phone.wait_for_selector("#overlay-title:text('Paused')")
+    assert box(phone, "#overlay")["height"] == box(phone, "#screen")["height"]
