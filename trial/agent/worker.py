@@ -6,6 +6,7 @@ import asyncio
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from trial.core.effects import AgentTimeout
@@ -14,6 +15,15 @@ T = TypeVar("T")
 
 Done = Callable[[Any, Exception | None], None]
 """Takes a function's result, or the exception that it raised."""
+
+
+@dataclass(eq=False, slots=True)
+class _Job:
+    """A function that the thread has, and who waits for it."""
+
+    done: Done
+    until: float
+    limit: float
 
 
 class Worker:
@@ -27,6 +37,8 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="agent", daemon=True)
         self._thread.start()
         self._out = 0  # functions that have not returned
+        self._waiting: dict[_Job, None] = {}  # those that are not late
+        self._timer: asyncio.TimerHandle | None = None  # one for all of them: most return long before their limit
 
     @property
     def busy(self) -> bool:
@@ -39,27 +51,41 @@ class Worker:
         To be called from the event loop.
         """
         loop = asyncio.get_running_loop()
-        waiting = True
+        job = _Job(done, loop.time() + limit, limit)
 
-        def finish(result: Any, error: Exception | None) -> None:
-            nonlocal waiting
-            if waiting:
-                waiting = False
-                timer.cancel()
-                done(result, error)
-
-        def returned(result: Any, error: Exception | None) -> None:
-            self._out -= 1
-            finish(result, error)
-
-        def job() -> None:
+        def run() -> None:
             result, error = _call(function)
             if not loop.is_closed():
-                loop.call_soon_threadsafe(returned, result, error)
+                loop.call_soon_threadsafe(self._returned, job, result, error)
 
-        timer = loop.call_later(limit, finish, None, AgentTimeout(f"no answer within {limit:g} s"))
         self._out += 1
-        self._jobs.put(job)
+        self._waiting[job] = None
+        if self._timer is None or job.until < self._timer.when():
+            self._wake_at(loop, job.until)
+        self._jobs.put(run)
+
+    def _returned(self, job: _Job, result: Any, error: Exception | None) -> None:
+        self._out -= 1
+        if job in self._waiting:
+            del self._waiting[job]
+            job.done(result, error)
+
+    def _wake_at(self, loop: asyncio.AbstractEventLoop, when: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = loop.call_at(when, self._look, loop)
+
+    def _look(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Give up the functions that are late; look again when the next one may be."""
+        self._timer = None
+        now = loop.time()
+        late = [job for job in self._waiting if job.until <= now]
+        for job in late:
+            del self._waiting[job]
+        if self._waiting:
+            self._wake_at(loop, min(job.until for job in self._waiting))
+        for job in late:
+            job.done(None, AgentTimeout(f"no answer within {job.limit:g} s"))
 
     async def call(self, function: Callable[[], T], *, limit: float) -> T:
         """The function's result, or the exception that it raised. Raises AgentTimeout after `limit` seconds."""

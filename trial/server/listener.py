@@ -18,6 +18,7 @@ from trial.server.handshake import process_request, select_subprotocol
 from trial.server.preauth_limit import PreauthLimitedSocket
 from trial.settings import Settings
 from trial.wire.connection import SUBPROTOCOLS
+from trial.wire.player_socket import PlayerSocket
 
 log = logging.getLogger("trial")
 
@@ -61,6 +62,7 @@ class Listener:
             ping_timeout=15,
             close_timeout=CLOSE_SECONDS,
             logger=_silent(),
+            create_connection=PlayerSocket,
         )
         port: int = self._server.sockets[0].getsockname()[1]
         return port

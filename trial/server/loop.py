@@ -86,10 +86,11 @@ class TrialLoop:
         self._saving: asyncio.Task[None] | None = None
         self._done: asyncio.Future[None] = self._loop.create_future()
         self._logged: set[str] = set()
+        self._pictured: list[Connection] = []  # connections that have a new picture
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
-            SendPicture: lambda effect: effect.connection.send_picture(effect.picture, effect.frame_id),
+            SendPicture: self._send_picture,
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: lambda effect: self._write(effect.line),
@@ -222,6 +223,8 @@ class TrialLoop:
                 self._call(effect)
             else:
                 self._carry_out[type(effect)](effect)
+        while self._pictured:  # after the messages of the same event
+            self._pictured.pop().send_now()
         core = self.core
         if core.ready:
             self.ready.set()
@@ -282,6 +285,11 @@ class TrialLoop:
         connection: Any = effect.connection
         connection.rate = effect.frame_rate
         connection.send_state(effect.text)
+
+    def _send_picture(self, effect: SendPicture) -> None:
+        connection: Any = effect.connection
+        connection.put_picture(effect.picture, effect.frame_id)
+        self._pictured.append(connection)
 
     def _write(self, line: bytes) -> None:
         self._recorder.write(line)

@@ -333,6 +333,7 @@ class Server:
         """Take a client's messages until it goes. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
         inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
+        connection.hear_acknowledgements(inbound)
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())

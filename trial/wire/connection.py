@@ -22,6 +22,8 @@ from trial.pictures.encoder import Encoder
 from trial.pictures.picture import Picture
 from trial.pictures.scene import Scene
 from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
+from trial.wire.inbound import Inbound
+from trial.wire.player_socket import PlayerSocket
 
 log = logging.getLogger("trial")
 
@@ -41,7 +43,9 @@ _ASSET_TIMES = 3  # that a connection may ask for an image
 
 
 class Connection:
-    """The sending half of a connection. Only `run` sends; the other methods leave it something to send.
+    """The sending half of a connection. `run` sends what the other methods leave it to send.
+
+    Only a picture for which nothing else has to wait is sent at once, by `send_now`.
 
     Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
     Pictures may lose something on the way (trial/pictures/encoder.py) if the client knows such frames and `lossless`
@@ -57,6 +61,8 @@ class Connection:
         draw: Callable[[Scene], frames.Frame] | None = None,
     ) -> None:
         self.websocket = websocket
+        self._direct = websocket if isinstance(websocket, PlayerSocket) else None
+        self._loop = asyncio.get_running_loop()
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.rate = 30
@@ -75,6 +81,7 @@ class Connection:
         self._sent = 0, False  # id of the last picture, and whether it is large
         self._closing: tuple[int, str] | None = None  # code, last words
         self._wake = asyncio.Event()
+        self._resting = False  # `run` has nothing to do
         _keep_little_unsent(websocket)
 
     def send(self, text: str) -> None:
@@ -90,8 +97,41 @@ class Connection:
 
     def send_picture(self, picture: Picture, picture_id: int) -> None:
         """Send a picture. It replaces one that still waits. `picture` must not change afterwards."""
-        self._picture = (picture_id, picture)
+        self.put_picture(picture, picture_id)
         self._wake.set()
+
+    def put_picture(self, picture: Picture, picture_id: int) -> None:
+        """As `send_picture`, but nothing is sent before `send_now` or another message."""
+        self._picture = (picture_id, picture)
+
+    def send_now(self) -> None:
+        """Send the picture that waits, at once if nothing else has to be sent or written."""
+        if not self._send_at_once():
+            self._wake.set()
+
+    def _send_at_once(self) -> bool:
+        """Send the picture that waits; False if `run` has to send it."""
+        direct, now = self._direct, self._loop.time()
+        if direct is None or self._picture is None or not self._resting or self._wake.is_set() or not direct.free:
+            return False
+        if self.window.wait(now, self.rate) > 0.0:
+            return False
+        frame_id, picture = self._picture
+        pack, large = self._packing(picture, frame_id)
+        if large or not self.binary:
+            return False
+        self._picture = None
+        try:
+            data = pack()
+            assert isinstance(data, bytes)
+            self._sent = (frame_id, False)
+            self._note_sent(frame_id, now, self._rest())
+            direct.send_now(data)
+        except Exception:
+            log.exception("a picture cannot be sent")
+            self.abort()
+            return True
+        return self._encoder.exact  # else `run` makes it so
 
     def send_asset(self, name: str) -> bool:
         """Send an image; False if there is none of this name. A client that asks for it too often gets it no more."""
@@ -110,6 +150,19 @@ class Connection:
         if self._picture is not None or not self._encoder.exact:
             self._wake.set()
 
+    def hear_acknowledgements(self, inbound: Inbound) -> None:
+        """From now on `inbound` reads acknowledgements as they come. Messages that say more are left to `recv`."""
+
+        def hear(data: bytes | bytearray | memoryview) -> bool:
+            now = self._loop.time()
+            frame_id = inbound.acknowledged(data, now)
+            if frame_id is not None:
+                self.acknowledged(frame_id, now)
+            return frame_id is not None
+
+        if self._direct is not None:
+            self._direct.hear = hear
+
     def close(self, code: int, last_words: str) -> None:
         """Close, after the messages that wait and this one, which is never lost. The first call counts."""
         if self._closing is None:
@@ -126,8 +179,7 @@ class Connection:
         timer: asyncio.TimerHandle | None = None
         try:
             while True:
-                await self._wake.wait()
-                self._wake.clear()
+                await self._something_to_do()
                 while self._texts:
                     await self.websocket.send(self._texts.popleft())
                 if self._state is not None:
@@ -154,8 +206,17 @@ class Connection:
             log.exception("a picture cannot be sent")
             self.abort()  # without this the page would wait for a frame that never comes; now it connects again
         finally:
+            self._resting = False
             if timer is not None:
                 timer.cancel()
+
+    async def _something_to_do(self) -> None:
+        self._resting = True
+        await self._wake.wait()
+        self._resting = False
+        self._wake.clear()
+        if self._direct is not None:
+            await self._direct.drain()  # `send_now` does not wait for it
 
     def _wait(self, now: float) -> float:
         """Seconds until the next frame may be sent; infinite if there is none."""
@@ -194,15 +255,21 @@ class Connection:
         if self._picture is not None:
             (frame_id, picture), self._picture = self._picture, None
             pack, large = self._packing(picture, frame_id)
-            self._sent, rest = (frame_id, large), max(REST_SECONDS, 2.5 / self.rate)
+            self._sent, rest = (frame_id, large), self._rest()
         else:
             frame_id, large = self._sent
             pack, rest = partial(self._encoder.sharpen, frame_id), 1.0 / max(self.rate, _ROWS_RATE)
         data: bytes | str = await asyncio.to_thread(pack) if large else pack()
-        now = loop.time()
+        self._note_sent(frame_id, loop.time(), rest)
+        await self.websocket.send(data)  # returns when the write buffer is empty
+
+    def _rest(self) -> float:
+        """Seconds after a picture until rows of it follow, if no other picture does."""
+        return max(REST_SECONDS, 2.5 / self.rate)
+
+    def _note_sent(self, frame_id: int, now: float, rest: float) -> None:
         self.window.sent(frame_id, now)
         self._sharpen_at = now + rest
-        await self.websocket.send(data)  # returns when the write buffer is empty
 
     def _packing(self, picture: Picture, frame_id: int) -> tuple[Callable[[], bytes | str], bool]:
         """What packs a picture for this client, and whether that takes so long that a thread has to do it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 
 from trial.core import messages
@@ -11,6 +12,7 @@ from trial.wire import plain
 
 MESSAGES_A_SECOND = 200
 _NONSENSE_ALLOWED = 2  # messages that are no JSON objects
+_ACK = re.compile(rb'\{"ack": ?(0|[1-9][0-9]{0,9})\}')
 
 
 class RateLimit:
@@ -40,6 +42,17 @@ class Inbound:
         self._words = words
         self._rate = RateLimit(MESSAGES_A_SECOND)
         self._nonsense = 0
+
+    def acknowledged(self, data: bytes | bytearray | memoryview, now: float) -> int | None:
+        """The frame that a message acknowledges, which says nothing else; None if `read` has to read the message.
+
+        Most messages are of this kind, and one follows each frame.
+        """
+        found = _ACK.fullmatch(data)
+        if found is None or self._window is None:
+            return None
+        frame_id = int(found[1])
+        return None if frame_id > self._window.newest or self._rate.exceeded(now) else frame_id
 
     def read(self, data: str | bytes, now: float) -> Message:
         """The message. Raises BadMessage or NotAMessage with words for the client, and CloseConnection."""
