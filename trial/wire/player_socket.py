@@ -36,6 +36,8 @@ class PlayerSocket(ServerConnection):
 
     def process_event(self, event: Event) -> None:
         """Called by websockets for each message."""
-        text = isinstance(event, Frame) and event.opcode is Opcode.TEXT and event.fin
-        if not (text and self.hear is not None and self.hear(event.data)):
+        if not (isinstance(event, Frame) and self._heard(event)):
             super().process_event(event)
+
+    def _heard(self, message: Frame) -> bool:
+        return self.hear is not None and message.opcode is Opcode.TEXT and message.fin and self.hear(message.data)
