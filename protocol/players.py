@@ -105,10 +105,13 @@ def _action(value: object, where: str) -> Any:
     return _one(_ACTION, value, where)
 
 
-def files(given: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """The policies' files that `players` names, each with its path of keys below `players`."""
-    for name, plays in given.items():
+def files(given: object) -> Iterator[tuple[tuple[str, ...], str]]:
+    """The policies' files that `players` names, each with its path of keys below `players`.
+
+    `given` need not have been checked: what is no name of a file is left out.
+    """
+    for name, plays in given.items() if isinstance(given, Mapping) else ():
         if isinstance(plays, Mapping):
             yield from (((name, *path), file) for path, file in files(plays))
-        elif plays.endswith(".onnx"):
+        elif isinstance(plays, str) and plays.endswith(".onnx"):
             yield (name,), plays.removeprefix(SAMPLE)

@@ -448,10 +448,19 @@ class Trial:
 
     def keys_of(self, player: str) -> Mapping[str, str]:
         """The actions of a player's keys by combination (`protocol.keyboard`); empty if the actions' names decide."""
-        if any(isinstance(each, dict) for each in self.keys.values()):
-            found: Mapping[str, str] = self.keys.get(player, {})
-            return found
-        return self.keys
+        return dict(self.key_maps()).get((player,) if self.keys_differ else (), {})
+
+    @property
+    def keys_differ(self) -> bool:
+        """Whether `keys` has a map for each player."""
+        return any(isinstance(each, dict) for each in self.keys.values())
+
+    def key_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
+        """The maps in `keys`, each with its path below `keys`: that of all players, or one for each."""
+        if self.keys_differ:
+            yield from (((player,), each) for player, each in self.keys.items())
+        else:
+            yield (), self.keys
 
     def players_of(self, group: int | None) -> dict[str, str]:
         """What plays each player in this group; empty if the section does not say."""
@@ -628,9 +637,7 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     names = [action.lower() for action in trial.action_space]
     if not names:
         return
-    by_player = any(isinstance(each, dict) for each in trial.keys.values())
-    keys = [((), trial.keys)] if not by_player else [((player,), each) for player, each in trial.keys.items()]
-    named = [(("keys", *place, key), action) for place, each in keys for key, action in each.items()]
+    named = [(("keys", *place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
     named += [(("labels", action), action) for action in trial.labels]
     for path, action in named:
         if action in names:

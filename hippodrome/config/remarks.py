@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hippodrome.config.config import Config
@@ -97,41 +97,29 @@ def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
     )
 
 
-def keys_by_player(config: Config) -> Iterator[tuple[Keys, Mapping[str, str]]]:
-    """The maps of keys, each with its path."""
-    keys = config.trial.keys
-    if any(isinstance(each, dict) for each in keys.values()):
-        yield from (((*KEYS, player), each) for player, each in keys.items())
-    else:
-        yield KEYS, keys
-
-
 def combined_after_single(config: Config) -> Iterator[Remark]:
     """What to say about keys that act together, if one of them acts by itself as soon as it goes down."""
     if config.trial.input != "single":
         return
-    for path, keys in keys_by_player(config):
+    for path, keys in config.trial.key_maps():
         for combined in keys:
             parts = keyboard.parts(combined)
             alone = [part for part in parts if len(parts) > 1 and part in keys]
             if alone:
                 first = keyboard.shown(alone[0])
                 said = f'with input: single, {first} does "{keys[alone[0]]}" before the other key is down'
-                yield Remark((*path, combined), said)
+                yield Remark((*KEYS, *path, combined), said)
 
 
 def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
     """What to say about keys of actions that the environment does not have, whose names it gives itself."""
+    if config.trial.keys_differ:
+        return  # players may have different actions
     names = [name.strip().lower() for name in actions]
-    for path, keys in keys_by_player(config):
-        if path != KEYS:
-            continue  # players may have different actions
-        for combined, action in keys.items():
-            if action not in names:
-                known = printable(", ".join(names), 100)
-                yield Remark(
-                    (*path, combined), f"the key does nothing: no action is called {action}; there are {known}"
-                )
+    for combined, action in config.trial.keys.items():
+        if action not in names:
+            known = printable(", ".join(names), 100)
+            yield Remark((*KEYS, combined), f"the key does nothing: no action is called {action}; there are {known}")
 
 
 def _names_a_certificate(config: Config) -> bool:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,8 +21,8 @@ import yaml
 from bots.verification import document
 from hippodrome.config.folder import read_source
 from protocol import environment, handover
+from protocol import players as who
 from protocol.keys import handover_key
-from protocol.players import SAMPLE
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
@@ -185,22 +185,16 @@ def copy_of(project: Path, folder: Path) -> list[str]:
 
 
 def _copy_policies(project: Path, folder: Path, players: object) -> None:
-    """Copy the policies' files and what lies beside them: a server reads none that a link leads to."""
-    for top in {Path(file).parts[0] for file in _policy_files(players) if (project / file).is_file()}:
+    """Copy the policies' files and what lies beside them: a server reads none that a link leads to.
+
+    What is wrong in `players` is said by local mode.
+    """
+    for top in {Path(file).parts[0] for _, file in who.files(players) if (project / file).is_file()}:
         (folder / top).unlink()
         if (project / top).is_dir():
             shutil.copytree(project / top, folder / top)
         else:
             shutil.copy2(project / top, folder / top)
-
-
-def _policy_files(players: object) -> Iterator[str]:
-    """The files of policies that `trial.players` names, for all groups. What is wrong there is said by local mode."""
-    for plays in players.values() if isinstance(players, dict) else ():
-        if isinstance(plays, dict):
-            yield from _policy_files(plays)
-        elif isinstance(plays, str) and plays.endswith(".onnx"):
-            yield plays.removeprefix(SAMPLE)
 
 
 def logs_of(data: Path) -> Path:

@@ -36,7 +36,7 @@ class JointCalls(Calls):
         self._agent = agent
         humans = tuple(player.name for player in players if player.human)
         self._first = humans[0]
-        self._policies = frozenset(player.name for player in players) - set(humans)
+        self._policies = frozenset(player.name for player in players if not player.human and not player.by_program)
         agent.views = humans
 
     def _reset(self, episode: int, seed: int) -> Begun:

@@ -1,6 +1,6 @@
 """Draws scenes as frames, for clients that cannot draw them: without a subprotocol, or with an earlier one.
 
-It is what `web/game/scene.js` draws, but for smooth edges, fonts and tweens.
+It is what `web/game/painter.js` draws, but for smooth edges, fonts and tweens.
 """
 
 from __future__ import annotations

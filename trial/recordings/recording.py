@@ -1,12 +1,13 @@
 """Recordings: gzip of JSON lines, one line per step, readable to the last flush whatever happens to the process.
 
-Kinds of lines: `header` (first of each file), `reset` (an episode begins), `step`, `callback` (what a callback of the
-agent recorded), `error` (the researcher's code raised) and `end` (an episode or the file ends). Nothing is pickled.
+Kinds of lines: `header` (first of each file), `reset` (an episode begins), `resume` (it goes on after a lost server's
+steps), `step`, `callback` (what a callback of the agent recorded), `error` (the researcher's code raised), `end` (an
+episode or the file ends) and `break` (the break after it ends). Nothing is pickled.
 
 A `step` tells the choice of its action: `human` is the index of the action that the participant's keys asked for (null
 if no key acted); `action` and `actionName` are the one that was taken; `by` is its origin: `agent` (the agent reports
-it as its own, even if it is the human's), `human`, or `none` (no key acted, and the default was taken). Times are UTC:
-2026-11-21T14:46:40.123456Z.
+it as its own, even if it is the human's), or one of `trial.core.actions.By`. Times are UTC:
+2026-11-21T14:46:40.123456Z. docs/data.md says what else the lines hold, also where several players play.
 """
 
 from __future__ import annotations
