@@ -637,16 +637,15 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     names = [action.lower() for action in trial.action_space]
     if not names:
         return
-    named = [(("keys", *place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
-    named += [(("labels", action), action) for action in trial.labels]
-    for path, action in named:
+    named = [("keys", (*place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
+    named += [("labels", (action,), action) for action in trial.labels]
+    for section, path, action in named:
         if action in names:
             continue
         near = difflib.get_close_matches(action, names, n=1)
         hint = f"did you mean {near[0]}?" if near else f"the actions are {values.printable(', '.join(names), 100)}"
-        yield Problem(
-            path, f"there is no action {values.show(action)} in actionSpace; {hint}", ("actionSpace", path[0])
-        )
+        sentence = f"there is no action {values.show(action)} in actionSpace; {hint}"
+        yield Problem((section, *path), sentence, ("actionSpace", section))
 
 
 def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
