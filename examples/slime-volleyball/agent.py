@@ -34,7 +34,7 @@ class Agent:
         objects = [*(STILL if self.env.begins() else ()), *_ball(ball)]
         for player in PLAYERS:
             objects += _slime(player, places[player], ball)
-        if self.env.serve():
+        if self.env.serve() and any(self.env.scores.values()):  # before the first point the page says so
             x, y = _at(0, 14)
             objects.append(
                 {"id": "serve", "type": "text", "text": "Ready?", "x": x, "y": y, "origin": [0.5, 1], "size": 34}

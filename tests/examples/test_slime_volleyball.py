@@ -203,6 +203,15 @@ def test_the_scene_has_no_flaw_and_shows_what_there_is(agent: Any) -> None:
     assert scene.permanent == {"court", "net", "net top"}
 
 
+def test_ready_is_asked_before_each_point_but_the_first_where_the_page_asks(agent: Any) -> None:
+    agent.env.reset(seed=1)
+    scored = False
+    while not scored:
+        assert "serve" not in {each["id"] for each in agent.render()["objects"]}
+        scored = any(agent.env.step({LEFT: 0, RIGHT: 0})[1].values())
+    assert "serve" in {each["id"] for each in agent.render()["objects"]}
+
+
 def test_the_picture_of_the_court_is_as_large_as_the_scene(load_module: Callable[[str, str], ModuleType]) -> None:
     agent, assets = load_module("slime-volleyball", "agent"), load_module("slime-volleyball", "make_assets")
     size = agent.WIDTH, agent.HEIGHT

@@ -1,0 +1,26 @@
+"""What participants read before the game of each example."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+EXAMPLES = sorted(path.parent for path in (Path(__file__).resolve().parents[2] / "examples").glob("*/config.yml"))
+
+
+@pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
+def test_the_buttons_are_named_as_they_are_labelled(folder: Path) -> None:
+    """Who plays on a phone has no keys."""
+    config = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
+    read = (folder / "steps" / f"{config['project']['steps'][2]}.html").read_text(encoding="utf-8")
+    assert "button" in read
+    assert [label for label in config["trial"].get("labels", {}).values() if label not in read] == []
+
+
+@pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
+def test_what_the_number_above_the_game_counts_is_said(folder: Path) -> None:
+    config = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
+    read = (folder / "steps" / f"{config['project']['steps'][2]}.html").read_text(encoding="utf-8")
+    assert "score" in read.lower()
