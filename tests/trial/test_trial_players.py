@@ -125,6 +125,13 @@ def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_clie
     assert any(line["kind"] == "error" and line.get("player") == "right" for line in lines)
 
 
+def test_the_log_of_a_policy_that_fails_does_not_hold_the_participants_id(launch, open_client):
+    server = launch(two_players(act="raise ValueError('not for ' + __import__('os').environ['USER_ID'])"), trial=TRIAL)
+    played(server, open_client)
+    assert "ValueError: not for (participant)" in server.said()
+    assert "P1" not in server.said()
+
+
 def test_a_policy_that_hangs_holds_up_nothing(launch, open_client):
     server = launch(two_players(act="time.sleep(3600)"), trial=TRIAL | {"startingFrameRate": 30})
     began = time.monotonic()

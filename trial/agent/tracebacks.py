@@ -21,7 +21,7 @@ def report(error: BaseException, folder: Path, private: str = "") -> str:
     indented = [part for part in only if part.startswith(" ")]  # the line that is no Python
     words = " ".join("".join(part for part in only if part not in indented).split()).removeprefix("trial.agent.agent.")
     place = where(error, folder)
-    return _without(private, "".join([*frames, *indented]) + (f"{place}: {words}" if place else words))
+    return without(private, "".join([*frames, *indented]) + (f"{place}: {words}" if place else words))
 
 
 def where(error: BaseException, folder: Path) -> str | None:
@@ -55,7 +55,8 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
         each = each.__cause__ or (None if each.__suppress_context__ else each.__context__)
 
 
-def _without(private: str, text: str) -> str:
+def without(private: str, text: str) -> str:
+    """The text without a participant's id."""
     # Short numbers are left: they are in every traceback.
     if not private or (private.isdigit() and len(private) < 6):
         return text

@@ -50,6 +50,7 @@ from trial.server.handshake import (
 from trial.server.lifetime import Lifetime, exit_hard_after
 from trial.server.listener import CLOSE_SECONDS, Listener
 from trial.server.loop import TrialLoop
+from trial.server.private_log import WithoutId
 from trial.server.started import Started
 from trial.settings import Settings
 from trial.wire.connection import Connection
@@ -98,6 +99,7 @@ class Server:
     async def run(self) -> int:
         """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
         settings = self.settings
+        log.addFilter(WithoutId(lambda: self.settings.user_id))
         self._lifetime = Lifetime(settings, saving=lambda: self._trial is not None and self._trial.core.saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
