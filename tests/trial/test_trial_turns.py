@@ -20,6 +20,7 @@ from trial.core.effects import (
     Log,
     OpenRecording,
     RecordLine,
+    Replayed,
     ResetCall,
     ResetPolicy,
     SaveAnswer,
@@ -33,6 +34,7 @@ from trial.core.players import Player, PlayersError, View, who_plays
 from trial.core.policies import AskPolicy
 from trial.core.progress import CommandRefused
 from trial.core.trial import Phase, Trial
+from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings, trial_section
 
 SPACE = ("noop", "up", "right")
@@ -313,6 +315,21 @@ def test_between_two_choices_the_last_action_goes_on_or_is_not_taken_again() -> 
         assert (len(game.asks), game.actions["it"]) == (1, expected)
         game.stepped(seen("me", "it"))
         assert len(game.asks) == 2
+
+
+def test_a_policys_last_action_goes_on_on_the_next_server() -> None:
+    game = Game(frameSkip=4)
+    steps = [
+        RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0), "it": RecordedAction(2, 2.0, observed)})
+        for observed in (0, None)
+    ]
+    recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))
+    spaces = dict.fromkeys(PLAYS, SPACE)
+    game.event("start", who_plays(game.settings.trial, spaces, None), recorded, game.now)
+    game.returns(Replayed(FRAME, seen("me", "it"), {}))
+    game.event("connect", "P1", "tab", Window(), game.now)
+    game.say(command="start")
+    assert (game.asks, game.actions["it"]) == ([], (2, "policy")), "it is asked after four steps"
 
 
 def test_whoever_left_the_game_is_not_asked_and_does_not_act() -> None:

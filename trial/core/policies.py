@@ -9,7 +9,7 @@ in a row for the rest of the episode.
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +91,12 @@ class Policies:
         """An episode begins."""
         for seat in self._seats.values():
             seat.begin()
+
+    def go_on(self, actions: Mapping[str, int]) -> None:
+        """The episode goes on where an earlier server left it: these actions of policies go on until the next ones."""
+        for player, action in actions.items():
+            if player in self._seats:
+                self._seats[player].last = action
 
     def late(self) -> dict[str, int]:
         """How many steps of the episode found a policy late, by player."""

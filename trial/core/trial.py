@@ -491,6 +491,7 @@ class Trial:
         self._reset_policies(replayed.observed)
         self._episode_time.go_on(steps / self.progress.frame_rate)
         self.progress.replayed(steps, unfinished.scores or {self.progress.first: unfinished.score})
+        self.progress.policies.go_on(unfinished.going_on)
         self._see(replayed.view)
         self._show(replayed.pictures)
         self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))

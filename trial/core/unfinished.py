@@ -55,6 +55,19 @@ class UnfinishedEpisode:
                 found[player] = found.get(player, 0.0) + part.reward
         return found
 
+    @property
+    def going_on(self) -> dict[str, int]:
+        """By player, the action of the last step, where a policy chose it in that step or in an earlier one."""
+        chosen: dict[str, int | None] = {}
+        for step in self.steps:
+            chosen |= {player: part.action for player, part in step.players.items() if part.observed is not None}
+        last = self.steps[-1].players if self.steps else {}
+        return {
+            player: part.action
+            for player, part in last.items()
+            if part.action is not None and chosen.get(player) == part.action
+        }
+
 
 @dataclass(slots=True)
 class RecordedTrial:
