@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from protocol.trial import Trial
 from trial.core import messages
 from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
@@ -142,3 +143,43 @@ def turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str,
         return {}
     mine = progress.to_act(player)
     return {"to_act": mine, "turn_ends_in": ends_in if mine else None}
+
+
+def controls_of(progress: Progress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
+    """The message that tells a client all of the game and of its controls. `scene` as `scene_of` has it."""
+    config, action_space = progress.config, progress.players[player].action_space
+    return messages.controls(
+        ui=config.ui.shown(),
+        words=[word for word in messages.words_of(config) if word.lower() not in action_space],
+        frame_rate=progress.frame_rate,
+        min_frame_rate=config.min_frame_rate,
+        max_frame_rate=config.max_frame_rate,
+        frame_rate_step_size=config.frame_rate_step_size,
+        allow_frame_rate_change=config.allow_frame_rate_change,
+        action_space=action_space,
+        state=progress.state.value,
+        episode=progress.episode,
+        max_episodes=config.max_episodes,
+        score=progress.scores[player],
+        episode_score=progress.episode_scores[player],
+        player=player,
+        players=tuple(progress.players),
+        scene=scene,
+        input_of_project=_input(config, player),
+        **of_state(progress, player, times),
+    )
+
+
+def scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """What a client is told of a game that is drawn by objects; None if it is not."""
+    if config.scene is None:
+        return None
+    told = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
+    return {"scene": told, "assets": list(assets)}
+
+
+def _input(config: Trial, player: str) -> dict[str, Any]:
+    """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
+    keys, labels = config.keys_of(player), config.labels
+    said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
+    return {name: value for name, value in said.items() if value}

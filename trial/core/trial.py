@@ -33,9 +33,8 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from typing import Any, Literal
 
-from protocol.trial import Trial as TrialSection
-from trial.core import messages
-from trial.core.clients import Client, Clients, StateTimes, of_state, state_of
+from trial.core import messages, records
+from trial.core.clients import Client, Clients, StateTimes, controls_of, scene_of, state_of
 from trial.core.controls import ARROWS, KEY
 from trial.core.effects import (
     AgentTimeout,
@@ -102,9 +101,9 @@ class Trial:
         """`assets` are the images of a game that is drawn by objects, as clients are told of them."""
         self.settings = settings
         self.config = settings.trial
-        self._shown = self.config.ui.shown()
-        self._offered = (*self._shown, *ARROWS) if self.config.keys else self._shown
-        self._scene = _scene(self.config, assets)
+        shown = self.config.ui.shown()
+        self._offered = (*shown, *ARROWS) if self.config.keys else shown
+        self._scene = scene_of(self.config, assets)
         self.step = step
         self.id = trial_id
         self.phase = Phase.STARTING
@@ -279,7 +278,7 @@ class Trial:
             self._begun_again = self.progress.episode
             self._reset()
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
-            self._record_error(error, _number(self.progress.ended[0]))
+            self._record_error(error, records.number(self.progress.ended[0]))
             if hangs:
                 self._fail(fatal=True)
             self._record_end(call)
@@ -623,12 +622,7 @@ class Trial:
         if isinstance(over, Episode):
             for player, late in self.progress.policies.late().items():
                 self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
-        fields: dict[str, Any] = {"episode": _number(over)}
-        if not isinstance(over, Break):
-            fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
-            fields |= {} if over.limit is None else {"limit": over.limit}
-        fields |= {"why": over.why, "messages": self._messages.messages[: call.messages]}
-        self._emit(RecordLine("break" if isinstance(over, Break) else "end", fields))
+        self._emit(records.end(over, self._messages.messages[: call.messages]))
         self._messages.recorded(call.messages, len(call.feedback))
         # The break after an episode belongs to its file.
         more = isinstance(self.progress.ended[0], Break) if self.progress.ended else self.progress.on_break
@@ -644,37 +638,16 @@ class Trial:
             return self._write_end()
         self._last_lines_written = True
         if self._closing and not progress.over and not progress.on_break:
-            self._emit(
-                RecordLine(
-                    "end",
-                    {
-                        "episode": progress.episode,
-                        "steps": progress.steps,
-                        "why": "shutdown",
-                        **_scores(progress.episode_score, progress.episode_scores if progress.several else {}),
-                        "messages": self._messages.messages,
-                    },
-                )
-            )
+            self._emit(records.shutdown(progress, self._messages.messages))
         self._close_recording()
-        self._emit(SaveAnswer(self._answers() if progress.over and not self.broken else None))
+        played = progress.over and not self.broken
+        self._emit(SaveAnswer(records.answers(progress, self._timing.seconds, self.id) if played else None))
         return False
 
     def _close_recording(self) -> None:
         if self._recording:
             self._recording = False
             self._emit(CloseRecording())
-
-    def _answers(self) -> dict[str, Any]:
-        progress = self.progress
-        return {
-            "episodes": progress.episodes_played,
-            **_scores(progress.score, progress.scores if progress.several else {}),
-            "frames": progress.total_steps,
-            "seconds": round(self._timing.seconds, 3),
-            "trial": self.id,
-            "outcome": progress.outcome,
-        }
 
     # ---- what fails
 
@@ -767,28 +740,7 @@ class Trial:
         )
 
     def _controls(self, client: Client) -> str:
-        config, progress, player = self.config, self.progress, client.player
-        action_space = progress.players[player].action_space
-        return messages.controls(
-            ui=self._shown,
-            words=[word for word in messages.words_of(config) if word.lower() not in action_space],
-            frame_rate=progress.frame_rate,
-            min_frame_rate=config.min_frame_rate,
-            max_frame_rate=config.max_frame_rate,
-            frame_rate_step_size=config.frame_rate_step_size,
-            allow_frame_rate_change=config.allow_frame_rate_change,
-            action_space=action_space,
-            state=progress.state.value,
-            episode=progress.episode,
-            max_episodes=config.max_episodes,
-            score=progress.scores[player],
-            episode_score=progress.episode_scores[player],
-            player=player,
-            players=tuple(progress.players),
-            scene=self._scene,
-            input_of_project=_input(config, player),
-            **of_state(progress, player, self._times()),
-        )
+        return controls_of(self.progress, client.player, self._times(), self._scene)
 
     def _send_done(self) -> None:
         episodes, score = self.progress.episodes_played, self.progress.score
@@ -804,29 +756,3 @@ class Trial:
     def _take_effects(self) -> list[Effect]:
         effects, self._effects = self._effects, []
         return effects
-
-
-def _scores(score: float, scores: Mapping[str, float]) -> dict[str, Any]:
-    """A score for the records, and those of all players if there are several."""
-    several = {player: messages.tidy(value) for player, value in scores.items()}
-    return {"score": messages.tidy(score), **({"scores": several} if several else {})}
-
-
-def _scene(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    """What a client is told of a game that is drawn by objects; None if it is not."""
-    if config.scene is None:
-        return None
-    told = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
-    return {"scene": told, "assets": list(assets)}
-
-
-def _input(config: TrialSection, player: str) -> dict[str, Any]:
-    """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
-    keys, labels = config.keys_of(player), config.labels
-    said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
-    return {name: value for name, value in said.items() if value}
-
-
-def _number(over: Episode | Break) -> int:
-    """The number of the episode that is over, or of the one before the break."""
-    return over.after if isinstance(over, Break) else over.number

@@ -1,0 +1,50 @@
+"""What the core writes of how far a trial is: the ends of episodes and breaks, and the answer. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from trial.core import messages
+from trial.core.effects import RecordLine
+from trial.core.progress import Break, Episode, Progress
+
+
+def end(over: Episode | Break, said: Sequence[Mapping[str, Any]]) -> RecordLine:
+    """The line that ends an episode or a break. `said` are the participant's messages since the line before."""
+    fields: dict[str, Any] = {"episode": number(over)}
+    if not isinstance(over, Break):
+        fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
+        fields |= {} if over.limit is None else {"limit": over.limit}
+    fields |= {"why": over.why, "messages": said}
+    return RecordLine("break" if isinstance(over, Break) else "end", fields)
+
+
+def shutdown(progress: Progress, said: Sequence[Mapping[str, Any]]) -> RecordLine:
+    """The line that ends the present episode because the server must end. `said` as in `end`."""
+    fields: dict[str, Any] = {"episode": progress.episode, "steps": progress.steps, "why": "shutdown"}
+    fields |= _scores(progress.episode_score, progress.episode_scores if progress.several else {})
+    return RecordLine("end", {**fields, "messages": said})
+
+
+def answers(progress: Progress, seconds: float, trial_id: str) -> dict[str, Any]:
+    """The answer of the step. `seconds` is how long was played."""
+    return {
+        "episodes": progress.episodes_played,
+        **_scores(progress.score, progress.scores if progress.several else {}),
+        "frames": progress.total_steps,
+        "seconds": round(seconds, 3),
+        "trial": trial_id,
+        "outcome": progress.outcome,
+    }
+
+
+def number(over: Episode | Break) -> int:
+    """The number of the episode that is over, or of the one before the break."""
+    return over.after if isinstance(over, Break) else over.number
+
+
+def _scores(score: float, scores: Mapping[str, float]) -> dict[str, Any]:
+    """A score for the records, and those of all players if there are several."""
+    several = {player: messages.tidy(value) for player, value in scores.items()}
+    return {"score": messages.tidy(score), **({"scores": several} if several else {})}
