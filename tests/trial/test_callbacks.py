@@ -318,6 +318,32 @@ def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, ope
     assert said.count("on_episode_end has not returned within callbackSeconds") == 1
 
 
+def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_again_and_again(launch, grid, open_client):
+    slow = "\nimport time\nclass Agent(Agent):\n    def on_join(self, session, player):\n        time.sleep(0.4)\n"
+    agent = grid(20) + slow + "        return True\n    on_leave = on_return = on_join\n"
+    server = launch(agent, {**TRIAL, "maxEpisodes": 1})
+
+    async def journey():
+        for _ in range(40):
+            async with open_client(server.address) as client:
+                await client.hello()
+                await client.until(lambda: client.controls)
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            began = time.monotonic()
+            await client.until(lambda: client.done)
+            return time.monotonic() - began
+
+    assert asyncio.run(journey()) < 10, "81 calls would take half a minute"
+    assert server.wait() == 0
+    (found,) = server.recordings().values()
+    moves = [line["name"] for line in found if line["kind"] == "callback"]
+    assert moves[:3] == ["on_join", "on_leave", "on_return"]
+    assert moves[1:] == ["on_leave", "on_return"] * (len(moves) // 2), "each who is back has left"
+
+
 RESUMED = """
 class Agent(Agent):
     def on_session_start(self, session):

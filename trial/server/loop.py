@@ -7,6 +7,7 @@ import contextlib
 import logging
 import secrets
 import uuid
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
@@ -52,6 +53,8 @@ from trial.wire.connection import Connection
 
 log = logging.getLogger("trial")
 
+_MOVES = 4  # participants who came and went, of whom callbacks have not been told; more are put together
+
 
 class TrialLoop:
     """Runs one trial on the event loop, from which all methods are to be called."""
@@ -79,6 +82,7 @@ class TrialLoop:
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls: Calls
         self._callbacks: Callbacks | None = None
+        self._moves: deque[TellMoved] = deque()  # the first is being told
         self._seats = Seats(self._acted)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -272,14 +276,36 @@ class TrialLoop:
                 self._write(line)
 
     def _tell_moved(self, effect: TellMoved) -> None:
-        """On the agent's thread, between two calls, so that the callback sees the environment at rest."""
-        callbacks = self._callbacks
-        if callbacks:
-            self._worker.submit(
-                lambda: callbacks.player_moved(effect.callback, effect.player),
-                self._settings.step_seconds,
-                lambda *_: self._write_callbacks(),
-            )
+        """On the agent's thread, between two calls, so that the callback sees the environment at rest.
+
+        One move after the other, with calls in between. If many wait, a participant who left and returned did not move.
+        """
+        moves = self._moves
+        if not self._callbacks:
+            return
+        if effect.callback == "on_return" and len(moves) >= _MOVES:
+            before = next((move for move in reversed(moves) if move.player == effect.player), None)
+            if before is not None and before is not moves[0] and before.callback == "on_leave":
+                moves.remove(before)
+                return
+        moves.append(effect)
+        if len(moves) == 1:
+            self._tell_next_move()
+
+    def _tell_next_move(self) -> None:
+        callbacks, move = self._callbacks, self._moves[0]
+        assert callbacks is not None
+        self._worker.submit(
+            lambda: callbacks.player_moved(move.callback, move.player),
+            self._settings.step_seconds,
+            lambda *_: self._told_move(),
+        )
+
+    def _told_move(self) -> None:
+        self._write_callbacks()
+        self._moves.popleft()
+        if self._moves and not self.core.done:
+            self._tell_next_move()
 
     def _send_state(self, effect: SendState) -> None:
         connection: Any = effect.connection
