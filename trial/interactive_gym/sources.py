@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import site
 import sys
+import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -21,6 +23,7 @@ MADE = ".made-by-interactive-gym.json"
 _HIPPODROME = Path(__file__).resolve().parents[2]
 _SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's assets lie below its server's folder
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
+_INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _TAKEN = {"agent", "trial", "protocol"}
 
 
@@ -94,7 +97,7 @@ def locate(source: Source) -> Any:
 def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]:
     """The files that go into the project, by their paths there, and sentences about those that do not.
 
-    They are the modules that the experiment has imported from its own folders, and all that lies beside its file.
+    They are the modules that the experiment has imported from folders of the researcher's, and all that lies beside its file.
     """
     found: dict[str, Path] = {}
     said = []
@@ -102,6 +105,8 @@ def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]
         file = _file(module)
         if file is not None and file.is_relative_to(source.root) and _ours(file, source.root, target):
             found[file.relative_to(source.root).as_posix()] = file
+        if file is not None and (name := _from_elsewhere(module, file, source.root, target)):
+            found[name] = file
     for file in _beside(source.file.parent, target):
         found.setdefault(file.relative_to(source.root).as_posix(), file)
     total = 0
@@ -162,6 +167,24 @@ def _ours(file: Path, root: Path, target: Path) -> bool:
     parts = file.relative_to(root).parts
     hidden = any(part.startswith(".") or part == "site-packages" for part in parts)
     return not hidden and not file.is_relative_to(target) and not _of_hippodrome(file)
+
+
+def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) -> str | None:
+    """Where in the project a module belongs that comes from another folder of PYTHONPATH; None if it is no such one."""
+    parts = module.__name__.split(".")
+    if file.name == "__init__.py":
+        parts.append("__init__")
+    if file.with_suffix("").parts[-len(parts) :] != tuple(parts):
+        return None  # `__main__`, or loaded from a file by its path
+    came_from = file.parents[len(parts) - 1]
+    installed = (*_INSTALLED, *site.getsitepackages(), site.getusersitepackages())
+    if came_from in (root, _HIPPODROME) or any(
+        came_from.is_relative_to(Path(folder).resolve()) for folder in installed
+    ):
+        return None
+    if parts[0] in _TAKEN or parts[0] in metadata.packages_distributions() or not _ours(file, came_from, target):
+        return None
+    return file.relative_to(came_from).as_posix()
 
 
 def _of_hippodrome(file: Path) -> bool:

@@ -133,6 +133,20 @@ def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
     assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
+def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> None:
+    package = tmp_path / "examples" / "car"
+    write(package, ALONE.replace("import helper", "from examples.car import helper"))
+    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, str(package / "experiment.py")], env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    project = package / "experiment-study"
+    assert (project / "examples/car/helper.py").is_file()
+    assert not list(project.rglob("site-packages")), "packages are in requirements.txt"
+    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+
+
 def test_it_is_made_anew_and_what_was_changed_by_hand_stays(tmp_path: Path) -> None:
     project, _ = made(tmp_path)
     (project / "steps/welcome.html").write_text("<h1>Mine</h1>")
