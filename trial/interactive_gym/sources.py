@@ -97,7 +97,8 @@ def locate(source: Source) -> Any:
 def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]:
     """The files that go into the project, by their paths there, and sentences about those that do not.
 
-    They are the modules that the experiment has imported from folders of the researcher's, and all that lies beside its file.
+    They are the modules that the experiment has imported from folders of the researcher's, and all that lies beside its
+    file.
     """
     found: dict[str, Path] = {}
     said = []
