@@ -244,7 +244,7 @@ def _plain(name: str, text: str) -> str:
         lines = (line.strip() for line in text.splitlines())
         text = "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
     if name.endswith(".css"):
-        text = re.sub(r"(?<=[{;,])\n|;?\n(?=})|;(?=})", "", text)  # a rule is a line
+        text = re.sub(r"(?<=[{;,}])\n|;?\n(?=})|;(?=})", "", text)
     if name.endswith(".js"):
         text = _CODE_OR_TEXT.sub(lambda part: part[0] if part["text"] else _dense(part[0]), text)
     return text

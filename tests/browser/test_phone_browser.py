@@ -127,3 +127,46 @@ def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: Wor
     tell(world, state="paused")
     phone.wait_for_selector("#overlay-title:text('Paused')")
     assert box(phone, "#overlay")["height"] == box(phone, "#screen")["height"]
+
+
+# Bad Wi-Fi
+
+HANGS = "The connection hangs. Please stay on this page."
+
+
+def silent(world: World, heard: list[dict[str, Any]]) -> None:
+    """From its start on, the game's server neither says nor answers anything."""
+
+    def speak(connection: Any) -> None:
+        world.connections.append(connection)
+        for text in connection:
+            heard.append(json.loads(text))
+            if "token" in heard[-1] and len(world.connections) == 1:
+                said = {"UI": ["start"], "actionSpace": ["noop"], "state": "playing", "episode": 1, "maxEpisodes": 1}
+                connection.send(json.dumps({**said, "score": 0, "frameRate": 30}))
+
+    world.play = speak  # type: ignore[method-assign]
+    world.step = 2
+    world.ready()
+
+
+def test_a_picture_that_stands_still_as_the_connection_is_dead_is_explained_within_six_seconds(
+    world: World, phone: Any
+) -> None:
+    heard: list[dict[str, Any]] = []
+    silent(world, heard)
+    phone.goto(world.url)
+    phone.wait_for_selector("#mode[data-state=playing]", state="attached")
+    phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=6_000)
+    shot(phone, "360-hangs")
+    phone.wait_for_selector("#overlay-title:text('Connection lost')", timeout=7_000)
+    phone.wait_for_selector("#trouble:empty", state="attached")
+
+
+def test_an_answer_takes_the_explanation_away(world: World, phone: Any) -> None:
+    heard: list[dict[str, Any]] = []
+    silent(world, heard)
+    phone.goto(world.url)
+    phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=10_000)
+    tell(world, state="playing")
+    phone.wait_for_selector("#trouble:empty", state="attached")

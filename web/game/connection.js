@@ -5,7 +5,8 @@ import { hooks } from "./hooks.js";
 import { data } from "./page.js";
 
 export const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the last has no lossy frames
-const SILENCE = 5_000; // ms without a message; then the page asks whether the server is there, and after as long again it gives up
+const SILENCE = 2_500; // ms without a message; then the page asks whether the server is there
+const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
 const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
 const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
@@ -95,7 +96,7 @@ export function watch(talks) {
   const now = performance.now();
   const silent = now - link.heard;
   const unreachable = link.socket.readyState === WebSocket.CONNECTING && silent > CONNECTING;
-  if ((link.asked && now - link.asked > SILENCE) || unreachable) link.end("lost");
+  if ((link.asked && now - link.asked > PATIENCE) || unreachable) link.end("lost");
   else if (talks && silent > SILENCE) ask();
   return silent;
 }

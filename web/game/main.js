@@ -16,6 +16,8 @@ import { showStatus } from "./status.js";
 import { clearDrafts } from "./storage.js";
 import { isOver, noteRestart, pollDelay, restartedFor, showClock, showWaiting } from "./waiting.js";
 
+const HANGS = "The connection hangs. Please stay on this page.";
+const SILENT = 4_500; // ms without a message in a game; the server was asked meanwhile
 const LONG = 20_000; // ms of trouble until more is said
 const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may have been lost, and a reload repeats it
 
@@ -96,6 +98,8 @@ clearDrafts();
 setInterval(() => find("wait").hidden || showClock(), 1_000);
 setInterval(() => {
   const silent = watch(isRunning());
+  if (silent > SILENT && isRunning()) setText(find("trouble"), HANGS);
+  else if (find("trouble").textContent === HANGS) hideMessage();
   if (game.state === "loading" && silent > LONG) setText(find("overlay-hint"), "This takes longer than usual. Please stay on this page.");
 }, 1_000);
 setInterval(countDown, 200);
