@@ -63,6 +63,17 @@ def test_the_head_of_a_recording_says_who_plays(launch, open_client):
     assert reset["toAct"] == ["left", "right"]
 
 
+def test_the_head_of_a_recording_says_by_which_rules_they_act(launch, open_client):
+    rules = {"frameSkip": 3, "input": "single", "idleAction": {"right": "down"}, "seed": 4}
+    server = launch(two_players(), trial=TRIAL | rules)
+    played(server, open_client, frames=2)
+    head, reset = next(iter(server.recordings().values()))[:2]
+    assert (head["frameSkip"], head["input"], head["pace"]) == (3, "single", "realtime")
+    assert head["idleActions"] == {"left": 0, "right": 2}
+    seed = int.from_bytes(hashlib.sha256(b"4\0right").digest()[:8], "big") % 2**31
+    assert reset["players"] == {"left": {}, "right": {"seed": seed}}
+
+
 def test_a_recording_with_several_players_ends_with_all_scores(launch, open_client):
     server = launch(two_players(length=4), trial=TRIAL | {"seed": 14, "maxEpisodes": 2, "startingFrameRate": 60})
 

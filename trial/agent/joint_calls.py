@@ -14,6 +14,7 @@ from trial.core.actions import Action
 from trial.core.effects import Begun, ReplayCall, Replayed, StepCall, StepTaken
 from trial.core.players import Player, View
 from trial.core.policies import Observed
+from trial.core.seeds import policy_seed
 from trial.core.unfinished import UnfinishedEpisode
 from trial.recordings import recording
 
@@ -37,10 +38,12 @@ class JointCalls(Calls):
         humans = tuple(player.name for player in players if player.human)
         self._first = humans[0]
         self._policies = frozenset(player.name for player in players if not player.human and not player.by_program)
+        self._ended: frozenset[str] = frozenset()  # the episode is over for them
         agent.views = humans
 
     def _reset(self, episode: int, seed: int) -> Begun:
         joint, seeded = self._agent.reset(seed)
+        self._ended = frozenset()
         pictures = self._agent.pictures()
         if self.callbacks:
             self.callbacks.episode_began(episode, joint.observations, joint.infos)
@@ -49,21 +52,26 @@ class JointCalls(Calls):
             "seed": seed if seeded else None,
             "info": recording.plain(joint.infos.get(self._first, {})),
             **self._seen(joint),
-            "players": {player: self._told(player, joint) for player in self._agent.players},
+            "players": {player: self._begun(player, seed, joint) for player in self._agent.players},
             "toAct": sorted(joint.to_act),
         }
         return Begun(recording.line("reset", **self._stamp(), **fields), pictures, self._view(joint))
 
     def _view(self, joint: Joint) -> View:
-        """What the core is told. Policies look at observations while the environment goes on, so they get copies."""
+        """What the core is told. Policies look at it while the environment goes on, so they get copies."""
         seen = {player: snapshot(joint.observations.get(player)) for player in self._policies & joint.to_act}
-        infos = {player: joint.infos.get(player, {}) for player in seen}
+        infos = {player: snapshot(joint.infos.get(player, {})) for player in seen}
         return View(joint.to_act, seen, infos, joint.masks)
 
     def _seen(self, joint: Joint) -> dict[str, Any]:
         if not self._record_observations:
             return {}
         return {"observation": recording.observation(joint.observations.get(self._first))}
+
+    def _begun(self, player: str, seed: int, joint: Joint) -> dict[str, Any]:
+        """One player's part of a reset's line. Policies have a seed, also if the environment takes none."""
+        seeded = {"seed": policy_seed(seed, player)} if player in self._policies else {}
+        return {**seeded, **self._told(player, joint)}
 
     def _told(self, player: str, joint: Joint) -> dict[str, Any]:
         """What a line says of what another player than the first human was told."""
@@ -106,6 +114,7 @@ class JointCalls(Calls):
             **self._seen(joint),
             **(self._extra(joint.extra) if joint.extra else {}),
         )
+        self._ended = _ended(joint)
         return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint))
 
     def _part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
@@ -116,6 +125,7 @@ class JointCalls(Calls):
             "by": action.by if action.acts else None,
             **({} if action.observed is None else {"observed": action.observed}),
             "reward": joint.rewards[player],
+            **({} if player in self._ended else _end(player, joint)),
             **self._told(player, joint),
         }
 
@@ -130,6 +140,7 @@ class JointCalls(Calls):
             raise Diverged("the environment takes no seed")
         if self.callbacks:
             self.callbacks.episode_began(unfinished.number, joint.observations, joint.infos)
+        self._ended = frozenset()
         acted_upon = _Remembered(unfinished)
         acted_upon.see(0, joint)
         for number, step in enumerate(unfinished.steps, 1):
@@ -144,7 +155,19 @@ class JointCalls(Calls):
                 raise Diverged("it plays differently now")
             self._tell_step(taken, joint)
             acted_upon.see(number, joint)
+            self._ended = _ended(joint)
         return Replayed(self._agent.pictures(), self._view(joint), acted_upon.by_player)
+
+
+def _ended(joint: Joint) -> frozenset[str]:
+    """For whom the episode is over."""
+    return frozenset(player for player in joint.terminated if joint.terminated[player] or joint.truncated[player])
+
+
+def _end(player: str, joint: Joint) -> dict[str, bool]:
+    """Whether the player was terminated or truncated by this step; nothing if not."""
+    ends = {"terminated": joint.terminated[player], "truncated": joint.truncated[player]}
+    return {name: True for name, ended in ends.items() if ended}
 
 
 class _Remembered:
@@ -162,7 +185,8 @@ class _Remembered:
         """So many steps were taken, and this is what the players see."""
         for player in self._wanted.get(steps, ()):
             seen = snapshot(joint.observations.get(player))
-            self.by_player[player].append(Observed(seen, joint.infos.get(player, {}), joint.masks.get(player)))
+            told = snapshot(joint.infos.get(player, {}))
+            self.by_player[player].append(Observed(seen, told, joint.masks.get(player)))
 
 
 def snapshot(observation: Any) -> Any:

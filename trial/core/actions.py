@@ -18,7 +18,7 @@ class Action:
     name: str
     by: By = "none"
     observed: int | None = None
-    """If a policy chose it: the steps of the episode that were taken when it observed."""
+    """If a policy was asked for it: the steps of the episode that were taken when it observed."""
     acts: bool = True
     """False if it is not the player's turn, or the player has left: the environment may want an action all the same."""
 

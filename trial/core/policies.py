@@ -162,6 +162,7 @@ class Policies:
         player, failed = seat.player, seat.failed
         seat.failed = False
         by: By
+        looked = seat.asked_after if failed else None
         if seat.answer is not None:
             return self._answered(seat, mask)
         if failed or seat.idles or (player.by_program and seat.last is None):
@@ -172,7 +173,7 @@ class Policies:
         else:
             index, by = self._last(seat), "policy" if self._goes_on and seat.last is not None else "none"
         index = legal_or_idle(index, player, mask)
-        return Action(index, player.action_space[index], by)
+        return Action(index, player.action_space[index], by, looked)
 
     def _last(self, seat: _Seat) -> int:
         return seat.last if self._goes_on and seat.last is not None else seat.player.idle
@@ -193,15 +194,16 @@ class Policies:
         if seat.answer is not None:
             return self._answered(seat, mask)
         if seat.failed or seat.idles:
-            seat.failed = False
-            return _idle(player, mask, "none")
+            looked, seat.failed = seat.asked_after if seat.failed else None, False
+            return _idle(player, mask, "none", looked)
         if now < self._until(seat):
             return None
         seat.late += 1
-        if seat.asked is not None:
-            seat.asked = None
-            seat.failures += 1
-        return _idle(player, mask, "late")
+        if seat.asked is None:
+            return _idle(player, mask, "late")
+        seat.asked = None
+        seat.failures += 1
+        return _idle(player, mask, "late", seat.asked_after)  # it looks all the same, and remembers that
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
         """A turn begins: programs have their time from now on, and nothing counts that was chosen before."""
@@ -217,6 +219,6 @@ class Policies:
         return seat.asked_at + (self._seconds or 0.0)
 
 
-def _idle(player: Player, mask: Mask | None, by: By) -> Action:
+def _idle(player: Player, mask: Mask | None, by: By, observed: int | None = None) -> Action:
     index = legal_or_idle(player.idle, player, mask)
-    return Action(index, player.action_space[index], by)
+    return Action(index, player.action_space[index], by, observed)

@@ -10,11 +10,12 @@ from trial.core.progress import Episode
 
 @dataclass(frozen=True, slots=True)
 class RecordedAction:
-    """One player's part of a step. `action` is None if it was not their turn; `observed` as in `Action`."""
+    """One player's part of a step. `action` is None if it was not their turn; `observed` and `by` as in `Action`."""
 
     action: int | None
     reward: float
     observed: int | None = None
+    by: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,8 @@ class UnfinishedEpisode:
         """By player, the action of the last step, where a policy chose it in that step or in an earlier one."""
         chosen: dict[str, int | None] = {}
         for step in self.steps:
-            chosen |= {player: part.action for player, part in step.players.items() if part.observed is not None}
+            looked = {player: part for player, part in step.players.items() if part.observed is not None}
+            chosen |= {player: None if part.by == "none" else part.action for player, part in looked.items()}
         last = self.steps[-1].players if self.steps else {}
         return {
             player: part.action

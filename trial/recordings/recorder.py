@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from protocol.answer import GAME, Answer, answers_in, to_json
 from protocol.keys import answer_key, recordings_folder
+from protocol.trial import Trial
 from trial.core.effects import OpenRecording
+from trial.core.players import Player
 from trial.core.unfinished import RecordedTrial
 from trial.recordings import recording
 from trial.recordings.recording import Recording
@@ -91,7 +93,7 @@ class Recorder:
             step=self._step,
             game=config.game,
             actionSpace=list(opening.action_space),
-            **({"players": _with_actions(players, opening)} if players else {}),
+            **({"players": _with_actions(players, opening), **rules(config, opening.players)} if players else {}),
             frameRate=opening.frame_rate,
             actionBufferLifespan=config.action_buffer_lifespan,
             episode=opening.episode,
@@ -161,6 +163,19 @@ class Recorder:
     @property
     def _answer_key(self) -> str:
         return answer_key(self._settings.project_id, self._settings.user_id, self._step)
+
+
+def rules(config: Trial, players: Sequence[Player]) -> dict[str, Any]:
+    """By which rules several players act: what is needed to take the steps of a recording again.
+
+    `idleActions` are the numbers that the environment was given for players whose `action` is null.
+    """
+    return {
+        "pace": config.pace,
+        "input": config.input,
+        "frameSkip": config.frame_skip,
+        "idleActions": {player.name: player.idle for player in players},
+    }
 
 
 def _with_actions(players: Mapping[str, Any], opening: OpenRecording) -> dict[str, Any]:

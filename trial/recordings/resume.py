@@ -95,7 +95,7 @@ def _step(line: Mapping[str, Any], words: tuple[str, ...]) -> RecordedStep:
     advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
     parts = line.get("players") or {}
     players = {
-        str(name): RecordedAction(part["action"], float(part["reward"] or 0.0), part.get("observed"))
+        str(name): RecordedAction(part["action"], float(part["reward"] or 0.0), part.get("observed"), part.get("by"))
         for name, part in parts.items()
     }
     return RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, advice, players)
