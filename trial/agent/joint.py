@@ -195,7 +195,7 @@ class JointAdapter:
             if player in self._players.keys:
                 found[player] = value
             elif player not in (ALL, "__common__"):
-                raise AgentError(f"{method}() returned something of {player!r}; the players are {self._shown()}")
+                raise AgentError(f"{method}() returned something of {player[:64]!r}; the players are {self._shown()}")
         return found
 
     def _shown(self) -> str:

@@ -284,9 +284,9 @@ class TrialLoop:
         if not self._callbacks:
             return
         if effect.callback == "on_return" and len(moves) >= _MOVES:
-            before = next((move for move in reversed(moves) if move.player == effect.player), None)
-            if before is not None and before is not moves[0] and before.callback == "on_leave":
-                moves.remove(before)
+            before = max((index for index, move in enumerate(moves) if move.player == effect.player), default=0)
+            if before > 0 and moves[before].callback == "on_leave":
+                del moves[before]
                 return
         moves.append(effect)
         if len(moves) == 1:
