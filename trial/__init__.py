@@ -7,6 +7,8 @@ imported when they are asked for, so that importing this package stays cheap.
 from __future__ import annotations
 
 import importlib
+import importlib.machinery
+import sys
 from typing import Any
 
 _INTERACTIVE_GYM = {
@@ -35,3 +37,28 @@ def __getattr__(name: str) -> Any:
     module, _, attribute = _INTERACTIVE_GYM[name].partition(".")
     found = importlib.import_module(f"trial.interactive_gym.{module}")
     return getattr(found, attribute) if attribute else found
+
+
+class _Words:
+    """`from trial.remote_game import RemoteGame`: the modules of Interactive Gym under their own names.
+
+    They are found after all else, so that no module of this package is hidden.
+    """
+
+    @staticmethod
+    def find_spec(name: str, _path: Any = None, _target: Any = None) -> Any:
+        word = name.removeprefix("trial.")
+        if word in (name, "RemoteConfig") or word not in _INTERACTIVE_GYM:
+            return None
+        return importlib.machinery.ModuleSpec(name, _Words)  # type: ignore[arg-type]
+
+    @staticmethod
+    def create_module(_spec: Any) -> None:
+        """The usual empty one, which `exec_module` replaces."""
+
+    @staticmethod
+    def exec_module(module: Any) -> None:
+        sys.modules[module.__name__] = __getattr__(module.__name__.removeprefix("trial."))
+
+
+sys.meta_path.append(_Words)

@@ -109,6 +109,23 @@ def test_the_documentation_says_what_each_option_becomes() -> None:
     assert options.table() in (ROOT / "docs/interactive-gym.md").read_text()
 
 
+def test_what_stands_in_its_modules_is_imported_from_there() -> None:
+    lines = (
+        "from trial.remote_game import RemoteGame",
+        "from trial.object_contexts import Circle, Line, Polygon",
+        "from trial.stager import Stager",
+        "import trial.callback",
+        "from trial import callback, remote_game",
+        "assert trial.callback is callback and remote_game.RemoteGame is RemoteGame",
+        "assert callback.__name__ == 'trial.interactive_gym.callback'",
+    )
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=ROOT, check=True)
+    unknown = subprocess.run(
+        [sys.executable, "-c", "import trial.waiting_room"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "No module named 'trial.waiting_room'" in unknown.stderr
+
+
 def test_methods_can_be_called_one_after_the_other_and_none_changes_nothing() -> None:
     config = RemoteConfig().rendering(fps=24, game_width=None).gameplay(num_episodes=3).hosting("127.0.0.1", 5703)
     assert (config.fps, config.game_width, config.num_episodes, config.host, config.port) == (
