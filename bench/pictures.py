@@ -17,14 +17,19 @@ GAME = "ALE/MsPacman-v5"
 FRAMES = 300
 
 
-def ms_pacman() -> list[Frame]:
-    """Ms. Pac-Man as the example agent shows it, with random keys: 160 x 210, flat, little moves."""
+def example_agent() -> Any:
+    """The agent of the example study."""
     spec = importlib.util.spec_from_file_location("example_agent", ROOT / "agent.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    agent = module.Agent()
+    return module.Agent()
+
+
+def ms_pacman() -> list[Frame]:
+    """Ms. Pac-Man as the example agent shows it, with random keys: 160 x 210, flat, little moves."""
+    agent = example_agent()
     agent.start(GAME)
     keys = random.Random(7)
     frames, action, over = [], 0, True

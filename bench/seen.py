@@ -104,9 +104,9 @@ class Seen:
 
 
 @contextlib.contextmanager
-def server(agent_dir: Path, **trial: Any) -> Iterator[tuple[str, int]]:
-    """A running trial server: its address and process id."""
-    with tempfile.TemporaryDirectory() as store:
+def server(agent_dir: Path, *, store: Path | None = None, **trial: Any) -> Iterator[tuple[str, int]]:
+    """A running trial server: its address and process id. `store` is the folder of what it records."""
+    with tempfile.TemporaryDirectory() as folder:
         env = {
             **os.environ,
             "PROJECT_ID": "bench",
@@ -114,7 +114,7 @@ def server(agent_dir: Path, **trial: Any) -> Iterator[tuple[str, int]]:
             "SERVER": "bench",
             "TOKEN": "bench",
             "GAME_STEPS": "1",
-            "STORE": store,
+            "STORE": str(store or folder),
             "TRIAL": json.dumps({"game": GAME, "maxEpisodes": 1000, **trial}),
             "HOST": "127.0.0.1",
             "PORT": "0",
@@ -123,7 +123,7 @@ def server(agent_dir: Path, **trial: Any) -> Iterator[tuple[str, int]]:
             "PYTHONPATH": str(ROOT),
         }
         process = subprocess.Popen(
-            [sys.executable, "-m", "trial"], cwd=store, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            [sys.executable, "-m", "trial"], cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         try:
             assert process.stdout is not None

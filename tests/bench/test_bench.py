@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, data, gym, memory, pages, pictures, scale, scenes, seen, table, trial, warm
+from bench import control, data, gym, load, memory, pages, pictures, scale, scenes, seen, table, trial, warm
 from bench.bill import bill
 from deploy.cost import estimate
 from deploy.cost.prices import Prices
@@ -440,6 +440,22 @@ def test_objects_that_are_late_or_large_miss_their_goals() -> None:
     assert_well_formed(rows)
     assert all(row["met"] is not False for row in rows)
     assert sum(row["met"] is False for row in scenes.judged(bad, bad)) == sum(row["met"] is not None for row in rows)
+
+
+def test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals() -> None:
+    def all_rows(share: float, cpu: float, size: float) -> list[table.Row]:
+        found = load.Played(share, cpu, size, size + 15)
+        return [load.judged_cpu(found, 0.5), *load.judged_core([found] * 3), load.judged_policy(share, 1.0, 0.9)]
+
+    rows = all_rows(1.0, 1.1, 40.0)
+    assert_well_formed(rows)
+    assert [row["met"] for row in rows] == [True] * 4
+    assert [row["met"] for row in all_rows(0.9, 1.3, 46.0)] == [False] * 4
+
+
+def test_a_slow_policy_that_was_never_late_shows_nothing() -> None:
+    with pytest.raises(RuntimeError, match="never late"):
+        load.judged_policy(1.0, 1.0, 0.0)
 
 
 def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ FIRST_ROW = struct.Struct("!H")
 LONGEST_JPEG_SIDE = 65_500
 """Pixels; libjpeg's JPEG_MAX_DIMENSION."""
 
-_FIRST_CHUNK = 32_768  # bytes of pixels until the first look at how much has come out
+_FIRST_CHUNK = 131_072  # bytes of pixels until the first look at how much has come out
 
 
 class FrameError(ValueError):

@@ -1,0 +1,289 @@
+"""What a trial costs its machine, without a browser: processor time, trials on one core, memory, and slow policies.
+
+`python -m bench.load`. Clients are sockets that acknowledge each frame and press keys, so that nothing but the servers
+is measured. The yardstick of processor time is the game alone: the example's agent, called as often by a bare loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
+
+from bench import seen
+from bench.pictures import GAME, ROOT
+from bench.table import Row, each, row
+from trial.recordings import recording
+
+RATE = 30  # frames a second
+SETTLE = 2.0  # seconds of play before anything is measured
+SECONDS = 8.0
+MOST_CPU = 1.2  # ms of a processor for a frame of the example
+TRIALS = 32  # that one core has to hold
+MOST_MEMORY = 45.0  # MB of each
+ACTIONS = ("noop", "up", "right", "left", "down")
+_ID = struct.Struct("!BI")  # how a binary message begins
+
+ALONE = """
+import random, sys, time
+from bench.pictures import example_agent
+agent = example_agent()
+agent.start({game!r})
+agent.reset(seed=7)
+due = time.monotonic()
+print("plays", flush=True)
+while True:
+    due = max(due + 1 / {rate}, time.monotonic() - 1)
+    time.sleep(max(0, due - time.monotonic()))
+    _, _, terminated, truncated, _ = agent.step(random.randrange(5))
+    agent.render()
+    if terminated or truncated:
+        agent.reset(seed=7)
+"""
+
+# A game that costs nothing, and a partner whose every answer comes three ticks late.
+SLOW = """
+import time
+import numpy as np
+class Agent:
+    possible_agents = ["player", "partner"]
+    def start(self, game):
+        pass
+    def reset(self, seed=None):
+        self.t = 0
+        return {each: np.zeros(2, np.float32) for each in self.possible_agents}, {}
+    def step(self, actions):
+        self.t += 1
+        seen = {each: np.full(2, self.t, np.float32) for each in self.possible_agents}
+        return seen, dict.fromkeys(self.possible_agents, 0.0), {"__all__": False}, {"__all__": False}, {}
+    def render(self):
+        return np.full((90, 160, 3), self.t % 256, np.uint8)
+    def close(self):
+        pass
+class Partner:
+    def reset(self, seed):
+        pass
+    def act(self, observation, info):
+        time.sleep(0.1)
+        return 1
+"""
+
+
+@dataclass
+class Played:
+    """What a server delivered and cost. `cpu` is ms for each frame, `memory` and `resident` are MB."""
+
+    share: float
+    cpu: float
+    memory: float
+    """Its own pages, and its part of those that several processes share (Pss)."""
+    resident: float
+
+
+async def play(url: str, count: list[int]) -> None:
+    """Play until it is cancelled; the number of frames goes into `count`."""
+    keys = random.Random(7)
+    async with connect(
+        url, subprotocols=[Subprotocol("hippodrome.2")], max_size=None, compression=None, open_timeout=60
+    ) as client:
+        await client.send(json.dumps({"userId": "bench", "token": "bench"}))
+        async for data in client:
+            if isinstance(data, str):
+                continue
+            count[0] += 1
+            await client.send(json.dumps({"ack": _ID.unpack_from(data)[1]}))
+            if count[0] == 1:
+                await client.send(json.dumps({"command": "start"}))
+            elif count[0] % 20 == 0:
+                await client.send(json.dumps({"action": keys.choice(ACTIONS[1:]), "held": keys.random() < 0.5}))
+
+
+async def played(servers: list[tuple[str, int]]) -> list[Played]:
+    """Play on all of these servers at once; what each delivered and cost."""
+    counts = [[0] for _ in servers]
+    players = [asyncio.create_task(play(url, count)) for (url, _), count in zip(servers, counts, strict=True)]
+    try:
+        async with asyncio.timeout(120):
+            while not all(count[0] > RATE for count in counts):
+                await asyncio.sleep(0.1)
+                for player in players:
+                    if player.done():
+                        player.result()
+                        raise RuntimeError("a server has ended its connection")
+        await asyncio.sleep(SETTLE)
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        before = [(count[0], seen.cpu_seconds(pid)) for (_, pid), count in zip(servers, counts, strict=True)]
+        await asyncio.sleep(SECONDS)
+        due = RATE * (loop.time() - begun)
+        return [
+            _played(pid, count[0] - frames, seen.cpu_seconds(pid) - cpu, due)
+            for (_, pid), count, (frames, cpu) in zip(servers, counts, before, strict=True)
+        ]
+    finally:
+        for player in players:
+            player.cancel()
+        await asyncio.gather(*players, return_exceptions=True)
+
+
+def _played(pid: int, frames: int, cpu: float, due: float) -> Played:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+    sizes = {line.split()[0]: int(line.split()[1]) / 1024 for line in lines if line.startswith(("Rss:", "Pss:"))}
+    return Played(frames / due, 1000 * cpu / max(frames, 1), sizes["Pss:"], sizes["Rss:"])
+
+
+@contextlib.contextmanager
+def example(count: int = 1) -> Iterator[list[tuple[str, int]]]:
+    """Servers of the example's game. More than one share a core."""
+    cores = os.sched_getaffinity(0)
+    core = cores if count == 1 else {max(cores)}
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as running:
+        Path(folder, "agent.py").write_bytes((ROOT / "agent.py").read_bytes())
+        # A process begins on the cores of the thread that starts it.
+        with ThreadPoolExecutor(4, initializer=os.sched_setaffinity, initargs=(0, core)) as starting:
+
+            def start(_: int) -> tuple[str, int]:
+                return running.enter_context(
+                    seen.server(Path(folder), startingFrameRate=RATE, actionSpace=list(ACTIONS))
+                )
+
+            servers = list(starting.map(start, range(count)))
+        yield servers
+
+
+def game_alone() -> float:
+    """Processor ms of the example's agent for each of its frames, at the same rate."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", ALONE.format(game=GAME, rate=RATE)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+
+        async def watch() -> float:
+            await asyncio.sleep(SETTLE)
+            before = seen.cpu_seconds(process.pid)
+            await asyncio.sleep(SECONDS)
+            return seen.cpu_seconds(process.pid) - before
+
+        return 1000 * asyncio.run(watch()) / (RATE * SECONDS)
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def one_trial() -> Iterator[Row]:
+    """What a frame of the example costs its server."""
+    alone = game_alone()
+    with example() as servers:
+        (found,) = asyncio.run(played(servers))
+    yield judged_cpu(found, alone)
+
+
+def judged_cpu(found: Played, alone: float) -> Row:
+    """The row of processor time."""
+    return row(
+        f"server's CPU per frame of the example at {RATE}/s, against its game alone",
+        found.cpu,
+        "ms",
+        yardstick=alone,
+        at_most=MOST_CPU,
+        judge="value",
+        detail={"share of the frames delivered": found.share, "MB resident": found.resident},
+    )
+
+
+def one_core() -> Iterator[Row]:
+    """How many trials one core holds, and the memory of each."""
+    with example(TRIALS) as servers:
+        found = asyncio.run(played(servers))
+    yield from judged_core(found)
+
+
+def judged_core(found: list[Played]) -> Iterator[Row]:
+    """The rows of trials that share a core."""
+    yield row(
+        f"frames delivered at {RATE}/s by {len(found)} trials of the example on one core",
+        statistics.mean(one.share for one in found),
+        "of those due",
+        at_least=0.99,
+        bound="ours: one core holds so many",
+        detail={
+            "of the trial that got least": min(one.share for one in found),
+            "CPU per frame, ms": statistics.mean(one.cpu for one in found),
+        },
+    )
+    yield row(
+        f"memory of each of {len(found)} trials of the example",
+        statistics.mean(one.memory for one in found),
+        "MB",
+        at_most=MOST_MEMORY,
+        bound="ours; each process's own pages, and its part of shared ones",
+        detail={"MB resident, shared pages counted in each": statistics.mean(one.resident for one in found)},
+    )
+
+
+def slow_policy() -> Iterator[Row]:
+    """Whether a policy that is late holds up the game."""
+    slow, late = beside("agent:Partner")
+    idle, _ = beside("idle")
+    yield judged_policy(slow, idle, late)
+
+
+def beside(partner: str) -> tuple[float, float]:
+    """The share of the ticks that a server delivers beside this partner, and that of steps for which it was late."""
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as store:
+        Path(folder, "agent.py").write_text(SLOW, encoding="utf-8")
+        trial = {"startingFrameRate": RATE, "actionSpace": ["noop", "up"]}
+        players = {"player": "human", "partner": partner}
+        with seen.server(Path(folder), store=Path(store), players=players, **trial) as server:
+            (found,) = asyncio.run(played([server]))
+        steps = [line for line in _recorded(Path(store)) if line["kind"] == "step"]
+        late = sum(step["players"]["partner"]["by"] == "late" for step in steps)
+        return found.share, late / max(len(steps), 1)
+
+
+def _recorded(store: Path) -> list[dict[str, Any]]:
+    return [line for file in store.rglob("*.jsonl.gz*") for line in recording.read(file.read_bytes())]
+
+
+def judged_policy(slow: float, idle: float, late: float) -> Row:
+    """The row of a slow policy. It shows nothing unless the policy was late."""
+    if late == 0.0:
+        raise RuntimeError("the policy was never late")
+    return row(
+        f"ticks delivered at {RATE}/s beside a policy that takes 100 ms, against one that idles",
+        slow,
+        "of those due",
+        yardstick=idle,
+        at_least=0.99,
+        detail={"steps for which it was late": late},
+    )
+
+
+def rows() -> Iterator[Row]:
+    """Measure everything; about two minutes."""
+    yield from each((one_trial, one_core, slow_policy))
+
+
+if __name__ == "__main__":
+    for found_row in rows():
+        print(json.dumps(found_row), flush=True)
