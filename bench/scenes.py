@@ -122,7 +122,7 @@ def _game(objects: bool) -> Iterator[tuple[str, int]]:
     trial: dict[str, Any] = {"scene": SCENE} if objects else {}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "agent.py").write_text(f"ROOT, OBJECTS = {str(ROOT)!r}, {objects}\n{AGENT}", encoding="utf-8")
-        space = {"actionSpace": ["noop", "left"], "startingFrameRate": RATE}
+        space: dict[str, Any] = {"actionSpace": ["noop", "left"], "startingFrameRate": RATE}
         with (
             seen.server(Path(folder), **space, **trial) as (url, pid),
             game_page(url, user="bench", token="bench", trial=trial) as address,

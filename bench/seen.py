@@ -146,7 +146,7 @@ def ours(picture: str, rate: int) -> Iterator[tuple[str, int]]:
     with tempfile.TemporaryDirectory() as folder:
         source = f"ROOT, LEFT = {str(ROOT)!r}, {LEFT[picture]}\n{AGENTS[picture]}"
         Path(folder, "agent.py").write_text(source, encoding="utf-8")
-        space = {"actionSpace": ["noop", "left"]} if LEFT[picture] == 1 else {}
+        space: dict[str, Any] = {"actionSpace": ["noop", "left"]} if LEFT[picture] == 1 else {}
         with (
             server(Path(folder), startingFrameRate=rate, **space) as (url, pid),
             game_page(url, user="bench", token="bench") as address,
