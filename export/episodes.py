@@ -17,7 +17,7 @@ import json
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -28,7 +28,8 @@ from export.state import State
 
 OF_HUMAN = (
     "Several players played: actions, rewards and observations are those of the first human. An action by none is the "
-    "idle one, also where it was not the human's turn. infos: players (what each did and got, as JSON). "
+    "idle one, also where it was not the human's turn. Episodes end where the human left the game. "
+    "infos: players (what each did and got, as JSON). "
 )
 STEP_NUMBERS = "The observations were not recorded; in their place stands the number of the step."
 
@@ -41,6 +42,7 @@ class Spec(NamedTuple):
     dtype: str  # of the observations; "" where there are none
     shape: tuple[int, ...]
     players: tuple[str, ...] = ()  # if several play
+    human: str = ""  # the first of them
 
 
 @dataclass
@@ -117,6 +119,7 @@ def _look(path: Path, step: str) -> tuple[Spec, int]:
         names = header.get("actionSpace")
         actions = tuple(map(str, names)) if isinstance(names, list) else ()
         players = players_of(header)
+        human = _first_human(header) if players else ""
         column = file.schema_arrow.get_field_index("action")
         highest = -1
         for number in range(file.metadata.num_row_groups):
@@ -127,9 +130,16 @@ def _look(path: Path, step: str) -> tuple[Spec, int]:
             for row in batch.to_pylist():
                 if row["observationDtype"] is not None:
                     shape = tuple(row["observationShape"])
-                    return Spec(step, actions, row["observationDtype"], shape, players), highest
+                    return Spec(step, actions, row["observationDtype"], shape, players, human), highest
             break
-    return Spec(step, actions, "", (), players), highest
+    return Spec(step, actions, "", (), players, human), highest
+
+
+def _first_human(header: Mapping[str, Any]) -> str:
+    kinds = header.get("players") or {}
+    return next(
+        (str(name) for name, said in kinds.items() if isinstance(said, dict) and said.get("kind") == "human"), ""
+    )
 
 
 def _storage(data: Path, dataset: Dataset, version: str) -> Any:
@@ -236,6 +246,7 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
     from minari.data_collector import EpisodeBuffer
 
     spec = dataset.spec
+    rows = _own(rows, spec.human) if spec.human else rows
     first = rows[0] if rows[0]["kind"] == "reset" else None
     steps = rows[1:] if first else rows
     if any(row["action"] is None or row["action"] < 0 for row in steps):
@@ -275,6 +286,17 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
             **(_more(told, "players") if spec.players else {}),
         },
     )
+
+
+def _own(rows: list[dict[str, Any]], human: str) -> list[dict[str, Any]]:
+    """The rows up to the human's own end, after which the others may play on."""
+    for place, row in enumerate(rows):
+        players = json.loads(row.get("other") or "{}").get("players")
+        part = players.get(human) if isinstance(players, dict) else None
+        if row["kind"] == "step" and isinstance(part, dict) and (part.get("terminated") or part.get("truncated")):
+            ends = {name: bool(part.get(name)) for name in ("terminated", "truncated")}
+            return [*rows[:place], row | ends]
+    return rows
 
 
 def _more(rows: list[dict[str, Any]], name: str) -> dict[str, list[str]]:

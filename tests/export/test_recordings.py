@@ -231,6 +231,27 @@ def test_what_else_a_step_returned_is_in_tables_and_datasets(tmp_path: Path, mon
     assert [json.loads(text) if text else None for text in episode.infos["extra"]] == [None, *[extra] * 6]
 
 
+def test_a_dataset_ends_where_the_human_left_the_game(tmp_path: Path, monkeypatch: Any) -> None:
+    """The others play on. What stands in the lines from then on is none of the human's steps."""
+    put = into_folder(tmp_path / "data")
+    (user,) = crowd(put, tmp_path, 1)
+    lines = recording.read(record(tmp_path, user, frames=6, observe=True, head={"players": {
+        "right": {"kind": "policy", "policy": "random"}, "left": {"kind": "human"}}}))  # fmt: skip
+    for line in lines:
+        if line["kind"] == "step":
+            alive = line["step"] <= 4
+            part = {"action": 1 if alive else None, "by": "human" if alive else None, "reward": 1.0 if alive else 0.0}
+            line["players"] = {"right": {"action": 0, "by": "policy", "reward": 0.0}, "left": part}
+            if line["step"] == 4:
+                part["truncated"] = True
+            if not alive:
+                line["observation"] = None
+    put(recording_key(user), gzip.compress(b"".join(json.dumps(line).encode() + b"\n" for line in lines)))
+    (episode,) = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch).iterate_episodes()
+    assert (len(episode.actions), len(episode.observations)) == (4, 5)
+    assert (episode.terminations.tolist(), episode.truncations.tolist()) == ([False] * 4, [False] * 3 + [True])
+
+
 def test_each_player_has_columns_and_a_dataset_is_of_the_first_human(tmp_path: Path, monkeypatch: Any) -> None:
     left, right = {"action": 1, "by": "human", "reward": 2.0}, {"action": None, "by": None, "reward": 0.5, "info": {}}
     head = {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "random"}}
