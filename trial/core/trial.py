@@ -681,7 +681,8 @@ class Trial:
 
     def _left(self, client: Client) -> None:
         self._note("disconnected")
-        self.progress.leave(client.player)
+        if not self._closing:  # the end of the server has ended what was on
+            self.progress.leave(client.player)
         self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
@@ -709,12 +710,14 @@ class Trial:
             self.progress.act(KEY + message.key, message.held, player=client.player)
 
     def _command(self, client: Client, command: str) -> None:
-        if command == "start":
+        if command == "requestUI":
+            self._clients.send(client, self._controls(client))
+        elif self._closing:
+            pass  # the end of the server has ended what was on
+        elif command == "start":
             self.progress.start()
         elif command == "pause":
             self.progress.pause()
-        elif command == "requestUI":
-            self._clients.send(client, self._controls(client))
         elif command in ("reset", "stop") and command not in self._commands:
             self._commands.append(command)
 

@@ -102,6 +102,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "trial": {},
         "task_definition": None,
         "page_folder": "steps",
+        "game_pages": {},
         "server_port": 5000,
         "version": "",
         "salt": "",
