@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 
-from protocol.values import Check, Plain, as_text, printable, show
+from protocol.values import printable, show
 
 MOST_AT_ONCE = 4
 """Keys that may be joined."""
@@ -92,19 +92,3 @@ def combination(text: str) -> str:
 def shown(combined: str) -> str:
     """The combination as it may stand in a sentence."""
     return printable("+".join("Space" if part == _SPACE else part for part in parts(combined)))
-
-
-def an_action(longest: int) -> Check:
-    """A check for the name of an action, of up to `longest` characters; it is returned in small letters."""
-
-    def check(value: object) -> str:
-        if isinstance(value, int) and not isinstance(value, bool):
-            value = str(value)
-        if isinstance(value, Plain) and not isinstance(value.value, bool):
-            value = value.text
-        found = as_text(value, "the name of an action").lower()
-        if len(found) > longest:
-            raise ValueError(f"must be at most {longest} characters long, not {len(found)}")
-        return found
-
-    return check

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from protocol import values
-from protocol.values import Plain, show
+from protocol.values import show
 
 HUMAN = "human"
 GYM_PLAYER = "gym://"
@@ -21,9 +21,8 @@ ONNXRUNTIME = "onnxruntime==1.32.0"
 WHO = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
 
 MOST_PLAYERS = 64
-_NAME = values.text("the name of a player", 64)
+_NAME = values.text("the name of a player", values.LONGEST_NAME)
 _PLAYS = values.text(WHO, 200)
-_ACTION = values.text("the name of an action", 64)
 _GROUP = re.compile(r"[0-9]{1,9}")
 _CLASS = re.compile(r"[A-Za-z_]\w*")
 _PROGRAM = re.compile(r"[A-Za-z0-9_.-]+")
@@ -91,18 +90,10 @@ def idle_action(value: object) -> str | dict[str, str]:
         if len(value) > MOST_PLAYERS:
             raise ValueError(f"must have at most {MOST_PLAYERS} players, not {len(value)}")
         return {
-            str(_one(_NAME, str(name), "")): str(_action(item, f"{values.printable(str(name))} "))
+            str(_one(_NAME, str(name), "")): _one(values.action_name, item, f"{values.printable(str(name))} ")
             for name, item in value.items()
         }
-    return str(_action(value, ""))
-
-
-def _action(value: object, where: str) -> Any:
-    """A number is a name too, in YAML and in JSON."""
-    plain = value.value if isinstance(value, Plain) else value
-    if isinstance(plain, int) and not isinstance(plain, bool):
-        value = str(plain)
-    return _one(_ACTION, value, where)
+    return values.action_name(value)
 
 
 def files(given: object) -> Iterator[tuple[tuple[str, ...], str]]:

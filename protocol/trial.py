@@ -1,46 +1,28 @@
-"""The `trial` section of config.yml: its keys, what each may be, and the one function that checks it.
-
-`hippodrome/config` checks a registration, `trial/settings.py` what a server is started with. Both call `check`.
-"""
+"""The `trial` section of config.yml: its keys, and what each may be. `protocol/trial_check.py` checks it."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-from protocol import keyboard, values
+from protocol import key_maps, values
 from protocol import players as who
-from protocol.players import GYM_PLAYER
-from protocol.values import Check, Keys, number_in
+from protocol.values import Check, Keys, Problem, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
 """Words that a client says to the server, so no control of a project's own can be called so."""
 MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
-LONGEST_NAME = 64
-"""Characters of the name of an action, or of a control of the project's own."""
 MOST_EPISODES = 1_000_000
 LONGEST_BREAK = 600
 """Seconds."""
 HIGHEST_RATE = 240
 """Frames per second that no project may exceed."""
-
-
-class Problem(NamedTuple):
-    """A mistake in the section: the path of the key below `trial`, and the sentence that says what to write.
-
-    `compared` are the keys of a rule between two values; it is empty if the value is wrong by itself.
-    """
-
-    path: Keys
-    sentence: str
-    compared: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -200,68 +182,6 @@ def _break(value: object) -> float | str:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
 
-def _actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
-    """What the keys do: `{key: action}`, or such a map for each player."""
-    if not value or not all(isinstance(each, dict) for each in value.values()):
-        return _one_players_keys(value, path)
-    checked = {str(player): _one_players_keys(each, (*path, player)) for player, each in value.items()}
-    return {player: found for player, (found, _) in checked.items()}, [
-        one for _, many in checked.values() for one in many
-    ]
-
-
-def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
-    found: dict[str, str] = {}
-    problems: list[Problem] = []
-    known: dict[frozenset[str], str] = {}
-    for name, action in value.items():
-        here = (*path, name)
-        key, wrong = _value(lambda text: keyboard.combination(str(text)), name, here)
-        named, wrong_action = _value(_KEYS_ACTION, action, here)
-        problems += wrong + wrong_action
-        if wrong or wrong_action:
-            continue
-        same = known.setdefault(frozenset(keyboard.parts(key)), name)
-        if same != name:
-            problems.append(Problem(here, f"is the same as {keyboard.shown(same)}; keep one of them"))
-        found[key] = named
-    return found, _few(value, problems, path)
-
-
-def _labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
-    found: dict[str, str] = {}
-    problems: list[Problem] = []
-    for name, label in value.items():
-        here = (*path, name)
-        action, wrong = _value(_KEYS_ACTION, name, here)
-        text, wrong_text = _value(_LABEL, label, here)
-        problems += wrong + wrong_text
-        if not wrong and not wrong_text:
-            found[action] = text
-    return found, _few(value, problems, path)
-
-
-def _few(value: Mapping[str, Any], problems: list[Problem], path: Keys) -> list[Problem]:
-    if len(value) <= MAX_KEYS:
-        return problems
-    return [*problems, Problem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
-
-
-MAX_KEYS = 100
-"""Keys of one player, and labels."""
-_KEYS_ACTION = keyboard.an_action(LONGEST_NAME)
-_LABEL = values.text("the text of a button", LONGEST_NAME)
-
-
-def _action(value: object) -> object:
-    """The name of an action. A number is a name too, in YAML and in JSON."""
-    return _ACTION(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
-
-
-_ACTION = values.text("the name of an action", LONGEST_NAME)
-_CONTROL = values.text("the name of a control", LONGEST_NAME)
-
-
 @dataclass(frozen=True, slots=True)
 class Trial:
     """What happens on the participant's server."""
@@ -309,7 +229,7 @@ class Trial:
                     ]
                 },
             },
-            entries=_actions_of_keys,
+            entries=key_maps.actions_of_keys,
         ),
     )
     labels: dict[str, str] = field(
@@ -318,7 +238,7 @@ class Trial:
             values.section("left: Go left"),
             "Texts of the buttons, by action.",
             {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
-            entries=_labels,
+            entries=key_maps.labels,
         ),
     )
     input: str = _choice(
@@ -341,7 +261,7 @@ class Trial:
         (),
         "Names of the actions, in the order of the environment's numbers.",
         {"type": "array", "items": {"type": "string"}},
-        each=_action,
+        each=values.action_name,
     )
     allow_frame_rate_change: bool = _flag(False, "Whether participants may change the frame rate.")
     frame_rate_step_size: int = _rate(5, "Frames per second by which fpsUp and fpsDown change the rate.")
@@ -514,165 +434,3 @@ def names(section: type[Trial | Ui | Scene]) -> frozenset[str]:
 def _camel(name: str) -> str:
     first, *others = name.split("_")
     return first + "".join(other.capitalize() for other in others)
-
-
-def check(section: object) -> tuple[Trial, list[Problem]]:
-    """The values of a `trial` section, and all that is wrong with it. Never raises.
-
-    `section` holds what JSON can hold, or text and `values.Plain`. A key that is left empty counts as not given.
-    A value that is wrong is replaced by its default. Unknown keys are ignored.
-    """
-    if section is None or section == "":
-        return Trial(), []
-    if not isinstance(section, dict):
-        _, problems = _value(values.section("actionBufferLifespan: …"), section, ())
-        return Trial(), problems
-    section, problems = _spelt(section)
-    found, wrong = _section(Trial, section, ())
-    trial, problems = Trial(**found), problems + wrong
-    given = {key.name for key in keys(Trial) if key.attribute in found}
-    bad = {path[0] for path, _, _ in problems}
-    rules: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
-        _frame_rates,
-        _different_actions,
-        _actions_that_exist,
-        _players_of_keys,
-        _programs,
-    )
-    compared = [problem for rule in rules for problem in rule(trial, given)]
-    return trial, problems + [problem for problem in compared if bad.isdisjoint(problem.compared)]
-
-
-def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[Problem]]:
-    """The section with the right spelling of a key that HIPPO's documentation spells in two ways."""
-    if RATE_CHANGE_MISSPELT not in section:
-        return section, []
-    rest = {key: value for key, value in section.items() if key != RATE_CHANGE_MISSPELT}
-    if rest.get(RATE_CHANGE) not in (None, ""):
-        return rest, [Problem((RATE_CHANGE_MISSPELT,), f"{RATE_CHANGE} is given too; keep that one")]
-    return rest | {RATE_CHANGE: section[RATE_CHANGE_MISSPELT]}, []
-
-
-def _section(
-    model: type[Trial | Ui | Scene], section: dict[str, Any], path: Keys
-) -> tuple[dict[str, Any], list[Problem]]:
-    """The good values by attribute, and the problems."""
-    found: dict[str, Any] = {}
-    problems: list[Problem] = []
-    for key in keys(model):
-        value, here = section.get(key.name), (*path, key.name)
-        if value is None or value == "" or (key.section is Ui and value == {}):
-            continue
-        value, wrong = _value(key.check, value, here)
-        if key.each and not wrong:
-            value, wrong = _items(key.each, value, here)
-        elif key.entries and not wrong:
-            value, wrong = key.entries(value, here)
-        elif key.section and not wrong:
-            inner, wrong = _section(key.section, value, here)
-            value = key.section(**inner)
-        problems += wrong
-        if not wrong:
-            found[key.attribute] = value
-    if model is Ui:
-        found["own"], wrong = _own_controls(section, path)
-        problems += wrong
-    return found, problems
-
-
-def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...], list[Problem]]:
-    """The names of the controls in `ui` that are not ours, and are to be shown."""
-    found: list[str] = []
-    problems: list[Problem] = []
-    for name in section.keys() - names(Ui):
-        here = (*path, name)
-        shown, wrong = (False, []) if section[name] in (None, "") else _value(values.flag, section[name], here)
-        if shown and name in TAKEN:
-            wrong = [Problem(here, "the game's server knows this word already; give the control another name")]
-        elif shown:
-            _, wrong = _value(_CONTROL, name, here)
-        if shown and not wrong:
-            found.append(name)
-        problems += wrong
-    if len(found) > MAX_OWN_CONTROLS:
-        problems.append(Problem(path, f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"))
-    order = list(section)
-    return tuple(sorted(found, key=order.index)), sorted(problems, key=lambda problem: len(problem.path))
-
-
-def _items(check_item: Check, items: list[object], path: Keys) -> tuple[tuple[Any, ...], list[Problem]]:
-    checked = [_value(check_item, item, (*path, index)) for index, item in enumerate(items)]
-    return tuple(value for value, _ in checked), [problem for _, wrong in checked for problem in wrong]
-
-
-def _value(check_value: Check, value: object, path: Keys) -> tuple[Any, list[Problem]]:
-    try:
-        return check_value(value), []
-    except ValueError as error:
-        return None, [Problem(path, str(error))]
-
-
-def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
-    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is told at a key that is given."""
-    rates = {
-        "minFrameRate": trial.min_frame_rate,
-        "startingFrameRate": trial.starting_frame_rate,
-        "maxFrameRate": trial.max_frame_rate,
-    }
-    low, start, high = rates
-    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
-    for lower, upper in pairs:
-        if rates[lower] <= rates[upper]:
-            continue
-        key = next(key for key in (start, low, high) if key in (lower, upper) and key in given)
-        other, bound = (upper, "most") if key == lower else (lower, "least")
-        default = "" if other in given else " by default"
-        hint = f"; set {other} too" if default else ""
-        sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
-        yield Problem((key,), sentence, (lower, upper))
-
-
-def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
-    """Keys and labels name actions of actionSpace, if that is given."""
-    names = [action.lower() for action in trial.action_space]
-    if not names:
-        return
-    named = [("keys", (*place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
-    named += [("labels", (action,), action) for action in trial.labels]
-    for section, path, action in named:
-        if action in names:
-            continue
-        near = difflib.get_close_matches(action, names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"the actions are {values.printable(', '.join(names), 100)}"
-        sentence = f"there is no action {values.show(action)} in actionSpace; {hint}"
-        yield Problem((section, *path), sentence, ("actionSpace", section))
-
-
-def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
-    """Keys by player name players of `players`, if that is given."""
-    known = trial.player_names()
-    for player, keys in trial.keys.items():
-        if known and isinstance(keys, dict) and player not in known:
-            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
-            yield Problem(("keys", player), sentence, ("players", "keys"))
-
-
-def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
-    first: dict[str, int] = {}
-    for index, action in enumerate(trial.action_space):
-        name = action.lower()  # as the trial has it
-        if first.setdefault(name, index) != index:
-            sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
-            yield Problem(("actionSpace", index), sentence, ("actionSpace",))
-
-
-def _programs(trial: Trial, _given: set[str]) -> Iterator[Problem]:
-    """A program that plays needs a way in."""
-    if trial.gym == "advise":
-        return
-    tables = trial.players.values() if who.by_group(trial.players) else [trial.players]
-    for table in tables:
-        for name, plays in table.items():
-            if plays.startswith(GYM_PLAYER):
-                yield Problem(("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",))
-                return

@@ -10,10 +10,13 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 Check = Callable[[object], object]
 Keys = tuple[str | int, ...]
 """Where a value stands: keys and, in lists, positions from 0."""
+LONGEST_NAME = 64
+"""Characters of the name of an action, a player, or a control of the project's own."""
 
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
@@ -29,6 +32,25 @@ class Plain:
 
     value: int | float | bool
     text: str
+
+
+class Problem(NamedTuple):
+    """A mistake in the section: the path of the key below `trial`, and the sentence that says what to write.
+
+    `compared` are the keys of a rule between two values; it is empty if the value is wrong by itself.
+    """
+
+    path: Keys
+    sentence: str
+    compared: tuple[str, ...] = ()
+
+
+def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[Problem]]:
+    """What the check returns, or None and the problem at this path."""
+    try:
+        return check(value), []
+    except ValueError as error:
+        return None, [Problem(path, str(error))]
 
 
 def show(value: object) -> str:
@@ -81,6 +103,14 @@ def text(what: str = "text", limit: int = 500) -> Check:
         return found
 
     return check
+
+
+def action_name(value: object) -> str:
+    """The name of an action. A number is a name too, in YAML as it is written. Raises ValueError."""
+    return str(_ACTION_NAME(str(value) if isinstance(value, int) and not isinstance(value, bool) else value))
+
+
+_ACTION_NAME = text("the name of an action", LONGEST_NAME)
 
 
 def number_in(value: object) -> int | float | None:

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protocol import environment
-from protocol.trial import Trial, check
+from protocol.trial import Trial
+from protocol.trial_check import check
 from trial.agent import tracebacks
 from trial.server import process_group
 

@@ -12,7 +12,8 @@ from typing import Any
 
 from protocol import environment as variables
 from protocol.keys import NAME, SERVER_NAME
-from protocol.trial import Trial, check
+from protocol.trial import Trial
+from protocol.trial_check import check
 from protocol.values import where_of
 
 DEFAULT_GAME = "ALE/MsPacman-v5"

@@ -1,6 +1,6 @@
 """The first check: each value by itself. A value with a mistake is left out of later checks.
 
-`project_keys` checks `project`; `protocol.trial.check` checks `trial`, also its values against each other.
+`project_keys` checks `project`; `protocol.trial_check.check` checks `trial`, also its values against each other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
 from protocol.trial import RATE_CHANGE_MISSPELT, Trial, Ui, names
-from protocol.trial import check as check_trial
+from protocol.trial_check import check as check_trial
 from protocol.values import show
 
 _ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find

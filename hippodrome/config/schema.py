@@ -8,13 +8,13 @@ import itertools
 from typing import Any
 
 from hippodrome.config.project_keys import SECTIONS, Root
-from protocol import trial
+from protocol import trial, values
 from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Scene, Trial, Ui
 
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
     "patternProperties": {
-        f"^({'|'.join(sorted(trial.TAKEN))})$|^.{{{trial.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
+        f"^({'|'.join(sorted(trial.TAKEN))})$|^.{{{values.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
     },
 }
 """What other keys of `ui` may be. A pattern, since editors would propose keys that stand under `properties`."""

@@ -115,6 +115,9 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/config/test_config_keys",
         "hippodrome/config/test_registration",
     ),
+    "protocol/trial_check.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
+    "protocol/trial_rules.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
+    "protocol/key_maps.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
     "protocol/values.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
@@ -127,6 +130,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "trial/pictures/frames.py": ("trial/test_trial_wire", "trial/test_trial_frames"),
     "trial/core/clients.py": ("trial/test_trial_decisions",),
     "trial/core/trial.py": ("trial/test_trial_decisions",),
+    "trial/core/records.py": ("trial/test_trial_decisions",),
     "trial/core/message_log.py": ("trial/test_trial_decisions",),
     "trial/core/timing.py": ("trial/test_trial_decisions", "trial/test_trial_progress", "trial/test_trial_core"),
     "trial/core/progress.py": ("trial/test_trial_progress", "trial/test_trial_core"),

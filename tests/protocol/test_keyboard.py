@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import keyboard, trial
+from protocol import keyboard, trial, trial_check
 
 
 def found(**section: Any) -> trial.Trial:
-    checked, problems = trial.check(section)
+    checked, problems = trial_check.check(section)
     assert problems == []
     return checked
 
 
 def said(**section: Any) -> list[str]:
-    _, problems = trial.check(section)
+    _, problems = trial_check.check(section)
     return [f"{trial.values.where_of(problem.path)}: {problem.sentence}" for problem in problems]
 
 

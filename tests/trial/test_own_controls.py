@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from protocol import trial
+from protocol import trial, trial_check
 from trial.core import messages
 from trial.core.message_log import MessageLog
 from trial.core.messages import BadMessage
@@ -25,7 +25,7 @@ def config(ui: dict[str, Any], **more: Any) -> trial.Trial:
 
 
 def problems(ui: dict[str, Any]) -> list[str]:
-    return [f"{'.'.join(map(str, path))}: {said}" for path, said, _ in trial.check({"ui": ui})[1]]
+    return [f"{'.'.join(map(str, path))}: {said}" for path, said, _ in trial_check.check({"ui": ui})[1]]
 
 
 # ---- what the section may say
@@ -42,11 +42,11 @@ def test_a_control_that_is_called_like_an_action_is_no_word() -> None:
 
 
 def test_the_section_with_its_defaults_is_accepted_again() -> None:
-    found, wrong = trial.check({"ui": UI})
+    found, wrong = trial_check.check({"ui": UI})
     assert wrong == []
     assert found.document()["ui"]["reallyGood"] is True
     assert "brightness" not in found.document()["ui"]
-    assert trial.check(found.document()) == (found, [])
+    assert trial_check.check(found.document()) == (found, [])
 
 
 @pytest.mark.parametrize(

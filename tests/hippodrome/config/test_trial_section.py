@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hippodrome.config import ConfigErrors, parse_registration, remarks
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from protocol import trial
+from protocol import trial, trial_check
+from protocol.values import Plain
 from trial.settings import SettingsError, trial_section
 
 STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
@@ -98,7 +99,7 @@ def test_the_same_section_gives_the_same_at_both_ends(section: dict[str, Any]) -
 
 @given(SECTIONS)
 def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> None:
-    found, problems = trial.check(section)
+    found, problems = trial_check.check(section)
     wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
     defaults = trial.Trial().document()
     document = found.document()
@@ -129,9 +130,23 @@ def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
     assert made.action_space == ("0", "1")
 
 
+def test_a_number_that_names_an_action_is_the_same_text_wherever_it_stands() -> None:
+    one = Plain(1, "01")  # as YAML reads 01
+    found, problems = trial_check.check(
+        {"actionSpace": [Plain(0, "00"), one], "idleAction": one, "keys": {"a": one}, "labels": {"01": "Go"}}
+    )
+    assert not problems
+    assert (found.action_space[1], found.idle_action, found.keys, found.labels) == (
+        "01",
+        "01",
+        {"a": "01"},
+        {"01": "Go"},
+    )
+
+
 @pytest.mark.parametrize("section", ["x", [1], 3, True])
 def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
-    found, problems = trial.check(section)
+    found, problems = trial_check.check(section)
     assert found == trial.Trial()
     assert [problem.path for problem in problems] == [()]
 

@@ -1,0 +1,91 @@
+"""How the keys of the section `trial` go together: rules between two values.
+
+A rule gets the section with its defaults, and the names of the keys that are given. A problem is not told if one of the
+values that it compares is wrong by itself.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator
+
+from protocol import players as who
+from protocol import values
+from protocol.players import GYM_PLAYER
+from protocol.trial import Trial
+from protocol.values import Problem
+
+
+def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
+    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is told at a key that is given."""
+    rates = {
+        "minFrameRate": trial.min_frame_rate,
+        "startingFrameRate": trial.starting_frame_rate,
+        "maxFrameRate": trial.max_frame_rate,
+    }
+    low, start, high = rates
+    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
+    for lower, upper in pairs:
+        if rates[lower] <= rates[upper]:
+            continue
+        key = next(key for key in (start, low, high) if key in (lower, upper) and key in given)
+        other, bound = (upper, "most") if key == lower else (lower, "least")
+        default = "" if other in given else " by default"
+        hint = f"; set {other} too" if default else ""
+        sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
+        yield Problem((key,), sentence, (lower, upper))
+
+
+def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """Keys and labels name actions of actionSpace, if that is given."""
+    names = [action.lower() for action in trial.action_space]
+    if not names:
+        return
+    named = [("keys", (*place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
+    named += [("labels", (action,), action) for action in trial.labels]
+    for section, path, action in named:
+        if action in names:
+            continue
+        near = difflib.get_close_matches(action, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"the actions are {values.printable(', '.join(names), 100)}"
+        sentence = f"there is no action {values.show(action)} in actionSpace; {hint}"
+        yield Problem((section, *path), sentence, ("actionSpace", section))
+
+
+def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """Keys by player name players of `players`, if that is given."""
+    known = trial.player_names()
+    for player, keys in trial.keys.items():
+        if known and isinstance(keys, dict) and player not in known:
+            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
+            yield Problem(("keys", player), sentence, ("players", "keys"))
+
+
+def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    first: dict[str, int] = {}
+    for index, action in enumerate(trial.action_space):
+        name = action.lower()  # as the trial has it
+        if first.setdefault(name, index) != index:
+            sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
+            yield Problem(("actionSpace", index), sentence, ("actionSpace",))
+
+
+def _programs(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """A program that plays needs a way in."""
+    if trial.gym == "advise":
+        return
+    tables = trial.players.values() if who.by_group(trial.players) else [trial.players]
+    for table in tables:
+        for name, plays in table.items():
+            if plays.startswith(GYM_PLAYER):
+                yield Problem(("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",))
+                return
+
+
+RULES: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
+    _frame_rates,
+    _different_actions,
+    _actions_that_exist,
+    _players_of_keys,
+    _programs,
+)
