@@ -31,7 +31,7 @@ _PIECE = 256 * 1024  # bytes
 _LONGEST = 64 * 1024 * 1024  # bytes in a line
 _BIGGEST = 256 * 1024 * 1024  # bytes in an observation
 _DTYPE = re.compile(r"bool|(?:u?int|float)(8|16|32|64)")
-_MOST_PLAYERS = 64  # as many as `trial.players` may name
+MOST_PLAYERS = 64  # as many as `trial.players` may name
 _NOT_STORED = {"kind", "v", "session", "trial", "observation"}
 
 
@@ -94,7 +94,7 @@ def schema(players: tuple[str, ...] = ()) -> Any:
 def players_of(header: Mapping[str, Any]) -> tuple[str, ...]:
     """The players that the head of a recording names; empty if there is one."""
     players = header.get("players")
-    return tuple(map(str, players))[:_MOST_PLAYERS] if isinstance(players, Mapping) else ()
+    return tuple(map(str, players))[:MOST_PLAYERS] if isinstance(players, Mapping) else ()
 
 
 def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, shown: bool = True) -> Converted:
@@ -139,6 +139,8 @@ def convert(source: Path, target: Path, who: Mapping[str, Any], scrub: Scrub, sh
         done.episodes[0]["callbacks"] = done.callbacks  # in all of the file
     for episode in done.episodes:
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
+        episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}
+        episode["players"] = _who_plays(header, scrub)
     return done
 
 
@@ -231,6 +233,7 @@ def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
             done.episodes.append(now)
         now["frames"] += 1
         now["score"] += _number(line.get("reward")) or 0.0
+        _add_rewards(now["scores"], line.get("players"))
         now["ended"] = _text(line.get("time"))
     elif kind == "end" and now is not None and now["episode"] == _whole(number):
         now["why"] = _text(line.get("why")) or "?"
@@ -245,10 +248,32 @@ def _episode(line: Mapping[str, Any], number: int | None, seed: int | None) -> d
         "seed": seed,
         "frames": 0,
         "score": 0.0,
+        "scores": {},
         "why": None,
         "started": started,
         "ended": started,
     }
+
+
+def _add_rewards(scores: dict[str, float], players: Any) -> None:
+    """Add what each player of a step got; what is no number counts nothing, as in `score`."""
+    if isinstance(players, Mapping):
+        for name, did in itertools.islice(players.items(), MOST_PLAYERS):
+            reward = _number(did.get("reward")) if isinstance(did, Mapping) else None
+            scores[str(name)] = scores.get(str(name), 0.0) + (reward or 0.0)
+
+
+def _who_plays(header: Mapping[str, Any], scrub: Scrub) -> dict[str, str | None]:
+    """By player: `human`, or the policy or program as config.yml has it."""
+    players = header.get("players")
+    if not isinstance(players, Mapping):
+        return {}
+    found = {}
+    for name in players_of(header):
+        about = players.get(name)
+        said = about.get("policy", about.get("kind")) if isinstance(about, Mapping) else None
+        found[name] = scrub.value(said) if isinstance(said, str) else None
+    return found
 
 
 def _summed(problems: list[str]) -> list[str]:

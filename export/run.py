@@ -169,7 +169,9 @@ def _run(
         if options.long:
             written += tables.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
         if options.wanted.recordings:
-            written += tables.write(folder / "episodes", tables.EPISODES, tables.episodes(state), either)
+            players = tables.players(state)
+            rows = tables.episodes(state, players)
+            written += tables.write(folder / "episodes", tables.of_episodes(players), rows, either)
             if any(found.get("callbacks") for _, _, found in state.episodes()):
                 lines = tables.callbacks(state, folder)
                 written += tables.write(folder / "callbacks", tables.CALLBACKS, lines, either)

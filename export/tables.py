@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from export import scrub
-from export.recording import when
+from export.recording import MOST_PLAYERS, when
 from export.scrub import clean, texts
 from export.state import Person, State
 from hippodrome.model.project import Project
@@ -394,8 +394,20 @@ EPISODES = (
 )
 
 
-def episodes(state: State) -> Iterator[list[Any]]:
-    """One row per episode: its outcome, and where its frames are."""
+def players(state: State) -> tuple[str, ...]:
+    """Everyone who plays in some episode; none if no game has several players."""
+    names = (name for _, _, found in state.episodes() for name in (*found.get("players", ()), *found.get("scores", ())))
+    return tuple(dict.fromkeys(names))[:MOST_PLAYERS]
+
+
+def of_episodes(players: Sequence[str]) -> list[Column]:
+    """The columns of `episodes`."""
+    who = (Column(f"player.{clean(name)}") for name in players)
+    return [*EPISODES, *who, *(Column(f"score.{clean(name)}", "number") for name in players)]
+
+
+def episodes(state: State, players: Sequence[str]) -> Iterator[list[Any]]:
+    """One row per episode: its outcome, where its frames are, and of each player who played it and its score."""
     for person, path, found in state.episodes():
         yield [
             person.number,
@@ -410,6 +422,8 @@ def episodes(state: State) -> Iterator[list[Any]]:
             when(found["started"]),
             when(found["ended"]),
             path,
+            *(None if (who := found.get("players", {}).get(name)) is None else clean(who) for name in players),
+            *(found.get("scores", {}).get(name) for name in players),
         ]
 
 

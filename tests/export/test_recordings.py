@@ -252,6 +252,26 @@ def test_a_dataset_ends_where_the_human_left_the_game(tmp_path: Path, monkeypatc
     assert (episode.terminations.tolist(), episode.truncations.tolist()) == ([False] * 4, [False] * 3 + [True])
 
 
+def test_the_table_of_episodes_says_who_played_and_each_players_score(tmp_path: Path) -> None:
+    head = {"me": {"kind": "human"}, "it": {"kind": "policy", "policy": "policies/a.onnx", "sha256": "0"}}
+    did = {"me": {"action": 1, "by": "human", "reward": 2.0}, "it": {"action": 0, "by": "policy", "reward": -0.5}}
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=3, head={"players": head}, players=did)
+    (episode,) = rows(data(tmp_path, "--format", "csv,parquet") / "episodes.csv")
+    said = {name: episode[name] for name in ("player.me", "player.it", "score.me", "score.it")}
+    assert said == {"player.me": "human", "player.it": "policies/a.onnx", "score.me": "6.0", "score.it": "-1.5"}
+
+
+def test_a_score_beyond_all_numbers_is_missing_and_one_player_has_no_columns(tmp_path: Path) -> None:
+    did = {"me": {"reward": 1.0}, "it": {"reward": 1e308}}
+    head = {"me": {"kind": "human"}, "it": {"kind": "program"}}
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=2, head={"players": head}, players=did)
+    (episode,) = rows(data(tmp_path, "--format", "csv,parquet") / "episodes.csv")
+    assert (episode["player.it"], episode["score.it"], episode["score.me"]) == ("program", "", "2.0")
+    crowd(into_folder(tmp_path / "other" / "data"), tmp_path, 1, frames=2)
+    (alone,) = rows(data(tmp_path / "other", "--format", "csv,parquet") / "episodes.csv")
+    assert list(alone)[-1] == "file"
+
+
 def test_each_player_has_columns_and_a_dataset_is_of_the_first_human(tmp_path: Path, monkeypatch: Any) -> None:
     left, right = {"action": 1, "by": "human", "reward": 2.0}, {"action": None, "by": None, "reward": 0.5, "info": {}}
     head = {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "random"}}
