@@ -408,7 +408,7 @@ def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_client: A
             await old.until(lambda: old.state["state"] == "paused")
         async with open_client(server.address) as later:
             await later.hello()
-            await later.until(lambda: np.array_equal(later.frame, textured(later.frame)))
+            await later.until(lambda: later.frames and np.array_equal(later.frame, textured(later.frame)))
             assert later.kinds[0] == JPEG
             assert set(later.kinds[1:]) == {ROWS}
 
