@@ -124,7 +124,7 @@ class Game:
             if player.human:
                 actions[name] = self._press(allowed)
             elif name in self._policies:
-                action = self._asked(name, now) if self._due(step) else self._last.get(name, player.idle)
+                action = self._asked(name, now) if self._due(step) else self._between(player)
                 if action is None:
                     return None
                 actions[name] = action if action in allowed else allowed[0]
@@ -136,6 +136,10 @@ class Game:
         """Each action once in turn, then they are at random."""
         self._pressed += 1
         return self._pressed - 1 if self._pressed - 1 in allowed else self._random.choice(allowed)
+
+    def _between(self, player: Player) -> int:
+        """What a policy's player does between two choices: the last goes on, unless each press is one action."""
+        return player.idle if self._config.input == "single" else self._last.get(player.name, player.idle)
 
     def _due(self, step: int) -> bool:
         return self._config.pace == "turns" or step % self._config.frame_skip == 0

@@ -93,7 +93,8 @@ class JointCalls(Calls):
         self._give_feedback(call)
         joint = self._agent.step({player: action.index for player, action in actions.items()})
         pictures = self._agent.pictures()
-        self._tell_step({player: action.index for player, action in actions.items() if action.acts}, joint)
+        if self.callbacks:
+            self._tell_step({player: action.index for player, action in actions.items() if action.acts}, joint)
         asked, truncated = actions[first], joint.over and joint.why == "truncated"
         terminated = joint.over and not truncated
         line = recording.line(
@@ -130,8 +131,8 @@ class JointCalls(Calls):
         }
 
     def _tell_step(self, actions: Mapping[str, int], joint: Joint) -> None:
-        if self.callbacks:
-            self.callbacks.stepped(actions, joint.rewards, joint.observations, joint.infos)
+        assert self.callbacks is not None
+        self.callbacks.stepped(actions, joint.rewards, joint.observations, joint.infos)
 
     def _take_again(self, call: ReplayCall) -> Replayed:
         unfinished = call.unfinished
@@ -153,7 +154,8 @@ class JointCalls(Calls):
             rewards = {player: part.reward for player, part in step.players.items()}
             if joint.over or joint.rewards != rewards:
                 raise Diverged("it plays differently now")
-            self._tell_step(taken, joint)
+            if self.callbacks:
+                self._tell_step(taken, joint)
             acted_upon.see(number, joint)
             self._ended = _ended(joint)
         return Replayed(self._agent.pictures(), self._view(joint), acted_upon.by_player)

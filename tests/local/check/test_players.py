@@ -92,6 +92,14 @@ def test_whole_episodes_are_played(folder: Path, plays: str) -> None:
     assert (found, said) == ([], ["played: 3 of 3 episodes to the end, 60 steps"])
 
 
+@pytest.mark.parametrize(("input", "between"), [("held", 2), ("single", 0)])
+def test_between_two_choices_a_policy_does_what_it_does_on_a_server(folder: Path, input: str, between: int) -> None:
+    agent = folder / "agent.py"
+    takes = f'assert actions["right"] == (2 if self.n % 4 == 0 else {between}), actions\n        self.n += 1'
+    agent.write_text(agent.read_text().replace("self.n += 1", takes))
+    assert tried(folder, "agent:Partner", "maxEpisodes", f"frameSkip: 4\n  input: {input}\n  maxEpisodes") == []
+
+
 def test_players_that_the_environment_has_not_are_told_with_those_it_has(folder: Path) -> None:
     (line,) = tried(folder, "random", "right:", "rigth:")
     assert line.endswith('trial.players: names "rigth", but the environment has "left", "right"')
