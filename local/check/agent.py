@@ -168,6 +168,7 @@ class _Reading:
             *self._slow_policies(),
             *self._undrawn(),
             *self._idle(),
+            *self._turns(),
             *self._not_on_aws(),
         ]
 
@@ -263,6 +264,17 @@ class _Reading:
             f"{said}: {advice}"
         )
         return [self._in_config(("trial", "idleAction"), message, remark=True)]
+
+    def _turns(self) -> list[Diagnostic]:
+        """Players who take turns in real time. Told once, of the first group."""
+        config = self._config.trial
+        if not self._report.get("takeTurns") or self._group or config.pace != "realtime":
+            return []
+        message = (
+            f"realtime, but the players take turns: at {config.starting_frame_rate} steps a second, a participant who "
+            "presses nothing at once takes the idle action; write pace: turns, unless that is meant"
+        )
+        return [self._in_config(("trial", "pace"), message, remark=True)]
 
     def _plays(self, player: str) -> str:
         """What plays this player, as config.yml has it."""

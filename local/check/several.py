@@ -50,6 +50,7 @@ class Game:
         self._last: dict[str, int] = {}
         self._random = Random(1)  # noqa: S311 - the same each time
         self._pressed = 0
+        self._acted: set[frozenset[str]] = set()  # who was to act at the same time
         adapter.views = tuple(player.name for player in players if player.human)
 
     def load(self) -> bool:
@@ -79,6 +80,7 @@ class Game:
                 if over():
                     callbacks.session_ended()
                     return True
+                self._acted.add(now.to_act)
                 actions = self._actions(now, steps)
                 if actions is None:
                     return False
@@ -92,6 +94,7 @@ class Game:
                     return False
                 progress.pace.took(time.monotonic() - began)
                 progress.known["policies"] = {name: asdict(pace) for name, pace in self._paces.items()}
+                progress.known["takeTurns"] = self._take_turns()
                 callbacks.stepped(actions, now.rewards, now.observations, now.infos)
             progress.episodes = episode
             callbacks.episode_ended(now.why)
@@ -131,6 +134,10 @@ class Game:
             else:
                 actions[name] = player.idle if player.idle in allowed else allowed[0]
         return actions
+
+    def _take_turns(self) -> bool:
+        """Whether each step was taken by one player alone, and not always by the same."""
+        return len(self._acted) > 1 and all(len(together) == 1 for together in self._acted)
 
     def _press(self, allowed: Sequence[int]) -> int:
         """Each action once in turn, then they are at random."""

@@ -173,6 +173,20 @@ def test_a_policy_that_is_slower_than_a_step_is_remarked_with_its_time(folder: P
     assert tried(folder, "agent:Partner", "maxEpisodes: 3", "maxEpisodes: 1\n  pace: turns") == []
 
 
+def test_players_who_take_turns_in_real_time_are_remarked(folder: Path) -> None:
+    agent = folder / "agent.py"
+    turn = '    def to_act(self):\n        return [["left", "right"][self.n % 2]]\n\n    def render'
+    agent.write_text(AGENT.replace("    def render", turn))
+    (line,) = tried(folder, "random")
+    assert line.endswith(
+        "trial.pace: realtime, but the players take turns: at 30 steps a second, a participant who presses nothing at "
+        "once takes the idle action; write pace: turns, unless that is meant"
+    )
+    assert tried(folder, "random", "maxEpisodes", "pace: turns\n  maxEpisodes") == []
+    agent.write_text(AGENT.replace("    def render", turn.replace('[["left", "right"][self.n % 2]]', '["left"]')))
+    assert tried(folder, "random") == [], "the same player acts at each step"
+
+
 def test_what_the_agent_returns_of_players_that_there_are_not(folder: Path) -> None:
     (folder / "agent.py").write_text(AGENT.replace('{"left": 1}', '{"lift": 1}'))
     (line,) = tried(folder, "random")
