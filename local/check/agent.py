@@ -298,9 +298,13 @@ class _Reading:
             return self._actions()
         error = report.get("error")
         if error is None:
-            hung = self._hung()
-            if hung is not None or status is None:
-                return [self._at(hung, f"{call} has not come back within {self._seconds:g} s{self._where()}")]
+            stack = self._stack()
+            if stack or status is None:
+                hung, player = self._hung(stack), self._asked_policy()
+                message = f"{call} has not come back within {self._seconds:g} s{self._where()}"
+                if hung is None and player is not None:
+                    return [self._in_config(self._player(player), message)]
+                return [self._at(hung, message)]
             return [
                 self._at(
                     None, f"{call} ended Python itself ({_termination(status)}){self._where()}{self._last_words()}"
@@ -426,12 +430,15 @@ class _Reading:
     def _in_config(self, path: Keys, message: str, remark: bool = False) -> Diagnostic:
         return read_source(self._folder).diagnostic(path, message, remark=remark)
 
-    def _hung(self) -> tuple[str, int] | None:
-        """The line at which the code was when its time was over."""
+    def _stack(self) -> str:
+        """Where all threads were when the time was over; empty if it was not."""
         try:
-            stack = (self._place / "report.stack").read_text(errors="replace")
+            return (self._place / "report.stack").read_text(errors="replace")
         except OSError:
-            return None
+            return ""
+
+    def _hung(self, stack: str) -> tuple[str, int] | None:
+        """The line at which the project's code was then; None if it was not running."""
         frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
         ours = [(self._name(file.name), line) for file, line in frames if file.parent == self._code]
         return ours[0] if ours else None

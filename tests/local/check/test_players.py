@@ -72,14 +72,16 @@ def folder(tmp_path: Path) -> Path:
     return found
 
 
-def tried(folder: Path, plays: str, old: str = "", new: str = "", said: list[str] | None = None) -> list[str]:
+def tried(
+    folder: Path, plays: str, old: str = "", new: str = "", said: list[str] | None = None, seconds: float = 60
+) -> list[str]:
     """What is said of the study in which `plays` plays the right player, with a text of the `trial` section replaced."""
     file = folder / "config.yml"
     project = file.read_text().partition("\ntrial:")[0]
     assert old in TRIAL
     file.write_text(project + (TRIAL.replace(old, new) if old else TRIAL).replace("PLAYS", plays))
     say = (said if said is not None else []).append
-    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), 60, say)]
+    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds, say)]
 
 
 @pytest.mark.parametrize(
@@ -147,6 +149,13 @@ def test_a_policy_of_agent_py_that_fails_is_told_at_its_line(folder: Path, old: 
     (folder / "agent.py").write_text(AGENT.replace(old, new))
     (line,) = tried(folder, "agent:Partner")
     assert line.startswith(said)
+
+
+def test_a_file_that_takes_hours_is_told_where_config_yml_names_it(folder: Path) -> None:
+    onnx_files.endless(folder / "policies/p.onnx")
+    (line,) = tried(folder, "policies/p.onnx", seconds=3)
+    said = "trial.players.right: act() of policies/p.onnx has not come back within 3 s"
+    assert (line.startswith("config.yml:"), line.endswith(said)) == (True, True), line
 
 
 def test_each_group_is_tried_with_its_players(folder: Path) -> None:
