@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from trial.interactive_gym.playing import ExperimentAgent, Unplayable, mapping_o
 from trial.interactive_gym.remote_config import RemoteConfig
 
 _FASTEST = 240
+_WORDS = re.compile(r"_+|(?<=[a-z0-9])(?=[A-Z])")  # between the words of a name
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,17 @@ def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> l
         if len(set(named)) == actions:
             return named
     return [str(number) for number in range(actions)]
+
+
+def labels_of(names: Iterable[str], module: Mapping[str, Any]) -> dict[str, str]:
+    """What participants read instead of those actions' names that are written as one: `PickUp` is `Pick up`."""
+    found = {}
+    for name in names:
+        constant = next((key for key, value in module.items() if type(value) is int and key.lower() == name), name)
+        label = _WORDS.sub(" ", constant).lower().capitalize()
+        if " " in label:
+            found[name] = label
+    return found
 
 
 def _check(config: RemoteConfig) -> None:

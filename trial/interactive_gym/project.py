@@ -74,6 +74,9 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
         if page:
             files[f"steps/{name}.html"] = pages.with_files(page, find, files).encode()
     trial = trial_section(config, look, looking.names_of(config, look.actions, source.names))
+    labels = looking.labels_of(dict.fromkeys(trial.get("keys", {}).values()), source.names)
+    if labels:
+        trial["labels"] = labels
     if steps["instructions"]:
         trial["instructions"] = "instructions"
     if steps["between"]:

@@ -147,6 +147,16 @@ def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> Non
     assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
+def test_participants_read_the_words_of_an_actions_constant(tmp_path: Path) -> None:
+    source = ALONE.replace("LEFT, NOOP, RIGHT = 0, 1, 2", "MoveLeft, DO_NOTHING, RIGHT = 0, 1, 2")
+    source = source.replace("NOOP", "DO_NOTHING").replace("DO_DO_", "DO_").replace("LEFT", "MoveLeft")
+    project, _ = made(tmp_path, source)
+    trial = config_of(project)["trial"]
+    assert trial["actionSpace"] == ["moveleft", "do_nothing", "right"]
+    assert trial["labels"] == {"moveleft": "Move left"}, "no button for what has no key"
+    assert read_project(project).trial.labels == {"moveleft": "Move left"}
+
+
 def test_it_is_made_anew_and_what_was_changed_by_hand_stays(tmp_path: Path) -> None:
     project, _ = made(tmp_path)
     (project / "steps/welcome.html").write_text("<h1>Mine</h1>")
