@@ -317,6 +317,21 @@ def test_between_two_choices_the_last_action_goes_on_or_is_not_taken_again() -> 
         assert len(game.asks) == 2
 
 
+def test_a_policy_that_is_not_to_act_when_it_would_be_asked_is_asked_as_soon_as_it_is() -> None:
+    """Otherwise one that acts at odd steps would never be asked with frameSkip: 2."""
+    game = Game(frameSkip=2).playing(seen("me"))
+    acted = []
+    for to_act in ("it", "me") * 3:
+        if game.open_call is None:
+            game.wait(0.1)
+        acted.append(game.actions)
+        game.stepped(seen(to_act))
+        if to_act == "it":
+            game.acts(2)
+    assert acted == [{"me": (0, "none")}, {"it": (2, "policy")}] * 3
+    assert len(game.asks) == 3
+
+
 def test_a_policys_last_action_goes_on_on_the_next_server() -> None:
     game = Game(frameSkip=4)
     steps = [

@@ -51,6 +51,7 @@ class _Seat:
         self.asked: int | None = None  # the ask that has not been answered
         self.asked_at = 0.0
         self.asked_after = 0  # steps
+        self.due = False  # it is to be asked as soon as it is to act
         self.mask: Mask | None = None
         self.answer: int | None = None
         self.failed = False  # since the last step
@@ -107,8 +108,12 @@ class Policies:
         due = self._seconds is not None or steps % self._frame_skip == 0
         found = []
         for name, seat in self._seats.items():
-            if not due or name not in view.to_act or seat.player.by_program or seat.idles:
+            if seat.player.by_program or seat.idles:
                 continue
+            seat.due = seat.due or due
+            if name not in view.to_act or not seat.due:
+                continue
+            seat.due = False
             if self._seconds is None and (seat.asked is not None or seat.answer is not None):
                 continue  # it still thinks, or what came late is taken first
             self._asks += 1
