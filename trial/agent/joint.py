@@ -15,11 +15,9 @@ import numpy as np
 
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.environments import AecTurns, Players
-from trial.core.players import ACTION_MASK
+from trial.core.players import ACTION_MASK, ALL
 from trial.pictures.picture import Picture
 
-ALL = "__all__"
-"""In what an environment returns, a key beside the players: the value for all of them (RLlib's `MultiAgentEnv`)."""
 TO_ACT = "to_act"
 
 

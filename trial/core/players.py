@@ -16,6 +16,9 @@ PLAYER = "player_0"
 NOOP = "noop"
 """The action of no key, if the environment has one of this name and `idleAction` names no other."""
 
+ALL = "__all__"
+"""In what an environment returns, a key beside the players: the value for all of them (RLlib's `MultiAgentEnv`)."""
+
 ACTION_MASK = "action_mask"
 """Under this key an info or an observation says which actions are legal now."""
 

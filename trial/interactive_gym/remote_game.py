@@ -7,6 +7,8 @@ import uuid
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from trial.core.players import ALL
+
 
 class GameStatus:
     """Where the game is."""
@@ -91,10 +93,9 @@ class RemoteGame:
     @property
     def over(self) -> bool:
         """The episode has ended for all."""
-        return _all(self.terminateds) or _all(self.truncateds)
-
-
-def _all(ended: Any) -> bool:
-    if isinstance(ended, Mapping):
-        return bool(ended.get("__all__", bool(ended) and all(ended.values())))
-    return bool(ended)
+        said = (self.terminateds, self.truncateds)
+        if not all(isinstance(each, Mapping) for each in said):
+            return any(map(bool, said))
+        players = {player for each in said for player in each} - {ALL}
+        each_ended = all(any(each.get(player) for each in said) for player in players)
+        return any(each.get(ALL) for each in said) or (bool(players) and each_ended)

@@ -165,6 +165,25 @@ def test_the_game_keeps_interactive_gyms_books() -> None:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("terminated", "truncated", "over"),
+    [
+        ({"a": True, "b": False}, {"a": False, "b": True}, True),
+        ({"a": True, "b": False, "__all__": False}, {"a": False, "b": True, "__all__": False}, True),
+        ({"a": True, "b": False}, {"a": False, "b": False}, False),
+        ({"__all__": True}, {"__all__": False}, True),
+        ({}, {}, False),
+    ],
+)
+def test_a_game_is_over_when_each_player_has_ended_in_one_way_or_the_other(
+    terminated: dict[str, bool], truncated: dict[str, bool], over: bool
+) -> None:
+    game = RemoteGame(RemoteConfig(), None, {"a": "human", "b": "model"})
+    game.began({}, {})
+    game.stepped({"a": 0, "b": 0}, ({}, {"a": 0.0, "b": 0.0}, terminated, truncated, {}))
+    assert game.over is over
+
+
 def test_a_single_players_reward_is_a_number() -> None:
     game = RemoteGame(RemoteConfig(), None, {"human": "human"})
     game.began(0, {})
