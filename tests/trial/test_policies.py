@@ -300,6 +300,15 @@ def test_observations_of_another_size(tmp_path: Path) -> None:
     assert refusal("p.onnx", tmp_path, space=Box(0, 255, (84, 84, 3), np.uint8)).endswith("gives 84 x 84 x 3")
 
 
+def test_a_file_of_a_fixed_batch_says_how_to_export_it(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "p.onnx", WEIGHTS, shape=(32, 2))
+    assert refusal("p.onnx", tmp_path, space=Box(-1, 1, (2,))) == (
+        "p.onnx takes observations of 32 x 2 (its input 'obs'); the environment gives 2 numbers; "
+        "32 is its batch: export it with a batch of 1, or of any size (dynamic axes)"
+    )
+    assert "batch" not in refusal("p.onnx", tmp_path, space=Box(-1, 1, (16,)))
+
+
 def test_another_number_of_actions(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     assert refusal("p.onnx", tmp_path, 6) == "p.onnx returns 3 numbers as 'output'; expected 6, one for each action"

@@ -43,7 +43,8 @@ def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bo
         print(f"Remark: {remark}")
     folder = shlex.quote(str(made.folder))
     print(f"The project is in {made.folder}.")
-    print(f"Check it with `make check PROJECT={folder}`; deploy it as docs/aws-project.md says.", flush=True)
+    check = f"make -C {shlex.quote(str(_HIPPODROME))} check PROJECT={folder}"
+    print(f"Check it with `{check}`; deploy it as docs/aws-project.md says.", flush=True)
     if serve:
         _hold(made.folder, game.port)
     return made.folder

@@ -281,9 +281,17 @@ def _fit(spec: str, values: Array, port: _Port) -> Array:
     if found is None:
         raise PolicyError(
             f"{spec} takes observations of {shown(port.shape)} (its input {port.name!r}); "
-            f"the environment gives {shown(values.shape)}"
+            f"the environment gives {shown(values.shape)}{_fixed_batch(values, port)}"
         )
     return np.ascontiguousarray(found, port.dtype)
+
+
+def _fixed_batch(values: Array, port: _Port) -> str:
+    """What to do about a file that takes several observations at once and no fewer; empty for any other."""
+    batch = port.shape[0] if len(port.shape) > 1 else 1
+    if not isinstance(batch, int) or batch == 1 or fitted(values, (1, *port.shape[1:])) is None:
+        return ""
+    return f"; {batch} is its batch: export it with a batch of 1, or of any size (dynamic axes)"
 
 
 def _drawn(values: Array, allowed: list[int], random: Random) -> int:
