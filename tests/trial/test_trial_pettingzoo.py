@@ -46,6 +46,7 @@ def test_a_game_in_turns_against_a_file_with_legal_actions_alone(launch: Any, op
     assert len(client.errors) == 1, "square 8 is taken"
     (lines,) = server.recordings().values()
     head = lines[0]
+    assert {"pettingzoo", "onnxruntime"} <= head["versions"].keys()
     assert head["players"]["player_1"] == {"kind": "human"}
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
     assert head["players"]["player_2"] == {"kind": "policy", "policy": "policies/p.onnx", "sha256": sha256}

@@ -98,7 +98,7 @@ class Recorder:
             actionBufferLifespan=config.action_buffer_lifespan,
             episode=opening.episode,
             seed=opening.seed,
-            versions=recording.versions(),
+            versions=recording.versions(recording.OF_SEVERAL if players else ()),
         )
         self._recording.add(header)
 

@@ -19,7 +19,7 @@ import platform
 import threading
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -91,10 +91,14 @@ def read_observation(kept: Any) -> Any:
     return np.frombuffer(pixels, dtype=np.dtype(kept["dtype"])).reshape(kept["shape"])
 
 
-def versions() -> dict[str, str]:
-    """Versions of what may change how a game plays."""
+OF_SEVERAL = ("pettingzoo", "onnxruntime")
+"""Packages that may change how a game of several players plays."""
+
+
+def versions(more: Iterable[str] = ()) -> dict[str, str]:
+    """Versions of what may change how a game plays; of these packages, too, as far as they are installed."""
     found = {"trial": VERSION, "python": platform.python_version()}
-    for name in ("gymnasium", "ale-py", "numpy", "websockets"):
+    for name in ("gymnasium", "ale-py", "numpy", "websockets", *more):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
