@@ -84,6 +84,14 @@ def test_on_a_small_phone_held_sideways_all_buttons_can_be_reached(world: World,
     assert overflow(phone) == [0, 0]
 
 
+def test_words_above_the_picture_go_on_in_a_second_line(world: World, phone: Any) -> None:
+    play(world, phone, (568, 320), {"pace": "turns", "scene": {"width": 640, "height": 320}}, ["left", "start"])
+    tell(world, state="playing", toAct=True, score=123456, episodeScore=123456)
+    phone.wait_for_selector("#total:text('Total 123,456')")
+    shot(phone, "568-turns")
+    assert all(box(phone, f"#{each}")["x"] + box(phone, f"#{each}")["width"] <= 568 for each in ("turn", "scene-hud"))
+
+
 JUMPS = {"keys": {"ArrowLeft": "left", "ArrowUp": "up", "ArrowRight": "right"}}
 
 
@@ -127,6 +135,32 @@ def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: Wor
     tell(world, state="paused")
     phone.wait_for_selector("#overlay-title:text('Paused')")
     assert box(phone, "#overlay")["height"] == box(phone, "#screen")["height"]
+
+
+def test_a_page_that_is_twice_as_large_has_the_picture_beside_the_buttons_and_the_keys_below_these(
+    world: World, chromium: Any
+) -> None:
+    """As at a window of 1280 by 800 pixels and a zoom of 200 %."""
+    context = chromium.new_context(viewport={"width": 640, "height": 400}, device_scale_factor=2)
+    page = context.new_page()
+    play(world, page, (640, 400), JUMPS, ["up", "left", "right", "start", "pause"])
+    shot(page, "640-zoom")
+    picture, buttons, keys = (box(page, each) for each in ("#screen", "#controls", "#legend"))
+    context.close()
+    assert picture["width"] > 360
+    assert picture["x"] + picture["width"] <= buttons["x"]
+    assert keys["y"] >= buttons["y"] + buttons["height"]
+    assert abs(keys["x"] + keys["width"] / 2 - buttons["x"] - buttons["width"] / 2) < 20
+
+
+def test_the_last_picture_is_covered_by_no_message_and_its_score_is_announced(world: World, phone: Any) -> None:
+    play(world, phone, (360, 640), {}, ALL)
+    world.connections[0].send(json.dumps({"error": "That move is not possible now"}))
+    phone.wait_for_selector("#trouble:text('not possible')")
+    world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 3}))
+    phone.wait_for_selector("#overlay-title:text('The game is over')")
+    assert phone.inner_text("#trouble") == ""
+    assert phone.inner_text("#announce") == "Your total score in 3 games: 21"
 
 
 # Bad Wi-Fi

@@ -1,5 +1,5 @@
 // The end: the last picture with the score, then a section that stays until the next page of the study can be loaded.
-import { showOverlay } from "./overlay.js";
+import { hideMessage, showOverlay } from "./overlay.js";
 import { find, points, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause } from "./requests.js";
 
@@ -27,7 +27,8 @@ export async function leave({ score, episodes } = {}) {
 // Resolves when it has been seen.
 function lastPicture(text) {
   showOverlay("over");
-  setText(find("overlay-score"), text);
+  hideMessage();
+  for (const id of ["overlay-score", "announce"]) setText(find(id), text);
   return new Promise((resolve) => {
     setTimeout(resolve, SHOWN);
     find("overlay-button").addEventListener("click", resolve);

@@ -8,6 +8,12 @@ let turnEndsAt = null;
 let wasMine = false;
 
 document.querySelector(".hud").append(turn);
+const turnSheet = new CSSStyleSheet(); // pages of other games need none of it
+turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
+.hud #turn { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
+#turn.mine { color: var(--ink); font-weight: 600; }
+@media (min-aspect-ratio: 5/4) { .hud #turn { flex: none; text-align: inherit; } }`);
+document.adoptedStyleSheets = [...document.adoptedStyleSheets, turnSheet];
 // A press that starts the game, or goes on with it, is no move.
 hooks.starts = () => true;
 
