@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from protocol import exits
 from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import MOST_VALUES, NAMES, About, Callbacks, Session, listening
 from trial.recordings import recording
@@ -108,6 +109,27 @@ def test_what_they_return_and_record_becomes_lines():
     callbacks.close()
 
 
+def test_what_a_callback_changes_of_its_session_changes_no_record():
+    class Agent:
+        def on_tick(self, session):
+            for given in (session.actions, session.rewards, session.observations, session.infos, session.scores):
+                given.clear()
+
+    callbacks, raised = made(Agent())
+    values = [{"player_0": value} for value in (2, 1.5, "seen", {"t": 1})]
+    callbacks.episode_began(1, {}, {})
+    callbacks.stepped(*values)
+    assert values == [{"player_0": value} for value in (2, 1.5, "seen", {"t": 1})]
+    assert raised == []
+    callbacks.close()
+
+
+def test_a_callback_that_cannot_even_be_looked_up_is_an_error_of_the_agents_start(launch, grid):
+    server = launch(grid(5) + "\nclass Agent(Agent):\n    on_join = property(lambda self: 1 / 0)\n")
+    assert server.wait() == exits.NO_AGENT
+    assert "the agent cannot be started" in server.said()
+
+
 def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
     class Agent:
         def on_feedback(self, session, player, word):
@@ -131,7 +153,12 @@ def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
     callbacks.close()
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), SystemExit(3), KeyboardInterrupt()])
+class Wordless(Exception):
+    def __str__(self):
+        raise SystemExit
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), SystemExit(3), KeyboardInterrupt(), Wordless()])
 def test_a_callback_that_raises_is_told_once_and_called_again(error):
     calls = []
 

@@ -248,10 +248,10 @@ class Callbacks:
             humans=about.humans,
             episode=now.episode,
             ticks=now.ticks,
-            actions=now.actions,
-            rewards=now.rewards,
-            observations=now.observations,
-            infos=now.infos,
+            actions=dict(now.actions),  # copies: what a callback does with them changes no record
+            rewards=dict(now.rewards),
+            observations=dict(now.observations),
+            infos=dict(now.infos),
             scores=dict(now.scores),
             why=now.why,
             replaying=self.replaying,
@@ -383,5 +383,5 @@ def _nowhere(name: str, value: Any) -> None:
 def _words(error: BaseException) -> str:
     try:
         return str(error)
-    except Exception:  # noqa: BLE001 - the researcher's errors may raise anything
+    except BaseException:  # noqa: BLE001 - the researcher's errors may raise anything
         return ""

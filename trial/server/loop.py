@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
-from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import About, Callbacks
 from trial.agent.calls import AgentCalls, Calls
 from trial.agent.joint import JointAdapter
@@ -166,7 +165,7 @@ class TrialLoop:
         recorded = await self._recorder.recorded()
         self._calls = self._calls_of(started, table.players)
         self._seats.fill(table.players, table.policies)
-        self._find_callbacks(started.agent, table.players)
+        self._find_callbacks(started, table.players)
         self._apply(self.core.start(table.players, recorded, self._loop.time()))
 
     async def _table(self, started: Started) -> Table | None:
@@ -244,15 +243,14 @@ class TrialLoop:
     def _call(self, call: Call) -> None:
         self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
 
-    def _find_callbacks(self, agent: AgentAdapter | JointAdapter, players: Sequence[Player]) -> None:
-        """The agent has started: see which callbacks it has."""
-        settings, loop = self._settings, self._loop
-        found = agent.callbacks
-        if not found:
+    def _find_callbacks(self, started: Started, players: Sequence[Player]) -> None:
+        """The agent has started: from now on its callbacks are called, if it has some."""
+        settings, loop, agent = self._settings, self._loop, started.agent
+        if not started.callbacks:
             return
         self.core.callbacks = True
         self._callbacks = self._calls.callbacks = Callbacks(
-            found,
+            started.callbacks,
             About(
                 self.core.id,
                 self.core.step,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from trial.agent import starting
 from trial.agent.agent import AgentAdapter
@@ -28,6 +29,8 @@ class Started:
 
     settings: Settings
     agent: AgentAdapter | JointAdapter
+    callbacks: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    """Those that the agent has."""
     _loaded: dict[int | None, Table] = field(default_factory=dict)
 
     @classmethod
@@ -37,7 +40,8 @@ class Started:
         Raises PlayersError and PolicyError with a sentence, AgentError, and whatever the researcher's code raises.
         """
         config = settings.trial
-        started = cls(settings, starting.start(adapter, config.player_names()))
+        agent = starting.start(adapter, config.player_names())
+        started = cls(settings, agent, agent.callbacks)
         groups: Iterable[int | None] = config.groups() if settings.warm_server else ()
         for group in groups or (settings.group,):
             started._loaded[started._key(group)] = started._load(group)
