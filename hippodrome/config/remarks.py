@@ -10,6 +10,7 @@ from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import Source, read_source
 from protocol import keyboard
+from protocol.players import HUMAN
 from protocol.values import printable
 
 START: Keys = ("project", "events", "startServerStep")
@@ -25,6 +26,7 @@ PARTS = frozenset({*ARROWS, "fire"})
 """Keys that act together with others: "up" and "right" are "upright" (`trial/core/controls.py`)."""
 
 KEYS: Keys = ("trial", "keys")
+PLAYERS: Keys = ("trial", "players")
 
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = "no effect: servers get the certificate of the installation"
@@ -111,6 +113,19 @@ def combined_after_single(config: Config) -> Iterator[Remark]:
                 yield Remark((*KEYS, *path, combined), said)
 
 
+def several_humans(config: Config) -> Iterator[Remark]:
+    """What to say about players whom no participant plays: there is one participant in a game."""
+    groups = config.trial.groups()
+    for group in groups or (None,):
+        names = [name for name, plays in config.trial.players_of(group).items() if plays == HUMAN]
+        if len(names) > 1:
+            said = (
+                f"{len(names)} players are human ({printable(', '.join(names), 100)}), and a game has one participant"
+            )
+            advice = "let the others be played by a policy, random or idle"
+            yield Remark((*PLAYERS, *([] if group is None else [str(group)])), f"{said}, who plays the first; {advice}")
+
+
 def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
     """What to say about keys of actions that the environment does not have, whose names it gives itself."""
     if config.trial.keys_differ:
@@ -143,6 +158,7 @@ def remarks(config: Config) -> Iterator[Remark]:
         links = "; signedLinks does not protect the game then" if config.project.signed_links else ""
         yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")
     yield from combined_after_single(config)
+    yield from several_humans(config)
     idle = without_a_key(config)
     if idle is not None:
         yield idle

@@ -537,6 +537,19 @@ def test_with_keys_the_arrows_of_ui_are_not_remarked(folder: Path) -> None:
     assert looked(folder) == []
 
 
+def test_players_whom_no_participant_plays_are_remarked(folder: Path) -> None:
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  players: {a: human, b: human, c: idle}")
+    (line,) = looked(folder)
+    assert line.endswith(
+        "remark: trial.players: 2 players are human (a, b), and a game has one participant, who plays the first; "
+        "let the others be played by a policy, random or idle"
+    )
+    groups = "players: {0: {a: human, b: random}, 1: {a: human, b: human}}"
+    config(folder, "players: {a: human, b: human, c: idle}", groups)
+    (line,) = looked(folder)
+    assert "trial.players.1: 2 players are human" in line
+
+
 def test_keys_that_act_before_their_combination_are_remarked(folder: Path) -> None:
     keys = "keys: {a: left, b+a: noop, c+d: noop}"
     config(folder, "actionSpace: [noop, left]", f"actionSpace: [noop, left]\n  {keys}")
