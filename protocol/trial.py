@@ -66,9 +66,9 @@ def _whole(low: int, high: int, default: int | None, meaning: str) -> Any:
     return _key(values.whole(low, high), default, meaning, schema)
 
 
-def _seconds(most: int, default: float, meaning: str) -> Any:
-    """Seconds from 0."""
-    return _key(values.number(0, most), default, meaning, {"type": "number", "minimum": 0, "maximum": most})
+def _seconds(most: int, default: float, meaning: str, *, least: float = 0) -> Any:
+    """Seconds, from `least` on."""
+    return _key(values.number(least, most), default, meaning, {"type": "number", "minimum": least, "maximum": most})
 
 
 def _choice(words: tuple[str, ...], meaning: str) -> Any:
@@ -318,6 +318,7 @@ class Trial:
         600,
         10,
         "With pace: turns, the seconds that a policy may think; then the idle action is taken.",
+        least=0.01,  # with 0, which elsewhere is no limit, each action would come late
     )
     seed: int | None = _whole(
         0,

@@ -151,6 +151,11 @@ def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
     assert [problem.path for problem in problems] == [()]
 
 
+def test_a_policy_that_may_not_think_at_all_is_a_mistake() -> None:
+    (problem,) = trial_check.check({"policySeconds": 0})[1]
+    assert problem.path == ("policySeconds",)
+
+
 @pytest.mark.parametrize(("seconds", "fits"), [(-0.5, False), (0, True), (600, True), (600.5, False)])
 def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) -> None:
     told, made = registered({"game": "x/Y-v0", "betweenEpisodes": seconds}), started({"betweenEpisodes": seconds})
