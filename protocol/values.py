@@ -140,7 +140,7 @@ def whole(low: int, high: int | None = None) -> Check:
     return check
 
 
-def number(low: int, high: int) -> Check:
+def number(low: float, high: int) -> Check:
     """A check for a number from `low` to `high`, also as text; a whole one is returned as an int."""
 
     def check(value: object) -> float:
