@@ -85,11 +85,12 @@ def test_on_a_small_phone_held_sideways_all_buttons_can_be_reached(world: World,
 
 
 def test_words_above_the_picture_go_on_in_a_second_line(world: World, phone: Any) -> None:
-    play(world, phone, (568, 320), {"pace": "turns", "scene": {"width": 640, "height": 320}}, ["left", "start"])
+    play(world, phone, (568, 320), {"pace": "turns", "scene": {"width": 640, "height": 480}}, ALL)
     tell(world, state="playing", toAct=True, score=123456, episodeScore=123456)
     phone.wait_for_selector("#total:text('Total 123,456')")
     shot(phone, "568-turns")
     assert all(box(phone, f"#{each}")["x"] + box(phone, f"#{each}")["width"] <= 568 for each in ("turn", "scene-hud"))
+    assert overflow(phone) == [0, 0]
 
 
 JUMPS = {"keys": {"ArrowLeft": "left", "ArrowUp": "up", "ArrowRight": "right"}}

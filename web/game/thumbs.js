@@ -6,7 +6,7 @@ const css = `
   .pad .right { grid-area: 1 / 2; }
   .pad .up { grid-area: 1 / 4; }
 }
-@media (pointer: coarse) and (min-aspect-ratio: 5/4) { .pad { --thumb: var(--key); } }
+@media (pointer: coarse) and (min-aspect-ratio: 5/4) { .pad { --thumb: calc(1.1 * var(--key)); } }
 @media (pointer: coarse) and (min-aspect-ratio: 5/4) and (max-height: 34rem) {
   .wide .board { grid-template: "hud hud hud" "walk room jump" minmax(13rem, 1fr) / 7.2rem minmax(0, 1fr) 7.2rem; }
   .wide .controls { grid-area: 2 / 1 / 3 / 4; justify-content: end; width: auto; max-width: none; pointer-events: none; }
