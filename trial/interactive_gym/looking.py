@@ -148,6 +148,10 @@ def _count(env: Any, player: Any, *, several: bool) -> int:
     space = env.action_space(player) if several else space_of(env, "action_space", player)
     count = getattr(space, "n", None)
     if count is None:
-        shown = "unknown" if space is None else str(space)[:80]
-        raise Unplayable(f"the actions of {player} must be numbered (a Discrete space); they are {shown}")
+        if space is None:
+            raise Unplayable(
+                f"the environment does not say which actions {player!r} has: let action_space be a map that has the "
+                f"key {player!r}, or a method, and its value a Discrete space"
+            )
+        raise Unplayable(f"the actions of {player} must be numbered (a Discrete space); they are {str(space)[:80]}")
     return int(count)

@@ -223,6 +223,14 @@ def test_what_cannot_be_is_a_sentence(tmp_path: Path, old: str, new: str, said: 
     assert said in refused(tmp_path, source)
 
 
+def test_an_environment_that_does_not_say_which_actions_a_player_has(tmp_path: Path) -> None:
+    made_by = "env_creator=env_creator"
+    source = ALONE.replace(
+        "config = (", "class Env(gymnasium.Env):\n    action_space = {'0': 1}\n\n\nconfig = ("
+    ).replace(made_by, "env_creator=lambda **_: Env()")
+    assert "the environment does not say which actions 'human' has" in refused(tmp_path, source)
+
+
 def test_a_config_that_is_no_variable_of_the_file_is_refused(tmp_path: Path) -> None:
     source = ALONE.replace("config = (", "def build(): return (")
     write(tmp_path, source)
