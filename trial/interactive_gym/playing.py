@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from protocol import environment as variables
-from trial.interactive_gym import callback as ig_callback
 from trial.interactive_gym.configuration_constants import PolicyTypes
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.remote_game import RemoteGame
@@ -244,16 +243,6 @@ def located(folder: Path) -> Callable[[Any], Any]:
         return name
 
     return locate
-
-
-def events_of(callback: Any) -> list[str]:
-    """The events of Interactive Gym that a callback handles with a method of its own."""
-    plain = ig_callback.GameCallback
-    return [
-        event
-        for event in ig_callback.EVENTS
-        if getattr(type(callback), event, None) not in (None, getattr(plain, event))
-    ]
 
 
 def _has_players(env: Any) -> bool:

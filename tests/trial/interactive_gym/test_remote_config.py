@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import trial
-from trial.interactive_gym import callback, object_contexts, options, playing
+from trial.interactive_gym import callback, object_contexts, options
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.pictures.scene import as_scene
 
@@ -204,4 +204,3 @@ def test_several_callbacks_are_told_in_turn() -> None:
     both.on_game_tick_end("the game")
     both.on_episode_start("the game")
     assert told == [("first", "the game"), ("second", "the game")]
-    assert playing.events_of(First()) == ["on_game_tick_end"]
