@@ -45,6 +45,9 @@ def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:
     return struct.pack("!BIHHB", last is not None, frame_id, 2, 2, 3) + deflate.compress(body) + deflate.flush()
 
 
+PLAYING = {"state": "playing", "episode": 1, "score": 70, "frameRate": 30}
+
+
 @dataclass
 class World:
     """A control plane that shows what it is told to, and a trial server that notes what it hears."""
@@ -66,6 +69,8 @@ class World:
     """What the trial server says of the controls besides the usual."""
     spoken: str = "hippodrome.1"
     """The subprotocol of the trial server."""
+    stands: dict[str, Any] = field(default_factory=lambda: PLAYING)
+    """Where the trial stands: what its server answers to a page that has heard nothing for some time."""
     url: str = ""
     game_url: str = ""
 
@@ -109,8 +114,11 @@ class World:
                 connection.send(json.dumps(controls))
                 connection.send(pack(1, RED * 4))
                 connection.send(pack(2, BLUE * 4, RED * 4))
-            elif message.get("command") in ("start", "requestUI"):
-                connection.send(json.dumps({"state": "playing", "episode": 1, "score": 70, "frameRate": 30}))
+            elif message.get("command") == "requestUI":
+                connection.send(json.dumps(self.stands))
+            elif message.get("command") == "start":
+                self.stands = PLAYING
+                connection.send(json.dumps(PLAYING))
             elif message.get("command") == "pause":
                 connection.send(json.dumps({"state": "paused", "episode": 1, "score": 70, "frameRate": 30}))
 
@@ -570,7 +578,10 @@ def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None
 
 
 def tell(world: World, **said: Any) -> None:
-    world.connections[0].send(json.dumps({"frameRate": 30, "episode": 1, "score": 70, "episodeScore": 30, **said}))
+    said = {"frameRate": 30, "episode": 1, "score": 70, "episodeScore": 30, **said}
+    if "state" in said:
+        world.stands = {name: value for name, value in said.items() if name not in ("nextIn", "startsIn", "timeLeft")}
+    world.connections[0].send(json.dumps(said))
 
 
 def test_the_header_has_the_score_of_this_game_and_the_total(world: World, tab: Any) -> None:

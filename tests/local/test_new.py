@@ -56,16 +56,16 @@ def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None
     ("variables", "first"),
     [
         ((), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
-        (("PROJECT=../x",), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
-        (("PROJECT=../x", "TEMPLATE=pacman"), "There is no template pacman."),
+        (("PROJECT={folder}",), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
+        (("PROJECT={folder}", "TEMPLATE=pacman"), "There is no template pacman."),
     ],
 )
-def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str) -> None:
-    done = make_new(*variables)
+def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str, tmp_path: Path) -> None:
+    done = make_new(*(variable.format(folder=tmp_path / "x") for variable in variables))
     assert done.returncode != 0
     assert done.stdout.splitlines()[0] == first
     assert re.search(rf"^  {TOP} +Learning to play Ms\. Pac-Man$", done.stdout, re.MULTILINE)
-    assert not (ROOT.parent / "x").exists()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("variables", [(), ("PROJECT=",), ("PROJECT=.",)])
