@@ -140,7 +140,7 @@ class Game:
 
     async def _told(self, message: dict[str, Any]) -> None:
         play = self._play
-        if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # which whoever presses keys at random hears
+        if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # a bot that presses keys at random hears that one
             self._account.troubles.append(f"the game says: {message['error']}")
         if "UI" in message:
             self._turns = message.get("pace") == "turns"

@@ -149,7 +149,7 @@ def test_players_who_leave_before_the_others_are_not_to_act_any_more(tmp_path: P
     """PettingZoo takes them out of `agents`."""
     steps = played(joint(tmp_path, game="pettingzoo.butterfly.knights_archers_zombies_v11"), 1)
     left = [step for step in steps if 0 < len(step.to_act) < 4]
-    assert left, "with this seed, somebody dies early"
+    assert left, "with this seed, a player leaves early"
     for step in left:
         gone = {player for player in step.terminated if step.terminated[player] or step.truncated[player]}
         assert gone.isdisjoint(step.to_act)
