@@ -16,7 +16,21 @@ from rich.console import Console
 from bench import table
 from bench.table import Row
 
-GROUPS = ("control", "functions", "stack", "pages", "trial", "load", "scenes", "scale", "warm", "data", "gym")
+GROUPS = (
+    "control",
+    "functions",
+    "stack",
+    "pages",
+    "trial",
+    "load",
+    "scenes",
+    "together",
+    "scale",
+    "sessions",
+    "warm",
+    "data",
+    "gym",
+)
 WIDTH = 132  # characters, where no terminal says otherwise
 
 

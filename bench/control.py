@@ -27,6 +27,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from bench.table import Row, each, row
+from bench.trial_server import trial_server
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.log import logger
@@ -548,40 +549,23 @@ def cold_start() -> Iterator[Row]:
 
 def calls_of_the_trial() -> Iterator[Row]:
     """S3 calls of a trial server itself: a real one, over TLS, from its certificate to the end of its first game."""
-    with moto_server() as server, tempfile.TemporaryDirectory() as folder:
+    with moto_server() as server:
         chain, private = _certificate()
         server.put("SSL/fullchain.pem", chain)
         server.put("SSL/privkey.pem", private)
         before = len(server.requests())
-        env = {
-            **server.env,
-            "PROJECT_ID": "bench",
+        trial = {"game": "ALE/MsPacman-v5", "maxEpisodes": 1, "ui": {"start": True, "stop": True}}
+        variables = {
             "USER_ID": "P1",
-            "SERVER": "bench",
-            "TOKEN": "bench",
             "GAME_STEPS": "3",
-            "STORE": "s3://hippodrome",
-            "TRIAL": json.dumps({"game": "ALE/MsPacman-v5", "maxEpisodes": 1, "ui": {"start": True, "stop": True}}),
             "SSL_BUCKET": "hippodrome",
             "SSL_FULLCHAIN": "SSL/fullchain.pem",
             "SSL_PRIVKEY": "SSL/privkey.pem",
-            "HOST": "127.0.0.1",
-            "PORT": "0",
             "TLS": "on",
-            "AGENT_DIR": str(ROOT),
-            "PYTHONPATH": str(ROOT),
         }
-        process = subprocess.Popen(
-            [sys.executable, "-m", "trial"], cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-        try:
-            assert process.stdout is not None
-            port = json.loads(process.stdout.readline())["port"]
+        with trial_server(ROOT, "s3://hippodrome", trial, inherited=server.env, **variables) as (port, process):
             asyncio.run(asyncio.wait_for(_play(port), 60))
             process.wait(60)
-        finally:
-            process.kill()
-            process.wait()
         requests = [request.replace("/hippodrome/", "") for request in server.requests()[before:]]
     detail = {"each": ", ".join(requests), "more": "1 for each further recording; 2 an hour to renew the certificate"}
     yield row("S3 calls of the trial server, one episode", len(requests), "calls", detail=detail)

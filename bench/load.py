@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import json
 import os
 import random
@@ -16,7 +17,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from bench import seen
+from bench.interpreter import interpreter
 from bench.pictures import GAME, ROOT
 from bench.table import Row, each, row
 from trial.recordings import recording
@@ -95,56 +97,101 @@ class Played:
     resident: float
 
 
-async def play(url: str, count: list[int]) -> None:
-    """Play until it is cancelled; the number of frames goes into `count`."""
+def frame_id(data: bytes) -> int:
+    """The number of the picture in a binary message."""
+    return int(_ID.unpack_from(data)[1])
+
+
+@dataclass
+class Count:
+    """What came to one client."""
+
+    pictures: int = 0
+    bytes: int = 0
+
+
+@dataclass
+class Delivered:
+    """What one server delivered while it was measured: to each of its clients. `cpu` is seconds."""
+
+    due: float  # pictures
+    clients: list[Count]
+    cpu: float
+
+
+async def play(url: str, count: Count) -> None:
+    """Play until it is cancelled."""
     keys = random.Random(7)
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.2")], max_size=None, compression=None, open_timeout=60
     ) as client:
         await client.send(json.dumps({"userId": "bench", "token": "bench"}))
         async for data in client:
+            count.bytes += len(data)
             if isinstance(data, str):
                 continue
-            count[0] += 1
-            await client.send(json.dumps({"ack": _ID.unpack_from(data)[1]}))
-            if count[0] == 1:
+            count.pictures += 1
+            await client.send(json.dumps({"ack": frame_id(data)}))
+            if count.pictures == 1:
                 await client.send(json.dumps({"command": "start"}))
-            elif count[0] % 20 == 0:
+            elif count.pictures % 20 == 0:
                 await client.send(json.dumps({"action": keys.choice(ACTIONS[1:]), "held": keys.random() < 0.5}))
 
 
-async def played(servers: list[tuple[str, int]]) -> list[Played]:
-    """Play on all of these servers at once; what each delivered and cost."""
-    counts = [[0] for _ in servers]
-    players = [asyncio.create_task(play(url, count)) for (url, _), count in zip(servers, counts, strict=True)]
+async def delivered(
+    servers: Sequence[tuple[str, int]], plays: Sequence[Callable[[str, Count], Coroutine[Any, Any, None]]]
+) -> list[Delivered]:
+    """Play on all of these servers at once, on each with these clients; what each delivered and cost."""
+    counts = [[Count() for _ in plays] for _ in servers]
+    clients = [
+        asyncio.create_task(play(url, count))
+        for (url, _), of_server in zip(servers, counts, strict=True)
+        for play, count in zip(plays, of_server, strict=True)
+    ]
     try:
         async with asyncio.timeout(120):
-            while not all(count[0] > RATE for count in counts):
+            while not all(count.pictures > RATE for of_server in counts for count in of_server):
                 await asyncio.sleep(0.1)
-                for player in players:
-                    if player.done():
-                        player.result()
+                for client in clients:
+                    if client.done():
+                        client.result()
                         raise RuntimeError("a server has ended its connection")
         await asyncio.sleep(SETTLE)
         loop = asyncio.get_running_loop()
-        begun = loop.time()
-        before = [(count[0], seen.cpu_seconds(pid)) for (_, pid), count in zip(servers, counts, strict=True)]
+        begun, before = loop.time(), copy.deepcopy(counts)
+        cpu = [seen.cpu_seconds(pid) for _, pid in servers]
         await asyncio.sleep(SECONDS)
         due = RATE * (loop.time() - begun)
         return [
-            _played(pid, count[0] - frames, seen.cpu_seconds(pid) - cpu, due)
-            for (_, pid), count, (frames, cpu) in zip(servers, counts, before, strict=True)
+            Delivered(due, [*map(_since, of_server, earlier)], seen.cpu_seconds(pid) - used)
+            for (_, pid), of_server, earlier, used in zip(servers, counts, before, cpu, strict=True)
         ]
     finally:
-        for player in players:
-            player.cancel()
-        await asyncio.gather(*players, return_exceptions=True)
+        for client in clients:
+            client.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
 
 
-def _played(pid: int, frames: int, cpu: float, due: float) -> Played:
+def _since(now: Count, before: Count) -> Count:
+    return Count(now.pictures - before.pictures, now.bytes - before.bytes)
+
+
+async def played(servers: Sequence[tuple[str, int]]) -> list[Played]:
+    """Play on all of these servers at once; what each delivered and cost."""
+    found = await delivered(servers, [play])
+    return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
+
+
+def _played(pid: int, found: Delivered) -> Played:
+    (client,) = found.clients
+    return Played(client.pictures / found.due, 1000 * found.cpu / max(client.pictures, 1), *memory(pid))
+
+
+def memory(pid: int) -> tuple[float, float]:
+    """MB of a process: its own pages with its part of shared ones (Pss), and all that are resident."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
     sizes = {line.split()[0]: int(line.split()[1]) / 1024 for line in lines if line.startswith(("Rss:", "Pss:"))}
-    return Played(frames / due, 1000 * cpu / max(frames, 1), sizes["Pss:"], sizes["Rss:"])
+    return sizes["Pss:"], sizes["Rss:"]
 
 
 @contextlib.contextmanager
@@ -207,7 +254,7 @@ def judged_cpu(found: Played, alone: float) -> Row:
         yardstick=alone,
         at_most=MOST_CPU,
         judge="value",
-        detail={"share of the frames delivered": found.share, "MB resident": found.resident},
+        detail={"share of the frames delivered": found.share, "MB resident": found.resident, **interpreter()},
     )
 
 
@@ -229,6 +276,7 @@ def judged_core(found: list[Played]) -> Iterator[Row]:
         detail={
             "of the trial that got least": min(one.share for one in found),
             "CPU per frame, ms": statistics.mean(one.cpu for one in found),
+            **interpreter(),
         },
     )
     yield row(

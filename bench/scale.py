@@ -8,8 +8,6 @@ are all in it. The yardstick is what AWS alone would take (`testing/simulation/a
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +21,8 @@ from bench.bill import bill, server_seconds
 from bench.table import Row, each, row
 from deploy.aws.concurrency import starts
 from deploy.cost.prices import Prices, Usd
-from hippodrome.log import logger
 from testing.clock import EPOCH
+from testing.quiet_log import quiet
 from testing.simulation import faults
 from testing.simulation.assumptions import assumptions, changed
 from testing.simulation.aws_bound import aws_alone
@@ -403,13 +401,3 @@ def seconds_of(moment: str) -> float:
 def quantile(values: Sequence[float], share: float) -> float:
     """The value below which that share of them lies."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    level = logger.log_level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

@@ -33,7 +33,7 @@ SCENE = {"width": 600, "height": 400, "background": "#202830"}
 AGENT = """
 import math, sys
 sys.path.insert(0, ROOT)
-from protocol.trial import Scene
+from protocol.trial_sections import Scene
 from trial.pictures.assets import Assets
 from trial.pictures.scene import as_scene
 class Agent:

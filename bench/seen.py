@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import random
 import subprocess
@@ -20,6 +19,7 @@ from PIL import Image
 
 from bench.bare import PAGE
 from bench.pictures import GAME, ROOT, ms_pacman, texture
+from bench.trial_server import trial_server
 from testing.browser import game_page, html_page
 from trial.pictures.frames import Frame
 
@@ -107,31 +107,9 @@ class Seen:
 def server(agent_dir: Path, *, store: Path | None = None, **trial: Any) -> Iterator[tuple[str, int]]:
     """A running trial server: its address and process id. `store` is the folder of what it records."""
     with tempfile.TemporaryDirectory() as folder:
-        env = {
-            **os.environ,
-            "PROJECT_ID": "bench",
-            "USER_ID": "bench",
-            "SERVER": "bench",
-            "TOKEN": "bench",
-            "GAME_STEPS": "1",
-            "STORE": str(store or folder),
-            "TRIAL": json.dumps({"game": GAME, "maxEpisodes": 1000, **trial}),
-            "HOST": "127.0.0.1",
-            "PORT": "0",
-            "TLS": "off",
-            "AGENT_DIR": str(agent_dir),
-            "PYTHONPATH": str(ROOT),
-        }
-        process = subprocess.Popen(
-            [sys.executable, "-m", "trial"], cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-        )
-        try:
-            assert process.stdout is not None
-            port = json.loads(process.stdout.readline())["port"]
+        section = {"game": GAME, "maxEpisodes": 1000, **trial}
+        with trial_server(agent_dir, str(store or folder), section, USER_ID="bench") as (port, process):
             yield f"ws://127.0.0.1:{port}/", process.pid
-        finally:
-            process.terminate()
-            process.wait(30)
 
 
 def cpu_seconds(pid: int) -> float:

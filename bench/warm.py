@@ -23,11 +23,12 @@ from websockets.typing import Subprotocol
 from bench.bill import server_seconds
 from bench.control import ROOT
 from bench.pages import Line, serving
-from bench.scale import SEED, quantile, quiet, seconds_of
+from bench.scale import SEED, quantile, seconds_of
 from bench.table import Row, each, row
 from deploy.cost import estimate
 from deploy.cost.prices import Prices
 from hippodrome.model import ids, server, warm_pool
+from testing.quiet_log import quiet
 from testing.simulation.people import Person
 from testing.simulation.world import PROJECT, World
 from testing.visitors import hidden

@@ -12,6 +12,10 @@ class Play:
     step: str
     addresses: list[str] = field(default_factory=list)
     waited: float = 0.0  # seconds on the waiting page
+    lobby: float | None = None  # seconds until others were found to play with, or the bot went on alone; None: no lobby
+    members: int = 1  # who play together
+    unmatched: bool = False  # no others were found, so nothing was played
+    outcome: str = ""  # as a game of several participants says at its end
     frames: int = 0  # received, after the first picture of each connection
     frame_rate: int = 0  # as the server says
     seconds: float = 0.0  # of playing, from the first to the last frame

@@ -18,7 +18,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
-from bots import form_filling
+from bots import form_filling, forms
 from bots.account import Account, Play
 from bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
 from bots.game import Game
@@ -30,7 +30,9 @@ from trial.pictures.frames import FrameError
 SUBPROTOCOLS = [Subprotocol(f"hippodrome.{version}") for version in (3, 2, 1)]
 LARGEST_FRAME = 64 * 1024 * 1024
 
+LOBBY, UNMATCHED = "lobby", "unmatched"  # states of the game page (docs/pages.md)
 POLL_SECONDS = 0.5
+LOBBY_SECONDS = 2.0  # from one poll of the lobby to the next
 AGAIN_SECONDS = 0.5  # between tries when there is no answer
 RELOADS = 3  # how often a bot tries again on a page of apology
 RESTARTS = 3  # how often a bot presses "Try again"
@@ -113,9 +115,9 @@ class Bot:
         """The page where the participant stands."""
         return Page(self.address, (await self._ask(self.address)).text)
 
-    async def answer(self, page: Page, form: form_filling.Form) -> Page:
+    async def answer(self, page: Page, form: forms.Form) -> Page:
         """Fill in the form, send it, and go where that leads."""
-        step = dict(form_filling.hidden(form)).get("hippodrome-step", page.step)
+        step = dict(forms.hidden(form)).get("hippodrome-step", page.step)
         if step in self.account.answers:
             raise Failed(f"step {step} was answered, and its page is shown once more")
         self.account.stage = f"answers step {step}"
@@ -169,21 +171,30 @@ class Bot:
         self.account.plays.append(play)
         until = time.monotonic() + self.patience + self.play
         while True:
-            await self._connect(await self._ready(page, data, play, until), play)
+            state = await self._ready(page, data, play, until)
+            if not play.unmatched:
+                await self._connect(state, play)
             page = await self.open()
             data = page.game or {}
             if not data or data.get("step") != step:
                 return page
-            if play.done:
-                raise Failed("the game said that it was done, and its page is shown once more")
+            if play.done or play.unmatched:
+                raise Failed(f"the game said that it was {play.outcome or 'done'}, and its page is shown once more")
             if time.monotonic() > until:
                 raise Failed("the game does not end")
             await asyncio.sleep(AGAIN_SECONDS)
 
     async def _ready(self, page: Page, data: dict[str, Any], play: Play, until: float) -> dict[str, Any]:
         """Wait for the server as the game page does; its state when it is ready."""
+        state, poll = data["state"], urljoin(page.address, data["poll"])
+        if state["state"] == LOBBY:
+            state = await self._lobby(state, poll, play)
+        if state["state"] == UNMATCHED:
+            play.unmatched, play.outcome = True, UNMATCHED
+            return dict(state)
         self.account.stage = "waits for its server"
-        began, state, poll = time.monotonic(), data["state"], urljoin(page.address, data["poll"])
+        play.members = state.get("members", play.members)
+        began, until = time.monotonic(), max(until, time.monotonic() + self.patience + self.play)
         while state["state"] != "ready":
             if time.monotonic() > until:
                 raise Failed(f"no server: still {state['state']}")
@@ -193,6 +204,19 @@ class Bot:
             state = json.loads((await self._ask(poll)).text)
         play.waited += time.monotonic() - began
         return dict(state)
+
+    async def _lobby(self, state: dict[str, Any], poll: str, play: Play) -> dict[str, Any]:
+        """Wait for others to play with, as the lobby's page does; the first state after it."""
+        self.account.stage = "waits for others"
+        began = time.monotonic()
+        until = began + state["patience"] + self.patience
+        while state["state"] == LOBBY:
+            if time.monotonic() > until:
+                raise Failed(f"it waits in the lobby for longer than the {state['patience']:g} s of its patience")
+            await asyncio.sleep(POLL_SECONDS if state["proposed"] else LOBBY_SECONDS)
+            state = json.loads((await self._ask(poll)).text)
+        play.lobby = time.monotonic() - began
+        return state
 
     async def _restart(self, page: Page, state: dict[str, Any]) -> None:
         form = page.form

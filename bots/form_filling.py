@@ -7,12 +7,12 @@ their order, hidden ones as they are, line ends as CR LF, and the button that wa
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from datetime import date, datetime, timedelta
 from decimal import ROUND_FLOOR, Decimal, InvalidOperation
-from html.parser import HTMLParser
 from random import Random
+
+from bots.forms import PRESSED, Control, Form
 
 Pairs = list[tuple[str, str]]
 
@@ -48,66 +48,7 @@ _PATTERNS = (
     "ABC123",
     "a1b2",
 )
-_PRESSED = ("submit", "image")
-_NEVER_SENT = ("reset", "button")
 _EPOCH = datetime(1970, 1, 1)
-
-
-@dataclass(frozen=True)
-class Option:
-    """One choice of a select."""
-
-    value: str
-    selected: bool = False
-    disabled: bool = False
-
-
-@dataclass
-class Control:
-    """An input, select, textarea or button; `kind` is the type of an input or button, or the name of the element."""
-
-    kind: str
-    given: Mapping[str, str]
-    options: list[Option] = field(default_factory=list)
-    text: str = ""  # of a textarea
-
-    @property
-    def name(self) -> str:
-        return self.given.get("name", "")
-
-    @property
-    def required(self) -> bool:
-        return "required" in self.given
-
-    @property
-    def value(self) -> str:
-        return self.given.get("value", "")
-
-
-@dataclass
-class Form:
-    """A form of a page. Disabled fields are not in it."""
-
-    action: str
-    method: str
-    controls: list[Control] = field(default_factory=list)
-
-    @property
-    def buttons(self) -> list[Control]:
-        return [control for control in self.controls if control.kind in _PRESSED]
-
-
-def forms(page: str) -> list[Form]:
-    """The forms of a page in their order."""
-    reader = _Reader()
-    reader.feed(page)
-    reader.close()
-    return reader.forms
-
-
-def to_answer(page: str) -> Form | None:
-    """The form that a page asks to be answered; None if it asks for nothing."""
-    return next((form for form in forms(page) if form.method == "post"), None)
 
 
 def fill(form: Form, random: Random) -> Pairs:
@@ -117,7 +58,7 @@ def fill(form: Form, random: Random) -> Pairs:
     pressed = random.choice(form.buttons) if form.buttons else None
     pairs: Pairs = []
     for control in form.controls:
-        if control.kind in _PRESSED:
+        if control.kind in PRESSED:
             values = [control.value] if control is pressed else []
             if control is pressed and control.kind == "image":
                 prefix = f"{control.name}." if control.name else ""
@@ -342,124 +283,6 @@ _MADE = {
     "range": _number,
     **dict.fromkeys(_SECONDS, _when),
 }
-_TYPES = {*_MADE, *_PRESSED, *_NEVER_SENT, "hidden", "radio", "checkbox", "file"} - {"textarea"}
-
-
-# Reading
-
-
-class _Reader(HTMLParser):
-    """Gathers forms. Follows `form="…"` and disabled fieldsets; tolerates what browsers tolerate."""
-
-    def __init__(self) -> None:
-        super().__init__(convert_charrefs=True)
-        self.forms: list[Form] = []
-        self._by_id: dict[str, Form] = {}
-        self._form: Form | None = None
-        self._elsewhere: list[tuple[str, Control]] = []  # controls that name their form
-        self._fieldsets: list[_Fieldset] = []
-        self._select: Control | None = None
-        self._option: dict[str, str] | None = None
-        self._label: list[str] = []  # the text of the option
-        self._group_disabled = False
-        self._textarea: Control | None = None
-
-    def handle_starttag(self, tag: str, attrs: Iterable[tuple[str, str | None]]) -> None:
-        given: dict[str, str] = {}
-        for name, value in attrs:
-            given.setdefault(name, value or "")
-        if tag == "form" and self._form is None:
-            self._form = Form(given.get("action", ""), given.get("method", "get").lower())
-            self.forms.append(self._form)
-            self._by_id.setdefault(given.get("id", ""), self._form)
-        elif tag == "fieldset":
-            self._fieldsets.append(_Fieldset("disabled" in given))
-        elif tag == "legend" and self._fieldsets:
-            self._fieldsets[-1].legend_begins()
-        elif tag == "input":
-            kind = given.get("type", "text").lower()
-            self._add(Control(kind if kind in _TYPES else "text", given))
-        elif tag == "button":
-            kind = given.get("type", "submit").lower()
-            self._add(Control(kind if kind in _NEVER_SENT else "submit", given))
-        elif tag == "textarea":
-            self._textarea = Control("textarea", given)
-            self._add(self._textarea)
-        elif tag == "select":
-            self._select = Control("select", given)
-            self._add(self._select)
-        elif tag == "optgroup":
-            self._end_option()
-            self._group_disabled = "disabled" in given
-        elif tag == "option" and self._select is not None:
-            self._end_option()
-            self._option, self._label = given, []
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag == "form":
-            self._form = None
-        elif tag == "fieldset" and self._fieldsets:
-            self._fieldsets.pop()
-        elif tag == "legend" and self._fieldsets:
-            self._fieldsets[-1].in_legend = False
-        elif tag == "textarea" and self._textarea is not None:
-            self._textarea.text = self._textarea.text.removeprefix("\n")
-            self._textarea = None
-        elif tag == "option":
-            self._end_option()
-        elif tag == "optgroup":
-            self._end_option()
-            self._group_disabled = False
-        elif tag == "select":
-            self._end_option()
-            self._select, self._group_disabled = None, False
-
-    def handle_data(self, data: str) -> None:
-        if self._textarea is not None:
-            self._textarea.text += data
-        elif self._option is not None:
-            self._label.append(data)
-
-    def close(self) -> None:
-        super().close()
-        for form_id, control in self._elsewhere:
-            if form_id in self._by_id:
-                self._by_id[form_id].controls.append(control)
-
-    def _add(self, control: Control) -> None:
-        if "disabled" in control.given or any(fieldset.disables for fieldset in self._fieldsets):
-            return
-        if control.kind in _NEVER_SENT:
-            return
-        if "form" in control.given:
-            self._elsewhere.append((control.given["form"], control))
-        elif self._form is not None:
-            self._form.controls.append(control)
-
-    def _end_option(self) -> None:
-        if self._select is not None and self._option is not None:
-            given = self._option
-            text = " ".join("".join(self._label).split())
-            disabled = "disabled" in given or self._group_disabled
-            self._select.options.append(Option(given.get("value", text), "selected" in given, disabled))
-        self._option = None
-
-
-@dataclass
-class _Fieldset:
-    """A fieldset that is open; what stands in its first legend is not disabled with it."""
-
-    disabled: bool
-    legends: int = 0
-    in_legend: bool = False
-
-    def legend_begins(self) -> None:
-        self.legends += 1
-        self.in_legend = self.legends == 1
-
-    @property
-    def disables(self) -> bool:
-        return self.disabled and not self.in_legend
 
 
 def gathered(pairs: Iterable[tuple[str, str]]) -> dict[str, str | list[str]]:
@@ -469,8 +292,3 @@ def gathered(pairs: Iterable[tuple[str, str]]) -> dict[str, str | list[str]]:
         if not name.startswith("hippodrome-"):
             seen.setdefault(name, []).append(value)
     return {name: values[0] if len(values) == 1 else values for name, values in seen.items()}
-
-
-def hidden(form: Form) -> Iterator[tuple[str, str]]:
-    """The hidden fields of a form."""
-    return ((control.name, control.value) for control in form.controls if control.kind == "hidden")

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 
 from bots.account import Account, Play
 from protocol import keyboard
-from trial.core.progress import NOT_POSSIBLE
+from trial.core.choices import NOT_POSSIBLE
 from trial.pictures.frames import Decoder
 from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecoder
 
@@ -149,18 +149,29 @@ class Game:
             self._may_stop = "stop" in message["UI"]
         if message.get("done"):
             play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)
+            play.outcome = message.get("outcome", play.outcome)
         if "state" in message:
             self._state, play.score = message["state"], message.get("score", 0)
             self._to_act = message.get("toAct", True)
             play.frame_rate = message.get("frameRate", play.frame_rate)
-            self._break_seconds = message.get("nextIn", 0.0) + message.get("startsIn", 0.0)
-            by_itself = "nextIn" in message  # otherwise there is a page to read, and a button after it
+            self._break_seconds = sum(message.get(name, 0.0) for name in ("nextIn", "startsIn", "beginsIn", "heldFor"))
             if self._state in ("ready", "paused", "break"):
                 self._last_frame = None
-            # Of those who are offered a break that ends by itself, every second one waits for its end.
-            goes_on = self._state == "break" and (not by_itself or self._random.random() < 0.5)
-            if self._state in ("ready", "paused") or goes_on:
+            if self._goes_on(message):
                 await self._say({"command": "start"})
+
+    def _goes_on(self, message: dict[str, Any]) -> bool:
+        """Whether the bot presses the button with which the game begins or goes on."""
+        if self._state == "break":
+            by_itself = "nextIn" in message  # otherwise there is a page to read, and a button after it
+            # Of those who are offered a break that ends by itself, every second one waits for its end.
+            if not by_itself or self._random.random() < 0.5:
+                return True
+        if "people" not in message:
+            return self._state in ("ready", "paused")
+        waits = "beginsIn" in message or "heldFor" in message  # for others, which no command ends
+        reads = message["people"].get(message.get("you")) == "reads"
+        return reads or (self._state == "paused" and not waits)
 
     async def _move(self, hands: Hands) -> None:
         began: float | None = None

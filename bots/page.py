@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from bots import form_filling
+from bots import forms
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Page:
         return data if isinstance(data, dict) else None
 
     @property
-    def form(self) -> form_filling.Form | None:
-        return form_filling.to_answer(self.text)
+    def form(self) -> forms.Form | None:
+        return forms.to_answer(self.text)
 
     @property
     def step(self) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from bots.account import Account, Play
 
 LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
+BETWEEN = ("presence", "ping")  # lines of a session that may stand anywhere, also after an episode's end
 PIECE = 1024**2  # bytes unpacked at once
 
 
@@ -26,6 +27,7 @@ class Recording:
     step: str = ""  # of the study
     steps: int = 0  # of the environment
     pictures: int = 0  # that could be shown: steps and resets
+    counted: bool = False  # in a `Verification`
 
 
 def read_recording(path: Path) -> Recording:
@@ -38,7 +40,8 @@ def read_recording(path: Path) -> Recording:
             kind = str(line["kind"])
             first = first or line
             counts[kind if kind in ("step", "reset") else "other"] += 1
-            last = (last[1], kind)
+            if kind not in BETWEEN:
+                last = (last[1], kind)
         found.step = str(first["step"]) if first else ""
         found.steps = counts["step"]
         found.pictures = found.steps + counts["reset"]
@@ -72,8 +75,9 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 
 @dataclass
 class Verification:
-    """What the data say about the bots, and what is missing."""
+    """What the data say about the bots, and what is missing. `recorded`: the project keeps recordings."""
 
+    recorded: bool = True
     answers: int = 0
     answers_sent: int = 0
     games: int = 0
@@ -82,6 +86,7 @@ class Verification:
     steps: int = 0
     codes: int = 0
     starts: list[float] = field(default_factory=list)  # seconds from request to ready
+    sessions: dict[str, int] = field(default_factory=dict)  # how many of the bots played in each, by its id
     missing: list[str] = field(default_factory=list)
 
 
@@ -97,36 +102,76 @@ def verify(
 
     `last_error` gives what the log of a participant's last server says of its last error, where that is known.
     """
-    found = Verification()
+    found, read = Verification(recorded=recorded), dict[Path, list[Recording]]()
     for account in accounts:
         folder = data / project_id / "users" / account.user_id
-        for step, sent in account.answers.items():
-            found.answers_sent += 1
-            if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
-                found.answers += 1
-            else:
-                found.missing.append(f"{account.user_id}: the answers of step {step} are not what was sent")
-        recordings = [read_recording(path) for path in sorted((folder / "trials").glob("*/*.gz"))]
-        for play in account.plays:
-            who, stored = f"{account.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
-            own = [one for one in recordings if one.step == play.step]
-            answers = stored.get("answers") or {}
-            _look_at_game(found, who, play, answers, own)
-            _look_for_the_cause(found, who, answers, last_error(account.user_id))
-            if recorded and not own:
-                found.missing.append(f"{who}: no recording")
-        for path in sorted((folder / "trials").rglob("*")):
+        membership = document(folder / "session.json")
+        together = data / project_id / "sessions" / str(membership["session"]) if membership.get("session") else None
+        if together is not None:
+            found.sessions[together.name] = found.sessions.get(together.name, 0) + 1
+        _look_at_answers(found, account, folder)
+        trials = (together or folder) / "trials"
+        _look_at_plays(found, account, folder, _recordings(trials, read), last_error)
+        for path in sorted(trials.rglob("*")):
             if path.is_file() and path.suffix != ".gz":
                 found.missing.append(f"{account.user_id}: {path.name} lies among the recordings")
-        code = document(folder / "participant.json").get("completionCode")
+        code = membership.get("completionCode") or document(folder / "participant.json").get("completionCode")
         found.codes += bool(code) and str(code) in account.final_page
+    owners = {account.user_id for account in accounts} | found.sessions.keys()
     for path in sorted((data / "_servers").glob("*.json")):
         record = document(path)
-        if record.get("ready") and record.get("userId") in {account.user_id for account in accounts}:
+        if record.get("ready") and record.get("userId") in owners:
             found.starts.append(_seconds(record["requested"], record["ready"]))
     if 0 < found.codes < sum(account.finished for account in accounts):
         found.missing.append("some final pages lack their completion code, or show another")
     return found
+
+
+def _look_at_answers(found: Verification, account: Account, folder: Path) -> None:
+    """Compare the answers to pages with what the bot has sent."""
+    for step, sent in account.answers.items():
+        found.answers_sent += 1
+        if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
+            found.answers += 1
+        else:
+            found.missing.append(f"{account.user_id}: the answers of step {step} are not what was sent")
+
+
+def _look_at_plays(
+    found: Verification,
+    account: Account,
+    folder: Path,
+    recordings: list[Recording],
+    last_error: Callable[[str], str],
+) -> None:
+    """Compare each game step with its answer and its recordings."""
+    for play in account.plays:
+        who, stored = f"{account.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
+        answers = stored.get("answers") or {}
+        if play.unmatched:
+            _look_at_unmatched(found, who, play, answers)
+            continue
+        own = [one for one in recordings if one.step == play.step]
+        _look_at_game(found, who, play, answers, own)
+        _look_for_the_cause(found, who, answers, last_error(account.user_id))
+        if found.recorded and not own:
+            found.missing.append(f"{who}: no recording")
+
+
+def _recordings(trials: Path, read: dict[Path, list[Recording]]) -> list[Recording]:
+    """The recordings in this folder. Those of a session are several bots', and are read once."""
+    if trials not in read:
+        read[trials] = [read_recording(path) for path in sorted(trials.glob("*/*.gz"))]
+    return read[trials]
+
+
+def _look_at_unmatched(found: Verification, who: str, play: Play, answers: dict[str, Any]) -> None:
+    """Whether the answer to a game says that its bot found no others."""
+    found.games_played += 1
+    if answers.get("outcome") == play.outcome:
+        found.games += 1
+    else:
+        found.missing.append(f"{who}: the game's answer does not say {play.outcome}")
 
 
 def _look_at_game(
@@ -143,9 +188,12 @@ def _look_at_game(
     if not recordings:
         return
     steps, pictures = sum(one.steps for one in recordings), sum(one.pictures for one in recordings)
-    found.recordings += len(recordings)
-    found.steps += steps
-    found.missing += [f"{who}: {one.name} is cut off" for one in recordings if not one.complete]
+    uncounted = [one for one in recordings if not one.counted]  # another member's look may have counted them
+    found.recordings += len(uncounted)
+    found.steps += sum(one.steps for one in uncounted)
+    found.missing += [f"{who}: {one.name} is cut off" for one in uncounted if not one.complete]
+    for one in uncounted:
+        one.counted = True
     if steps < answers.get("frames", 0):
         found.missing.append(f"{who}: {steps} steps recorded of {answers.get('frames')} played")
     if pictures < play.frames:

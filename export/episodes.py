@@ -1,5 +1,7 @@
 """From converted recordings to Minari datasets: one per game step, or several where the game changed on the way.
 
+In sessions, one for each human player.
+
 Minari wants an observation for every step. Recordings hold them if the study said `recordObservations`; where they do
 not, the number of the step stands in their place, and the dataset's description says so. Episodes are written one at a
 time. Images are kept exactly: Minari would write them as JPEG, which loses something.
@@ -13,9 +15,12 @@ truncated. All of that is done here too.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
 import shutil
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -23,13 +28,17 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from export.recording import players_of
+from export.recording_columns import humans_of, players_of, unpack_array
 from export.state import State
 
 OF_HUMAN = (
-    "Several players played: actions, rewards and observations are those of the first human. An action by none is the "
+    "Several players played: actions, rewards and observations are those of {who}. An action by none is the "
     "idle one, also where it was not the human's turn. Episodes end where the human left the game. "
     "infos: players (what each did and got, as JSON). "
+)
+IN_SESSIONS = (
+    "Several people played together: the others' steps of the same games are in datasets of their own. A policy took "
+    "actions by policy while the participant was away. "
 )
 STEP_NUMBERS = "The observations were not recorded; in their place stands the number of the step."
 
@@ -42,7 +51,8 @@ class Spec(NamedTuple):
     dtype: str  # of the observations; "" where there are none
     shape: tuple[int, ...]
     players: tuple[str, ...] = ()  # if several play
-    human: str = ""  # the first of them
+    human: str = ""  # whose steps these are
+    together: bool = False  # with other people, in a session
 
 
 @dataclass
@@ -98,48 +108,97 @@ def _datasets(folder: Path, state: State, project: str) -> list[Dataset]:
     found: dict[Spec, Dataset] = {}
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         first = next(several)[2]
-        spec, highest = _look(folder / path, str(first["step"]))
-        dataset = found.setdefault(spec, Dataset(spec))
-        dataset.files.append(path)
-        dataset.highest = max(dataset.highest, highest)
-        dataset.began = min(dataset.began, str(first["started"]))
+        for spec, highest in _look(folder / path, str(first["step"]), first.get("people")):
+            dataset = found.setdefault(spec, Dataset(spec))
+            dataset.files.append(path)
+            dataset.highest = max(dataset.highest, highest)
+            dataset.began = min(dataset.began, str(first["started"]))
+    humans: dict[str, set[str]] = {}
+    for spec in found:
+        humans.setdefault(spec.step, set()).add(spec.human)
     versions: Counter[str] = Counter()
-    for dataset in sorted(found.values(), key=lambda dataset: (dataset.spec.step, dataset.began)):
-        dataset.id = f"{project}-{dataset.spec.step}-v{versions[dataset.spec.step]}"
-        versions[dataset.spec.step] += 1
+    for dataset in sorted(found.values(), key=lambda dataset: (dataset.spec.step, dataset.began, dataset.spec.human)):
+        spec = dataset.spec
+        named = spec.human and (spec.together or len(humans[spec.step]) > 1)
+        name = f"{project}-{spec.step}" + (f"-{_NO_NAME.sub('_', spec.human)}" if named else "")
+        dataset.id = f"{name}-v{versions[name]}"
+        versions[name] += 1
     return sorted(found.values(), key=lambda dataset: dataset.id)
 
 
-def _look(path: Path, step: str) -> tuple[Spec, int]:
-    """What a converted recording is like, and its highest action, without reading it all."""
+_NO_NAME = re.compile("[^A-Za-z0-9_-]")
+"""What the name of a dataset may not have (`DATASET_ID_RE` of minari 0.5.4)."""
+
+
+def _look(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
+    """What a converted recording is like for each human, and their highest action, without reading it all.
+
+    `people` are the participants of a session's players. A player who is none's any more has no dataset.
+    """
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as file:
-        header = json.loads((file.metadata.metadata or {}).get(b"hippodrome", b"{}")).get("header", {})
+        header = _header(file)
         names = header.get("actionSpace")
         actions = tuple(map(str, names)) if isinstance(names, list) else ()
-        players = players_of(header)
-        human = _first_human(header) if players else ""
-        column = file.schema_arrow.get_field_index("action")
-        highest = -1
-        for number in range(file.metadata.num_row_groups):
-            statistics = file.metadata.row_group(number).column(column).statistics
-            if statistics is not None and statistics.has_min_max:
-                highest = max(highest, int(statistics.max))
-        for batch in file.iter_batches(batch_size=256, columns=["observationDtype", "observationShape"]):
-            for row in batch.to_pylist():
-                if row["observationDtype"] is not None:
-                    shape = tuple(row["observationShape"])
-                    return Spec(step, actions, row["observationDtype"], shape, players, human), highest
-            break
-    return Spec(step, actions, "", (), players, human), highest
+        players, humans = players_of(header), humans_of(header)
+        columns = ["kind", "observationDtype", "observationShape", "other"]
+        batch = next(file.iter_batches(batch_size=256, columns=columns), None)
+        rows = [row for row in batch.to_pylist() if row["kind"] in ("reset", "step")] if batch else []
+        if people is None:
+            human = humans[0] if humans else ""
+            dtype, shape = _observed(rows, "")
+            yield Spec(step, actions, dtype, shape, players, human), _highest(file, "action")
+            return
+        known = [human for human in humans if people.get(human)] or humans
+        for human in known if any(people.values()) or not people else ():
+            own = (header["players"][human] or {}).get("actionSpace")
+            theirs = tuple(map(str, own)) if isinstance(own, list) else actions
+            dtype, shape = _observed(rows, "" if human == humans[0] else human)
+            highest = _highest(file, f"action.{human}")
+            yield Spec(step, theirs, dtype, shape, players, human, together=True), highest
 
 
-def _first_human(header: Mapping[str, Any]) -> str:
-    kinds = header.get("players") or {}
-    return next(
-        (str(name) for name, said in kinds.items() if isinstance(said, dict) and said.get("kind") == "human"), ""
-    )
+def _header(file: Any) -> dict[str, Any]:
+    found = json.loads((file.metadata.metadata or {}).get(b"hippodrome", b"{}")).get("header", {})
+    return found if isinstance(found, dict) else {}
+
+
+def _highest(file: Any, column: str) -> int:
+    place = file.schema_arrow.get_field_index(column)
+    highest = -1
+    for number in range(file.metadata.num_row_groups if place >= 0 else 0):
+        statistics = file.metadata.row_group(number).column(_leaf(file, column)).statistics
+        if statistics is not None and statistics.has_min_max:
+            highest = max(highest, int(statistics.max))
+    return highest
+
+
+def _leaf(file: Any, column: str) -> int:
+    """The place of a column among Parquet's leaves: one of lists has a path of several parts."""
+    return next(n for n in range(file.metadata.num_columns) if file.metadata.schema.column(n).path == column)
+
+
+def _observed(rows: list[dict[str, Any]], player: str) -> tuple[str, tuple[int, ...]]:
+    """The type and shape of the first observation: that of the columns, or that of another `player`."""
+    for row in rows:
+        if not player and row["observationDtype"] is not None:
+            return row["observationDtype"], tuple(row["observationShape"])
+        seen = _part(row, player).get("observation") if player else None
+        if isinstance(seen, dict):
+            try:
+                _, dtype, shape = unpack_array(seen)
+            except (KeyError, TypeError, ValueError, zlib.error):
+                continue
+            return dtype, tuple(shape)
+    return "", ()
+
+
+def _part(row: Mapping[str, Any], player: str) -> dict[str, Any]:
+    """What a row says of one player."""
+    players = json.loads(row.get("other") or "{}").get("players")
+    part = players.get(player) if isinstance(players, dict) else None
+    return part if isinstance(part, dict) else {}
 
 
 def _storage(data: Path, dataset: Dataset, version: str) -> Any:
@@ -169,7 +228,9 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
     description = "Recorded by Hippodrome: what people did, and what came of it. " + (
         "" if spec.dtype else STEP_NUMBERS + " "
     )
-    description += OF_HUMAN if spec.players else ""
+    who = f"the player {spec.human}" if spec.together else "the first human"
+    description += OF_HUMAN.format(who=who) if spec.players else ""
+    description += IN_SESSIONS if spec.together else ""
     storage.update_metadata(
         {
             "dataset_id": dataset.id,
@@ -187,9 +248,10 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
 def _append(storage: Any, path: Path, dataset: Dataset) -> None:
     """Add a recording's episodes."""
     first, abouts = storage.total_episodes, []
+    shared = dataset.spec.together
 
     def buffers() -> Iterator[Any]:
-        for rows, why in _episodes(path):
+        for rows, why in _episodes(path, dataset.spec):
             made = _buffer(rows, dataset)
             if isinstance(made, str):
                 dataset.left_out[made] += 1
@@ -199,6 +261,7 @@ def _append(storage: Any, path: Path, dataset: Dataset) -> None:
             abouts.append(
                 {
                     "participant": rows[0]["participant"] or "",
+                    **({"session": rows[0]["session"] or "", "player": _clean(dataset.spec.human)} if shared else {}),
                     "attempt": -1 if rows[0]["attempt"] is None else rows[0]["attempt"],
                     "trial": (rows[0]["trial"] or "").replace("\0", ""),
                     "episode": -1 if rows[0]["episode"] is None else rows[0]["episode"],
@@ -212,25 +275,37 @@ def _append(storage: Any, path: Path, dataset: Dataset) -> None:
         storage.update_episode_metadata(abouts, range(first, first + len(abouts)))
 
 
-def _episodes(path: Path) -> Iterator[tuple[list[dict[str, Any]], str]]:
+def _clean(text: str) -> str:
+    return text.replace("\0", "")
+
+
+def _episodes(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
     """A recording's rows of `reset` and `step`, cut where an episode begins, and why each ended.
 
-    Episodes that end before the first step are left out.
+    Episodes that end before the first step are left out. In a session the rows say what the dataset's human did.
     """
     import pyarrow.parquet as pq
 
     columns = ["participant", "attempt", "trial", "kind", "episode", "step", "time", "action", "by", "human"]
     columns += ["reward", "terminated", "truncated", "info", "seed", "observation", "observationDtype"]
     columns += ["observationShape", "why", "other"]
+    whose = f"participant.{spec.human}"
+    columns += ["session", whose] if spec.together else []
     rows: list[dict[str, Any]] = []
     why = "cut off"
     with pq.ParquetFile(path) as file:
+        header = _header(file)
+        humans = humans_of(header)
         for batch in file.iter_batches(batch_size=512, columns=columns):
-            for row in batch.to_pylist():
+            for line in batch.to_pylist():
+                row = line
                 if row["kind"] == "end" and rows and row["episode"] == rows[0]["episode"]:
                     why = row["why"] or why
                 if row["kind"] not in ("reset", "step"):
                     continue
+                if spec.together:
+                    row = row | {"participant": row[whose]}
+                    row |= _as_of(row, spec.human, header) if spec.human != humans[0] else {}
                 if rows and (row["kind"] == "reset" or row["episode"] != rows[0]["episode"]):
                     if rows[-1]["kind"] == "step":
                         yield rows, why
@@ -238,6 +313,33 @@ def _episodes(path: Path) -> Iterator[tuple[list[dict[str, Any]], str]]:
                 rows.append(row)
     if rows and rows[-1]["kind"] == "step":
         yield rows, why
+
+
+def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dict[str, Any]:
+    """What a row says of another human than the first, under the names of the columns."""
+    part = _part(row, human)
+    idle = header.get("idleActions")
+    action = part.get("action")
+    if action is None and isinstance(idle, dict):  # not their turn: the environment took the idle action
+        action = idle.get(human)
+    found = {
+        "action": _whole(action),
+        "by": part.get("by") or ("none" if row["kind"] == "step" else None),
+        "human": _whole(part.get("human")),
+        "reward": float(reward) if isinstance(reward := part.get("reward"), int | float) else None,
+        "info": json.dumps(part["info"]) if "info" in part else None,
+        "observation": None,
+        "observationDtype": None,
+        "observationShape": None,
+    }
+    with contextlib.suppress(KeyError, TypeError, ValueError, zlib.error):
+        seen = unpack_array(part["observation"])
+        found |= dict(zip(("observation", "observationDtype", "observationShape"), seen, strict=True))
+    return found
+
+
+def _whole(value: Any) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
 def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:

@@ -1,4 +1,4 @@
-"""From the source into the folder: what is new or changed, a participant at a time, several at once.
+"""From the source into the folder: what is new or changed (`listing.py`), a participant at a time, several at once.
 
 A file appears under its name whole or not at all, and is written down only then: whatever cuts a run off, the next one
 goes on from there.
@@ -12,16 +12,20 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from export import keys, recording, scrub
-from export.keys import Item, Kind, Listed
+from export.keys import Item, Kind
+from export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
+from export.recording_columns import when
 from export.source import PARALLEL, Gone, Source, TooLarge
 from export.state import File, Kept, Person, State
+from protocol import session as sessions
+from protocol.session import is_session_id
 
 MAX_WAITING = 4 * PARALLEL  # participants listed and not yet written down
 COMMIT_EVERY = 2  # seconds: as much work may have to be done again after a power cut
@@ -29,90 +33,24 @@ LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
 _PIECE = 1024 * 1024  # bytes
 
 
-class Wanted(NamedTuple):
-    """What a run is to bring."""
-
-    recordings: bool = True
-    raw: bool = False
-    apart: bool = False
-
-
-class Unit(NamedTuple):
-    """All that the source has of one participant; of the project itself where `user` is empty."""
-
-    user: str
-    items: list[Item]
-
-
-@dataclass
-class Tally:
-    """What a run did, or would do."""
-
-    participants: int = 0
-    new: int = 0
-    changed: int = 0
-    unchanged: int = 0
-    gone: int = 0
-    bytes: int = 0
-    damaged: int = 0
-
-    @property
-    def to_fetch(self) -> int:
-        return self.new + self.changed
-
-
 @dataclass
 class Work:
-    """What one worker is to fetch for one participant."""
+    """What one worker is to fetch for one participant or one session."""
 
-    person: Person | None
+    owner: Person | Members | None
     fetch: list[Item]
     seen: list[str]
-    leave: list[str] = field(default_factory=list)  # paths that are replaced or gone
+    then: Unit | None = None  # what follows when the session's own document is here
 
-
-def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
-    """The listing by participant; theirs stand together, in any order."""
-    user, items = "", list[Item]()
-    for line in listed:
-        item = keys.read(project, line)
-        if item.user != user or (not user and len(items) >= 1000):
-            if items:
-                yield Unit(user, items)
-            user, items = item.user, []
-        items.append(item)
-    if items:
-        yield Unit(user, items)
-
-
-def choose(
-    state: State, unit: Unit, wanted: Wanted, tally: Tally, damaged: frozenset[str]
-) -> tuple[list[Item], list[str]]:
-    """What of a unit has to be fetched, and the keys that may stay as they are. `damaged` are paths of ours."""
-    known = state.files_of(unit.user)
-    fetch, seen = [], []
-    everything = False
-    for item in sorted(unit.items, key=lambda item: item.kind is not Kind.PARTICIPANT):
-        before = known.get(item.listed.key)
-        skipped = item.kind is Kind.RECORDING and not wanted.recordings
-        same = (
-            before is not None
-            and before.version == item.listed.version
-            and not everything
-            and damaged.isdisjoint((before.path, before.raw))
-        )
-        raw_missing = wanted.raw and item.kind is not Kind.FOREIGN and (before is None or before.raw is None)
-        if skipped or (same and not raw_missing):
-            tally.unchanged += 1
-            seen.append(item.listed.key)
-            continue
-        tally.new, tally.changed = tally.new + (before is None), tally.changed + (before is not None)
-        tally.bytes += item.listed.size if item.kind is not Kind.FOREIGN else 0
-        fetch.append(item)
-        # With another participant.json a participant has other identities, which must leave all their files.
-        everything = everything or (item.kind is Kind.PARTICIPANT and wanted.apart)
-    tally.participants += bool(unit.user)
-    return fetch, seen
+    @property
+    def user(self) -> str:
+        """The id of the participant or of the session."""
+        match self.owner:
+            case Person(user=user):
+                return user
+            case Members(session=session):
+                return session
+        return ""
 
 
 class Fetcher:
@@ -154,20 +92,34 @@ class Fetcher:
         running: dict[Future[list[File]], Work] = {}
         committed = time.monotonic()
         pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
+
+        def begin(work: Work) -> None:
+            if work.fetch:
+                running[pool.submit(self._fetch, work)] = work
+            else:
+                self._keep(work, [])
+                follow(work)
+
+        def follow(work: Work) -> None:
+            if work.then is not None:
+                begin(self._work(work.then, tally, members(self._state, work.then.user)))
+
+        def collect() -> None:
+            for work in self._collect(running):
+                follow(work)
+
         try:
-            for unit in units(self._project, self._source.list(keys.prefix(self._project))):
-                work = self._work(unit, tally)
-                if work.fetch:
-                    running[pool.submit(self._fetch, work)] = work
-                else:
-                    self._keep(work, [])
+            for unit in units(self._project, lines(self._source, self._project, self._state)):
+                while unit.is_session and any(isinstance(work.owner, Person) for work in running.values()):
+                    collect()  # who plays there has to be known first
+                begin(self._work(unit, tally))
                 while len(running) >= MAX_WAITING:
-                    self._collect(running)
+                    collect()
                 if time.monotonic() - committed > COMMIT_EVERY:
                     commit()
                     committed = time.monotonic()
             while running:
-                self._collect(running)
+                collect()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, work in running.items():
@@ -176,25 +128,38 @@ class Fetcher:
             raise
         pool.shutdown()
 
-    def _work(self, unit: Unit, tally: Tally) -> Work:
-        person = self._state.meet(unit.user, self._wanted.apart) if unit.user else None
-        fetch, seen = choose(self._state, unit, self._wanted, tally, self._damaged)
+    def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
+        """What is to be done for a unit. Of a session first its own document; the rest when its members are `known`."""
+        owner: Person | Members | None = known
+        then = None
+        if unit.is_session and known is None:
+            about, rest = list[Item](), list[Item]()
+            for item in unit.items:
+                (about if item.kind is Kind.SESSION else rest).append(item)
+            owner, unit, then = Members(unit.user), Unit(unit.user, about), Unit(unit.user, rest)
+        elif unit.user and known is None:
+            owner = self._state.meet(unit.user, self._wanted.apart)
+        mark = known.mark if known else ""
+        fetch, seen = choose(self._state, unit, self._wanted, tally, self._damaged, mark=mark)
         self._listed += len(unit.items)
         self._done += len(seen)
         self._progress(self._listed, self._done)
-        return Work(person, fetch, seen)
+        return Work(owner, fetch, seen, then)
 
-    def _collect(self, running: dict[Future[list[File]], Work]) -> None:
+    def _collect(self, running: dict[Future[list[File]], Work]) -> list[Work]:
         done, _ = wait(running, return_when=FIRST_COMPLETED)
+        collected = []
         for future in done:
             files = future.result()  # raises what the worker did not expect; the others are kept by `run`
             work = running.pop(future)
             self._keep(work, files)
             self._done += len(work.fetch)
+            collected.append(work)
         self._progress(self._listed, self._done)
+        return collected
 
     def _keep(self, work: Work, files: list[File]) -> None:
-        user = work.person.user if work.person else ""
+        user = work.user
         before = self._state.files_of(user) if files else {}
         self._state.keep(user, work.seen, files)
         for file in files:
@@ -207,24 +172,27 @@ class Fetcher:
 
     def _fetch(self, work: Work) -> list[File]:
         made = []
-        document = work.person.document if work.person else {}
+        owner = work.owner
         for item in work.fetch:  # participant.json comes first
-            file = File(item.listed.key, item.kind, item.listed.version, item.listed.size, step=item.step)
+            mark = owner.mark if isinstance(owner, Members) else ""
+            file = File(item.listed.key, item.kind, version_of(item, mark), item.listed.size, step=item.step)
             try:
-                if item.kind is Kind.FOREIGN or work.person is None:
+                if item.kind is Kind.FOREIGN or owner is None:
                     file.problems.append(f"not one of ours: {item.why}")
                 elif item.kind is Kind.RECORDING:
-                    self._recording(item, work.person, document, file)
+                    self._recording(item, owner, file)
                 else:
-                    self._document(item, work.person, file)
+                    self._document(item, owner, file)
             except Gone:
                 continue  # the next run sees what has become of it
-            if item.kind is Kind.PARTICIPANT:
-                document = file.document or {}
+            if isinstance(owner, Person) and item.kind is Kind.PARTICIPANT:
+                owner = owner._replace(document=file.document or {})
+            if isinstance(owner, Person) and item.kind is Kind.MEMBERSHIP:
+                owner = owner._replace(membership=file.document or {})
             made.append(file)
         return made
 
-    def _document(self, item: Item, person: Person, file: File) -> None:
+    def _document(self, item: Item, owner: Person | Members, file: File) -> None:
         try:
             body = self._source.read(item.listed.key, LARGEST_DOCUMENT)
         except TooLarge:
@@ -232,7 +200,7 @@ class Fetcher:
             return
         if self._wanted.raw:
             parts = item.listed.key.split("/")[3:]
-            file.raw = self._put(body, f"private/raw/{'/'.join([person.folder, *parts])}")
+            file.raw = self._put(body, f"private/raw/{'/'.join([_folder(owner), *parts])}")
         try:
             found = json.loads(body)
         except (ValueError, RecursionError):
@@ -244,21 +212,25 @@ class Fetcher:
         file.document = found
         file.problems += _doubts(item, found)
 
-    def _recording(self, item: Item, person: Person, document: Any, file: File) -> None:
-        attempt = keys.attempt(self._project, person.user, item.server)
+    def _recording(self, item: Item, owner: Person | Members, file: File) -> None:
+        attempt = keys.attempt(self._project, item.user, item.server)
         place = str(attempt) if attempt is not None else f"other-{self._token(item.server)}"
-        names = scrub.identities(person.user, person.number, document) | {item.server: place}
+        if isinstance(owner, Person):
+            whose, theirs, people = {"participant": owner.number}, scrub.identities(owner), None
+        else:
+            whose, theirs, people = {"session": owner.session}, dict(owner.identities), owner.people
+        folder, names = _folder(owner), theirs | {item.server: place}
         label = item.server.rpartition("-")[0]
         hide = scrub.Scrub(names | ({label: "(server)"} if label else {})) if self._wanted.apart else scrub.nothing()
         packed, made = self._temporary(), self._temporary()
         try:
             self._source.fetch(item.listed, packed)
-            who = {"participant": person.number, "studyStep": item.step, "attempt": attempt}
-            converted = recording.convert(packed, made, who, hide, shown=not self._wanted.apart)
-            path = f"recordings/{person.folder}/{place}/{item.name}.parquet"
+            who = {**whose, "studyStep": item.step, "attempt": attempt}
+            converted = recording.convert(packed, made, who, hide, shown=not self._wanted.apart, people=people)
+            path = f"recordings/{folder}/{place}/{item.name}.parquet"
             file.made = self._move(made, path)
             if self._wanted.raw:
-                file.raw = self._move(packed, f"private/raw/{person.folder}/trials/{item.server}/{item.name}.jsonl.gz")
+                file.raw = self._move(packed, f"private/raw/{folder}/trials/{item.server}/{item.name}.jsonl.gz")
         finally:
             packed.unlink(missing_ok=True)
             made.unlink(missing_ok=True)
@@ -290,6 +262,11 @@ class Fetcher:
         return Kept(path, size, digest)
 
 
+def _folder(owner: Person | Members) -> str:
+    """The name of a participant's or a session's folder among ours."""
+    return owner.folder if isinstance(owner, Person) else owner.session
+
+
 def forget_gone(state: State, folder: Path) -> int:
     """Remove here what is gone from the source, such as an erased participant. Return how many files that were."""
     count = 0
@@ -297,14 +274,15 @@ def forget_gone(state: State, folder: Path) -> int:
         for key, user, kind, step, path, raw in state.unseen():
             for old in filter(None, (path, raw)):
                 (folder / old).unlink(missing_ok=True)
-                _prune((folder / old).parent, folder)
+                remove_empty((folder / old).parent, folder)
             state.forget(key, user, kind, step)
             count += 1
         state.forget_people()
     return count
 
 
-def _prune(empty: Path, top: Path) -> None:
+def remove_empty(empty: Path, top: Path) -> None:
+    """Remove this folder and those above it that are empty then, up to `top`, which stays."""
     with contextlib.suppress(OSError):  # not empty
         while empty != top:
             empty.rmdir()
@@ -324,14 +302,23 @@ def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
     if group is not None and (not isinstance(group, int) or isinstance(group, bool)):
         doubts.append("group is no whole number")
     if item.kind is Kind.PARTICIPANT:
-        if recording.when(found.get("arrived")) is None:
+        if when(found.get("arrived")) is None:
             doubts.append("arrived is no time")
         if not isinstance(found.get("link", {}), dict):
             doubts.append("link is no object")
         return doubts
+    if item.kind is Kind.MEMBERSHIP:
+        known = found.get("session")
+        return doubts if known is None or is_session_id(known) else [*doubts, "session is the id of none"]
+    if item.kind is Kind.SESSION:
+        try:
+            sessions.parse(json.dumps(found).encode())
+        except sessions.BadSession as bad:
+            doubts.append(str(bad))
+        return doubts
     if not isinstance(found.get("answers"), dict):
         doubts.append("answers is no object")
-    if recording.when(found.get("answered")) is None:
+    if when(found.get("answered")) is None:
         doubts.append("answered is no time")
     if found.get("step") != item.step:
         doubts.append("step is another one than the file's name says")

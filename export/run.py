@@ -19,8 +19,10 @@ import msgspec
 
 from console import screen
 from console.problem import Problem
-from export import episodes, fetch, keys, manifest, tables
-from export.fetch import Fetcher, Tally, Wanted
+from export import episodes, fetch, keys, listing, manifest, table_files, tables
+from export.answers import Answers
+from export.fetch import Fetcher
+from export.listing import Tally, Wanted
 from export.source import Gone, Source, TooLarge
 from export.state import Kept, State
 from hippodrome.model.project import MASTER_LIST, Project, read_list
@@ -65,10 +67,11 @@ def look(source: Source, project_id: str, folder: Path, options: Options) -> Tal
     """What a run would do. Changes nothing."""
     with _checked(folder, source, project_id, options) as (state, damaged):
         tally, known = Tally(damaged=len(damaged)), 0
-        for unit in fetch.units(project_id, source.list(keys.prefix(project_id))):
+        for unit in listing.units(project_id, listing.lines(source, project_id, state)):
             there = state.files_of(unit.user)
             known += sum(item.listed.key in there for item in unit.items)
-            fetch.choose(state, unit, options.wanted, tally, damaged)
+            mark = listing.members(state, unit.user).mark if unit.is_session else ""
+            listing.choose(state, unit, options.wanted, tally, damaged, mark=mark)
         tally.gone = state.file_count() - known
         return tally
 
@@ -158,30 +161,30 @@ def _run(
             "If that is right, delete the folder. If not, look at --project, --stack and --region.",
         )
     tally.gone = fetch.forget_gone(state, folder)
-    style = tables.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
+    style = table_files.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
     with _bar("Writing tables") as told:
-        answers = tables.Answers(state, project, options.apart)
-        either = style if style.csv or style.parquet else tables.Style(parquet=False)
+        answers = Answers(state, project, options.apart)
+        either = style if style.csv or style.parquet else table_files.Style(parquet=False)
         columns = answers.columns
-        written += tables.write(folder / "answers", columns, answers.rows(), either)
+        written += table_files.write(folder / "answers", columns, answers.rows(), either)
         finished, scrubbed = answers.finished, answers.scrubbed
         if options.long:
-            written += tables.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
+            written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
         if options.wanted.recordings:
-            players = tables.players(state)
-            rows = tables.episodes(state, players)
-            written += tables.write(folder / "episodes", tables.of_episodes(players), rows, either)
+            players, shared = tables.players(state), tables.in_sessions(state)
+            rows = tables.episodes(state, players, shared)
+            written += table_files.write(folder / "episodes", tables.of_episodes(players, shared), rows, either)
             if any(found.get("callbacks") for _, _, found in state.episodes()):
-                lines = tables.callbacks(state, folder)
-                written += tables.write(folder / "callbacks", tables.CALLBACKS, lines, either)
-        only_csv = tables.Style(parquet=False, spreadsheet=options.spreadsheet)
+                lines = tables.callbacks(state, folder, shared)
+                written += table_files.write(folder / "callbacks", tables.of_callbacks(shared), lines, either)
+        only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
-        written += tables.write(folder / "problems", tables.PROBLEMS, found, only_csv)
+        written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)
         private = [manifest.kept(folder, salt)]
         if options.apart:
             who, rows = tables.identities(state, answers.links)
-            (made,) = tables.write(folder / PRIVATE / "identities", who, rows, only_csv)
+            (made,) = table_files.write(folder / PRIVATE / "identities", who, rows, only_csv)
             made.chmod(0o600)
             private.append(manifest.kept(folder, made))
         told(1, 1)

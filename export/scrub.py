@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from export.state import Person
+
 SHORTEST = 6  # characters; a shorter id or value stands in too many texts by chance
 _SURROGATES = re.compile("[\ud800-\udfff]")
 
@@ -50,14 +52,19 @@ def nothing() -> Scrub:
     return Scrub({})
 
 
-def identities(user: str, number: str, participant: Mapping[str, Any]) -> dict[str, str]:
-    """What gives a participant away, from `participant.json`, and what to write instead."""
-    link = participant.get("link")
-    found = {value: f"({name})" for name, value in texts(link).items()}
-    code = participant.get("completionCode")
-    if isinstance(code, str):
-        found[code] = "(completionCode)"
-    return {**found, user: number}
+def identities(person: Person) -> dict[str, str]:
+    """What gives a participant away, from `participant.json` and `session.json`, and what to write instead."""
+    found = {value: f"({name})" for name, value in texts(person.document.get("link")).items()}
+    for document in (person.document, person.membership):
+        if isinstance(code := document.get("completionCode"), str) and code:
+            found[code] = "(completionCode)"
+    return {**found, person.user: person.number}
+
+
+def completion_code(person: Person) -> str | None:
+    """The code that the participant was shown at the end: one without a partner has another than the usual one."""
+    codes = (document.get("completionCode") for document in (person.membership, person.document))
+    return next((clean(code) for code in codes if isinstance(code, str) and code), None)
 
 
 def texts(link: Any) -> dict[str, str]:

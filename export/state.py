@@ -27,6 +27,10 @@ CREATE TABLE IF NOT EXISTS files (
 CREATE INDEX IF NOT EXISTS files_of ON files (user);
 CREATE TABLE IF NOT EXISTS answers (
   user TEXT NOT NULL, step TEXT NOT NULL, document TEXT NOT NULL, PRIMARY KEY (user, step)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sessions (owner TEXT PRIMARY KEY, document TEXT NOT NULL) WITHOUT ROWID;
+CREATE VIEW IF NOT EXISTS people AS
+  SELECT p.user, p.number, p.folder, p.document, s.document AS membership, p.seen
+  FROM participants p LEFT JOIN sessions s ON s.owner = p.user;
 CREATE TABLE IF NOT EXISTS episodes (
   key TEXT NOT NULL, place INTEGER NOT NULL, document TEXT NOT NULL, PRIMARY KEY (key, place)) WITHOUT ROWID;
 """
@@ -68,12 +72,20 @@ class Known(NamedTuple):
 
 
 class Person(NamedTuple):
-    """A participant: the id, the number that stands for it, the folder's name, and participant.json."""
+    """A participant: the id, the number that stands for it, the folder's name, and participant.json.
+
+    `membership` says in which session they play (`session.json` of their folder); empty if in none.
+    """
 
     user: str
     number: str
     folder: str
     document: Mapping[str, Any]
+    membership: Mapping[str, Any] = {}
+
+
+_OF_SESSIONS = ("membership", "session")
+"""Kinds of `session.json`: that of a participant's folder, and that of the session's. Both are kept in one table."""
 
 
 class State:
@@ -114,9 +126,23 @@ class State:
 
     def person(self, user: str) -> Person | None:
         row = self._db.execute(
-            "SELECT user, number, folder, document FROM participants WHERE user=?", (user,)
+            "SELECT user, number, folder, document, membership FROM people WHERE user=?", (user,)
         ).fetchone()
         return _person(row) if row else None
+
+    def present(self, user: str) -> Person | None:
+        """The participant, if the source still has something of them."""
+        seen = self._db.execute("SELECT 1 FROM participants WHERE user=? AND seen=?", (user, self.run)).fetchone()
+        return self.person(user) if seen else None
+
+    def session(self, session: str) -> Mapping[str, Any]:
+        """The document of a session; empty if it is not known."""
+        row = self._db.execute("SELECT document FROM sessions WHERE owner=?", (session,)).fetchone()
+        return json.loads(row[0]) if row else {}
+
+    def has_sessions(self) -> bool:
+        """Whether anything of sessions is known here."""
+        return self._db.execute("SELECT 1 FROM files WHERE kind IN ('session', 'membership')").fetchone() is not None
 
     def meet(self, user: str, apart: bool, number: str = "") -> Person:
         """The participant, with a number of their own from the first time on: random, unless ids may be seen."""
@@ -149,7 +175,7 @@ class State:
 
     def people(self) -> Iterator[Person]:
         """Everybody who was seen in the last run, in the order of their numbers."""
-        query = "SELECT user, number, folder, document FROM participants WHERE seen=? ORDER BY number"
+        query = "SELECT user, number, folder, document, membership FROM people WHERE seen=? ORDER BY number"
         for row in self._db.execute(query, (self.run,)):
             yield _person(row)
 
@@ -213,6 +239,10 @@ class State:
         )
         if file.kind == "participant":
             self._db.execute("UPDATE participants SET document=? WHERE user=?", (_json(file.document), user))
+        if file.kind in _OF_SESSIONS:
+            self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
+            if file.document is not None:
+                self._db.execute("INSERT INTO sessions VALUES (?, ?)", (user, _json(file.document)))
         if file.kind == "answer":
             if file.document is None:
                 self._db.execute("DELETE FROM answers WHERE user=? AND step=?", (user, file.step))
@@ -240,6 +270,8 @@ class State:
             self._db.execute("DELETE FROM answers WHERE user=? AND step=?", (user, step))
         if kind == "participant":
             self._db.execute("UPDATE participants SET document=NULL WHERE user=?", (user,))
+        if kind in _OF_SESSIONS:
+            self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
 
     def forget_people(self) -> int:
         """Those who were not seen in the last run: their numbers too. How many there were."""
@@ -263,7 +295,7 @@ class State:
     def answers(self) -> Iterator[tuple[Person, dict[str, Mapping[str, Any]]]]:
         """Everybody in the order of their numbers, each with the documents of their answers by step."""
         rows = self._db.execute(
-            "SELECT p.user, p.number, p.folder, p.document, a.step, a.document FROM participants p"
+            "SELECT p.user, p.number, p.folder, p.document, p.membership, a.step, a.document FROM people p"
             " LEFT JOIN answers a ON a.user = p.user WHERE p.seen=? ORDER BY p.number, a.step",
             (self.run,),
         )
@@ -273,36 +305,40 @@ class State:
             if person is None or row[0] != person.user:
                 if person is not None:
                     yield person, found
-                person, found = _person(row[:4]), {}
-            if row[4] is not None:
-                found[row[4]] = json.loads(row[5])
+                person, found = _person(row[:5]), {}
+            if row[5] is not None:
+                found[row[5]] = json.loads(row[6])
         if person is not None:
             yield person, found
 
-    def episodes(self) -> Iterator[tuple[Person, str, Mapping[str, Any]]]:
-        """Every episode with its player and its file, in the order of numbers and files."""
+    def episodes(self) -> Iterator[tuple[Person | None, str, Mapping[str, Any]]]:
+        """Every episode with its participant and its file, in the order of numbers and files; first those of sessions.
+
+        A session's episode has no participant here; it says `session` and, by player, the `people`'s numbers.
+        """
         rows = self._db.execute(
-            "SELECT p.user, p.number, p.folder, p.document, f.path, e.document FROM files f"
-            " JOIN participants p ON p.user = f.user JOIN episodes e ON e.key = f.key"
+            "SELECT p.user, p.number, p.folder, p.document, p.membership, f.path, e.document FROM files f"
+            " LEFT JOIN people p ON p.user = f.user JOIN episodes e ON e.key = f.key"
             " WHERE f.path IS NOT NULL ORDER BY p.number, f.path, e.place"
         )
         for row in rows:
-            yield _person(row[:4]), row[4], json.loads(row[5])
+            yield _person(row[:5]) if row[0] else None, row[5], json.loads(row[6])
 
     def problems(self) -> Iterator[tuple[Person | None, str, str]]:
         """Who, which file, what is wrong with it."""
         rows = self._db.execute(
-            "SELECT p.user, p.number, p.folder, p.document, f.key, f.problems FROM files f"
-            " LEFT JOIN participants p ON p.user = f.user WHERE f.problems<>'[]' ORDER BY p.number, f.key"
+            "SELECT p.user, p.number, p.folder, p.document, p.membership, f.key, f.problems FROM files f"
+            " LEFT JOIN people p ON p.user = f.user WHERE f.problems<>'[]' ORDER BY p.number, f.key"
         )
         for row in rows:
-            for problem in json.loads(row[5]):
-                yield _person(row[:4]) if row[0] else None, row[4], problem
+            for problem in json.loads(row[6]):
+                yield _person(row[:5]) if row[0] else None, row[5], problem
 
     def counts(self) -> dict[str, int]:
         one = self._db.execute
         kinds = dict(one("SELECT kind, count(*) FROM files GROUP BY kind").fetchall())
-        return {
+        sessions = {"sessions": kinds["session"]} if "session" in kinds else {}
+        return sessions | {
             "participants": one("SELECT count(*) FROM participants WHERE seen=?", (self.run,)).fetchone()[0],
             "answers": one("SELECT count(*) FROM answers").fetchone()[0],
             "recordings": one("SELECT count(*) FROM files WHERE kind='recording' AND path IS NOT NULL").fetchone()[0],
@@ -322,7 +358,7 @@ class State:
 
 
 def _person(row: Any) -> Person:
-    return Person(row[0], row[1], row[2], json.loads(row[3]) if row[3] else {})
+    return Person(row[0], row[1], row[2], json.loads(row[3]) if row[3] else {}, json.loads(row[4]) if row[4] else {})
 
 
 def _json(document: Mapping[str, Any] | None) -> str | None:

@@ -71,6 +71,9 @@ class Documents(Protocol):
     def replace(self, key: str, body: bytes, etag: str) -> str:
         """Replace the version with this ETag; return the new ETag. Raises `Conflict` if another version is present."""
 
+    def put(self, key: str, body: bytes) -> None:
+        """Write a document, whatever is there: of several writers the last one's stays. For what says "still here"."""
+
     def list(self, prefix: str) -> Iterator[Entry]:
         """All documents whose key begins with `prefix`, in key order."""
 

@@ -29,6 +29,10 @@ from hippodrome.storage.secret import SecretCache
 
 TRIES = 20
 MAX_SIGNED = 5_000  # links in one call
+ALONE = (  # functions ask for a participant's session only in a project with several players
+    "project.players: the study is registered with players: {players}, and participants who play together would be "
+    "parted; give a study for one participant another project.id"
+)
 
 
 class NotRegistered(Exception):
@@ -56,6 +60,8 @@ def _enter(platform: Platform, project: Project) -> Project:
         found = platform.documents.get(MASTER_LIST)
         listed = _master_list(found.body) if found else MasterList()
         before = listed.find(project.id)
+        if before and before.has_sessions and not project.has_sessions:
+            raise NotRegistered([ALONE.format(players=before.players)])
         keys.add_project_secrets(listed.secrets())
         salt = listed.salt(project.id)  # a project whose secret an earlier version made has the salt ""
         salt = secrets.token_hex(8) if salt is None else salt

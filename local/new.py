@@ -131,7 +131,7 @@ def _name(folder: Path, project_id: str) -> None:
 
 def _lead(template: Template, folder: Path) -> None:
     """Let the commands and links in README.md and config.yml lead to the new folder, and to Hippodrome from there."""
-    example = re.compile(rf"(?<![\w/]){EXAMPLES}/{re.escape(template.folder.name)}(?=[/\s`]|$)")
+    example = re.compile(rf"(?<![\w/]){EXAMPLES}/{re.escape(template.folder.name)}(?=[/\s`,.;:)]|$)")
     for file in (folder / README, folder / OF_A_STUDY[0]):
         if template.at_top or not file.is_file():
             continue

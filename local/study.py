@@ -13,6 +13,7 @@ from hippodrome.model import ids
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import SecretCache
 from lambdas import installed, next_step, send_start_server_message, send_stop_server_message
+from local import own_places
 from local.activity.log import ActivityLog
 from local.backend.authority import Authority
 from local.backend.platform import LocalPlatform
@@ -115,16 +116,18 @@ class Study:
 
     def _banner(self) -> None:
         project, url = self._config.project, self.server.url
-        link = f"{url}/next?projectId={project.id}{self._signed() if project.signed_links else ''}"
+        link = f"{url}/next?projectId={project.id}"
+        own = link + self._signed(_new_id()) if project.signed_links else link
         lines = [
             Text(""),
             Text.assemble("  ", (project.name or project.id, "bold")),
             Text(f"  {self._config.summary()}"),
             Text(""),
-            Text.assemble("  Link   ", (link, "bold green")),
+            Text.assemble("  Link   ", (own, "bold green")),
             Text(f"  Data   {self._data}"),
             Text(f"  Logs   {near(self._state / 'logs')}"),
             *self._how_to_trust(),
+            *self._how_to_play_together(link),
             Text(""),
             Text(f"  {_ONE_EACH if project.signed_links else _WHOEVER} Ctrl-C ends everything."),
         ]
@@ -149,9 +152,34 @@ class Study:
             lines.append(Text(text, "yellow"))
         return lines
 
-    def _signed(self) -> str:
-        """The rest of a signed link, for a new participant."""
-        project_id, user_id = self._config.project.id, secrets.token_hex(12)
+    def _how_to_play_together(self, link: str) -> list[Text]:
+        """With `players`: a link for each of them, so that one researcher can play in all places."""
+        project = self._config.project
+        if not project.has_sessions:
+            return []
+        run = secrets.token_hex(2)
+        names = own_places.user_ids(
+            project.id,
+            project.players,
+            project.matching,
+            self._config.groups,
+            lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
+        )
+        more = [self._signed(name) if project.signed_links else f"&userId={name}" for name in names]
+        said = _TOGETHER.format(
+            places="both" if project.players == 2 else f"all {project.players}", patience=f"{project.patience:g}"
+        )
+        advice = own_places.advice(project.matching)
+        return [
+            Text(""),
+            *(Text(line) for line in said.splitlines()),
+            *([Text(f"  {advice}")] if advice else []),
+            *(Text(f"    {link}{each}", "green") for each in more),
+        ]
+
+    def _signed(self, user_id: str) -> str:
+        """The rest of this participant's signed link."""
+        project_id = self._config.project.id
         project = ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
@@ -164,10 +192,18 @@ _TLS = """\
   Let your browser trust this certificate, which vouches for names of this machine alone. In Chrome: Settings, Privacy
   and security, Security, Manage certificates. In Firefox: Settings, Privacy & Security, View Certificates, Authorities.
   On macOS: open it, and choose Always Trust."""
+_TOGETHER = """\
+  To play in {places} places yourself, open these links in windows side by side: a page that is hidden counts as away.
+  Come to the game in each within {patience} seconds of the others (`patience`):"""
 _WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
 _NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+def _new_id() -> str:
+    """An id of a participant."""
+    return secrets.token_hex(12)
 
 
 def near(path: Path) -> Path:

@@ -12,8 +12,12 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any
 
+from protocol.times import time_text
+
 GAME = "game"
 """The `page` of a game step's answer."""
+UNMATCHED = "unmatched"
+"""The `outcome` of a game step whose participant found no others to play with."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,8 @@ class Answer:
 
 
 def to_json(answer: Answer) -> bytes:
-    """The document. `answered` must be in UTC: `2026-11-21T14:46:40.123456Z`."""
-    document = asdict(answer) | {"answered": answer.answered.strftime("%Y-%m-%dT%H:%M:%S.%fZ")}
+    """The document. `answered` must be in UTC."""
+    document = asdict(answer) | {"answered": time_text(answer.answered)}
     return json.dumps(document).encode()
 
 

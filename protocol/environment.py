@@ -27,8 +27,14 @@ GROUP = "GROUP"
 """The participant's group, a whole number; empty in a study without groups. The researcher's agent may read it."""
 WARM_SERVER = "SPARE"
 """`on`: a warm server."""
+SESSION = "SESSION"
+"""The session's id, if several participants play on this server. Then there are no USER_ID and no GROUP: the server
+reads both in the session's document."""
 
 # Given by the control plane
+
+MATCHING = "MATCHING"
+"""`match`: the server asks the function `match` of agent.py who plays with whom, while its session has no members."""
 
 TRIAL = "TRIAL"
 """The `trial` section as JSON. Without it, ./config.yml is read."""
@@ -62,6 +68,8 @@ START_SECONDS = "START_SECONDS"
 STEP_SECONDS = "STEP_SECONDS"
 """For one step of the agent."""
 HELLO_SECONDS = "HELLO_SECONDS"
+RECORDINGS_FIRST_SECONDS = "RECORDINGS_FIRST_SECONDS"
+"""An answer waits for so long until the recordings before it are stored; 120 by default."""
 LINGER_SECONDS = "LINGER_SECONDS"
 """From the stored answer to the process's end."""
 WARM_SERVER_SECONDS = "SPARE_SECONDS"

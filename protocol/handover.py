@@ -2,6 +2,8 @@
 
     {"userId": "…", "group": 0 or null, "server": "…"}
 
+In a project with sessions (`project.players`) the session's id stands in the place of the participant's.
+
 The control plane creates it once, before the participant's page is told the server's address. A later version may write
 another `schema` than 1, which this one refuses.
 """
@@ -12,6 +14,7 @@ import json
 from dataclasses import dataclass
 
 from protocol.keys import NAME, SERVER_NAME
+from protocol.session import is_session_id
 
 SCHEMA = 1
 
@@ -24,7 +27,8 @@ class BadHandover(ValueError):
 class Handover:
     """The participant, their group (None: the study has none), and the server's name from now on.
 
-    `server` is the name under which the participant's recordings of this attempt lie.
+    `user_id` may be the id of a session, whose members stand in its document (`protocol/session.py`). `server` is the
+    name under which the recordings of this attempt lie.
     """
 
     user_id: str
@@ -46,7 +50,7 @@ def parse(body: bytes) -> Handover:
     if not isinstance(found, dict) or found.get("schema", SCHEMA) != SCHEMA:
         raise BadHandover("its document is none that this server can read")
     user_id, group, server = found.get("userId"), found.get("group"), found.get("server")
-    if not (isinstance(user_id, str) and NAME.fullmatch(user_id)):
+    if not (isinstance(user_id, str) and (NAME.fullmatch(user_id) or is_session_id(user_id))):
         raise BadHandover("its document names no participant")
     if not (isinstance(server, str) and SERVER_NAME.fullmatch(server)):
         raise BadHandover("its document names no server")

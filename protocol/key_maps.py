@@ -1,11 +1,11 @@
-"""The keys `keys` and `labels` of the section `trial`: maps of names of the project's own.
+"""The keys `keys`, `labels` and `playerNames` of the section `trial`: maps of names of the project's own.
 
 Each function returns what is good of the map at this path, and what is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol import keyboard, values
@@ -14,6 +14,7 @@ from protocol.values import LONGEST_NAME, Keys, Problem, checked
 MAX_KEYS = 100
 """Keys of one player, and labels."""
 _LABEL = values.text("the text of a button", LONGEST_NAME)
+_NAME = values.text("what participants read", LONGEST_NAME)
 
 
 def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
@@ -44,15 +45,26 @@ def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str]
 
 def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
     """The texts of buttons: `{action: text}`."""
+    return _texts(value, path, _action, _LABEL)
+
+
+def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+    """What participants read of players: `{player: text}`."""
+    return _texts(value, path, str, _NAME)
+
+
+def _texts(
+    value: dict[str, Any], path: Keys, key: Callable[[Any], Any], text: Callable[[Any], Any]
+) -> tuple[dict[str, str], list[Problem]]:
     found: dict[str, str] = {}
     problems: list[Problem] = []
-    for name, label in value.items():
-        here = (*path, name)
-        action, wrong = checked(_action, name, here)
-        text, wrong_text = checked(_LABEL, label, here)
+    for given, said in value.items():
+        here = (*path, given)
+        name, wrong = checked(key, given, here)
+        words, wrong_text = checked(text, said, here)
         problems += wrong + wrong_text
         if not wrong and not wrong_text:
-            found[action] = text
+            found[name] = words
     return found, _few(value, problems, path)
 
 

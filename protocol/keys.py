@@ -10,6 +10,10 @@ import re
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 """The names that a project, a participant and a step may have."""
+QUESTIONS = "_match/"
+"""The folder of what the function `match` is asked, of all projects."""
+QUESTION_ID = re.compile(r"[0-9a-f]{20}")
+"""The id of a question to the function `match`."""
 SERVER_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
 """The names that a server may have."""
 
@@ -27,6 +31,51 @@ def answer_key(project_id: str, user_id: str, step: str) -> str:
 def recordings_folder(project_id: str, user_id: str) -> str:
     """The folder of a participant's recordings: each server has a folder of its own name in it."""
     return f"{participant_folder(project_id, user_id)}trials/"
+
+
+def membership_key(project_id: str, user_id: str) -> str:
+    """The key of the document that says in which session a participant plays (`project.players`)."""
+    return f"{participant_folder(project_id, user_id)}session.json"
+
+
+def sessions_folder(project_id: str) -> str:
+    """The folder of a project's sessions."""
+    return f"{project_id}/sessions/"
+
+
+def session_folder(project_id: str, session_id: str) -> str:
+    """The folder of the documents of one session."""
+    return f"{sessions_folder(project_id)}{session_id}/"
+
+
+def session_key(project_id: str, session_id: str) -> str:
+    """The key of a session's document (`protocol/session.py`)."""
+    return f"{session_folder(project_id, session_id)}session.json"
+
+
+def session_recordings_folder(project_id: str, session_id: str) -> str:
+    """The folder of a session's recordings: each server has a folder of its own name in it."""
+    return f"{session_folder(project_id, session_id)}trials/"
+
+
+def questions_folder(project_id: str) -> str:
+    """The folder of what `matching: match` asks the researcher's function. Older versions are kept for a day."""
+    return f"{QUESTIONS}{project_id}/"
+
+
+def waiting_key(project_id: str) -> str:
+    """The key of the document that says who waits: the question to the function `match` (`matching: match`)."""
+    return f"{questions_folder(project_id)}waiting.json"
+
+
+def groups_folder(project_id: str) -> str:
+    """The folder of the answers of the function `match`."""
+    return f"{project_id}/lobby/groups/"
+
+
+def groups_key(project_id: str, question: str) -> str:
+    """The key of the answer to the question with this id: the groups that the function `match` has chosen."""
+    return f"{groups_folder(project_id)}{question}.json"
 
 
 def handovers_folder(project_id: str) -> str:

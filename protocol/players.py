@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from protocol import values
 from protocol.values import show
@@ -21,6 +22,7 @@ ONNXRUNTIME = "onnxruntime==1.32.0"
 WHO = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
 
 MOST_PLAYERS = 64
+_MOST_NEAR = 5
 _NAME = values.text("the name of a player", values.LONGEST_NAME)
 _PLAYS = values.text(WHO, 200)
 _GROUP = re.compile(r"[0-9]{1,9}")
@@ -56,6 +58,14 @@ def _players(value: dict[Any, Any], where: str) -> dict[str, str]:
     if found and HUMAN not in found.values():
         raise ValueError(f"{where}must have a human: write human for the player that the participant plays")
     return found
+
+
+def policy(value: object) -> str:
+    """What plays in an empty place. Raises ValueError with what to write instead."""
+    plays = _plays(value, "")
+    if plays == HUMAN or plays.startswith(GYM_PLAYER):
+        raise ValueError(f"must be a policy: random, idle, agent:Class or a file, not {show(plays)}")
+    return plays
 
 
 def _plays(value: object, where: str) -> str:
@@ -96,6 +106,22 @@ def idle_action(value: object) -> str | dict[str, str]:
     return values.action_name(value)
 
 
+class Naming(Protocol):
+    """A section `trial`, as far as it names policies."""
+
+    @property
+    def players(self) -> Mapping[str, Any]: ...
+
+    @property
+    def substitute(self) -> str | None: ...
+
+
+def files_of(trial: Naming) -> Iterator[tuple[tuple[str, ...], str]]:
+    """The policies' files that a section `trial` names, each with its path of keys."""
+    for key, given in (("players", trial.players), ("substitute", {"": trial.substitute})):
+        yield from (((key, *filter(None, path)), file) for path, file in files(given))
+
+
 def files(given: object) -> Iterator[tuple[tuple[str, ...], str]]:
     """The policies' files that `players` names, each with its path of keys below `players`.
 
@@ -106,3 +132,12 @@ def files(given: object) -> Iterator[tuple[tuple[str, ...], str]]:
             yield from (((name, *path), file) for path, file in files(plays))
         elif isinstance(plays, str) and plays.endswith(".onnx"):
             yield (name,), plays.removeprefix(SAMPLE)
+
+
+def files_there(folder: Path) -> str:
+    """How a sentence about a policy's missing file ends: the files that there are beside agent.py; empty without any.
+
+    At most five are named.
+    """
+    near = sorted(other.relative_to(folder).as_posix() for other in folder.glob("policies/**/*.onnx"))
+    return f"; there are {', '.join(near[:_MOST_NEAR])}" if near else ""

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from protocol import key_maps, values
 from protocol import players as who
-from protocol.values import Check, Keys, Problem, number_in
+from protocol import trial_keys as keyed
+from protocol.trial_sections import Scene, Ui, usual_ui
+from protocol.values import Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
 """Words that a client says to the server, so no control of a project's own can be called so."""
 MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
+SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
+"""Keys of games of several participants (`project.players`). A registration leaves out what is as by default."""
 MOST_EPISODES = 1_000_000
 LONGEST_BREAK = 600
 """Seconds."""
@@ -25,150 +27,11 @@ HIGHEST_RATE = 240
 """Frames per second that no project may exceed."""
 
 
-@dataclass(frozen=True)
-class Key:
-    """A key of a section: its name in the file, and the attribute that holds its value."""
-
-    name: str
-    attribute: str
-    check: Check
-    default: Any
-    """What it is if it is not given; None if that is no plain value."""
-    meaning: str
-    schema: Mapping[str, Any]
-    """JSON Schema of the value, for editors."""
-    each: Check | None = None
-    """If the value is a list: the check of each item."""
-    section: type[Ui | Scene] | None = None
-    """If the value is a section of its own: the class of its keys."""
-    entries: Callable[[Any, Keys], tuple[Any, list[Problem]]] | None = None
-    """If the value is a map of names of the project's own: what is good of it at this path, and what is wrong."""
-
-
-def _about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    return {"check": check, "meaning": meaning, "schema": schema, **more}
-
-
-def _key(check: Check, default: Any, meaning: str, schema: Mapping[str, Any], **more: Any) -> Any:
-    return field(default=default, metadata=_about(check, meaning, schema, **more))
-
-
-def _flag(default: bool, meaning: str) -> Any:
-    return _key(values.flag, default, meaning, {"type": "boolean"})
-
-
-def _control() -> Any:
-    return _key(values.flag, False, "", {"type": "boolean"})
-
-
-def _whole(low: int, high: int, default: int | None, meaning: str) -> Any:
-    schema = {"type": "integer", "minimum": low, "maximum": high}
-    return _key(values.whole(low, high), default, meaning, schema)
-
-
-def _seconds(most: int, default: float, meaning: str, *, least: float = 0) -> Any:
-    """Seconds, from `least` on."""
-    return _key(values.number(least, most), default, meaning, {"type": "number", "minimum": least, "maximum": most})
-
-
-def _choice(words: tuple[str, ...], meaning: str) -> Any:
-    """One of these words; the first is the default."""
-    return _key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
-
-
-def _rate(default: int, meaning: str) -> Any:
-    return _whole(1, HIGHEST_RATE, default, meaning)
-
-
-@dataclass(frozen=True, slots=True)
-class Ui:
-    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
-
-    left: bool = _control()
-    right: bool = _control()
-    up: bool = _control()
-    down: bool = _control()
-    start: bool = _control()
-    stop: bool = _control()
-    pause: bool = _control()
-    reset: bool = _control()
-    train_offline: bool = _control()
-    train_online: bool = _control()
-    good: bool = _control()
-    bad: bool = _control()
-    fps_set: bool = _control()
-    fps_up: bool = _control()
-    fps_down: bool = _control()
-    own: tuple[str, ...] = ()
-    """The project's own controls: all other keys that are true. A press is a word for the agent."""
-
-    def shown(self) -> tuple[str, ...]:
-        """The names of all controls that are shown, the project's own last."""
-        return tuple(name for name, shown in _document(self).items() if shown)
-
-
-def _usual_ui() -> Ui:
-    return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)
-
-
-_COLOR = re.compile(r"#[0-9a-fA-F]{6}")
-_FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
-
-
-def _color(value: object) -> str:
-    """A color of the form `#rrggbb`, in small letters."""
-    found = values.as_text(value, 'a color such as "#ffffff", in quotes')
-    if not _COLOR.fullmatch(found):
-        raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
-    return found.lower()
-
-
-def _folder(value: object) -> str:
-    """A folder below the project's."""
-    found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
-    if len(found) > 200 or not _FOLDER.fullmatch(found):
-        raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
-    return found
-
-
-def _pixels(default: int, meaning: str) -> Any:
-    return _whole(1, 4096, default, meaning)
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """How a game is shown that is drawn by objects (docs/objects.md)."""
-
-    width: int = _pixels(600, "Width of the picture, in pixels of its own; the page makes it larger or smaller.")
-    height: int = _pixels(400, "Its height.")
-    background: str = _key(
-        _color,
-        "#ffffff",
-        "Color behind all objects, as #rrggbb in quotes.",
-        {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
-    )
-    coordinates: str = _choice(
-        ("relative", "pixels"),
-        "Whether x, y and points are shares of the picture, from 0 to 1, or pixels of it.",
-    )
-    pixel_art: bool = _flag(False, "Whether images keep hard edges when they are made larger.")
-    assets: str = _key(_folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"})
-
-
-_PAGE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
-
-
 def page(value: object) -> str:
     """A file in the folder of pages, without `.html`. Raises ValueError with what to write."""
-    found = values.as_text(value, "the name of a file in the steps folder")
-    stem = found.removesuffix(".html")
-    if "/" in found or "\\" in found:
-        raise ValueError(f"must be the name of a file in the steps folder, without folders, not {values.show(found)}")
+    stem = values.step_file(values.as_text(value, "the name of a file in the steps folder"))
     if stem == "game":
         raise ValueError("a page cannot be called game.html; rename it")
-    if not _PAGE.fullmatch(stem) or ".." in stem:
-        letters = "letters (a to z), digits, spaces, dots, dashes and underscores"
-        raise ValueError(f"file names may hold {letters}; rename {values.show(found)}")
     return stem
 
 
@@ -182,41 +45,45 @@ def _break(value: object) -> float | str:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
 
+def _rate(default: int, meaning: str) -> Any:
+    return keyed.whole(1, HIGHEST_RATE, default, meaning)
+
+
 @dataclass(frozen=True, slots=True)
 class Trial:
     """What happens on the participant's server."""
 
-    action_buffer_lifespan: int = _whole(
+    action_buffer_lifespan: int = keyed.whole(
         1, 10_000, 1, "Environment steps for which an action stays in force unless another comes; 1 is no buffer."
     )
-    max_episodes: int = _whole(1, MOST_EPISODES, 20, "Episodes until the trial is over.")
-    between_episodes: float | str = _key(
+    max_episodes: int = keyed.whole(1, MOST_EPISODES, 20, "Episodes until the trial is over.")
+    between_episodes: float | str = keyed.key(
         _break,
         3,
         "Seconds of the break between two episodes, with the score and a countdown; 0 is none. Or a file of steps/, "
         "which is shown until the participant goes on.",
         {"anyOf": [{"type": "number", "minimum": 0, "maximum": LONGEST_BREAK}, {"type": "string"}]},
     )
-    instructions: str | None = _key(
+    instructions: str | None = keyed.key(
         page,
         None,
         "A file of steps/ that the game page shows before the game, and again in a pause.",
         {"type": "string"},
     )
-    reset_freeze: float = _seconds(
+    reset_freeze: float = keyed.seconds(
         60,
         0,
         "Seconds for which each episode shows its first picture, with a countdown; keys do nothing.",
     )
-    max_steps: int = _whole(0, 10**9, 0, "Steps after which an episode is truncated; 0 is no limit.")
-    episode_seconds: float = _seconds(
+    max_steps: int = keyed.whole(0, 10**9, 0, "Steps after which an episode is truncated; 0 is no limit.")
+    episode_seconds: float = keyed.seconds(
         86_400,
         0,
         "Seconds of play after which an episode is truncated; the page shows the time left. 0 is no limit.",
     )
     keys: dict[str, Any] = field(
         default_factory=dict,
-        metadata=_about(
+        metadata=keyed.about(
             values.section("ArrowLeft: left"),
             "What the keys of the keyboard do: an action by KeyboardEvent.key, or several joined by +; or such a map "
             "for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
@@ -234,64 +101,59 @@ class Trial:
     )
     labels: dict[str, str] = field(
         default_factory=dict,
-        metadata=_about(
-            values.section("left: Go left"),
-            "Texts of the buttons, by action.",
-            {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
-            entries=key_maps.labels,
-        ),
+        metadata=keyed.texts("left: Go left", "Texts of the buttons, by action.", key_maps.labels),
     )
-    input: str = _choice(
+    input: str = keyed.choice(
         ("held", "single"),
         "Whether an action goes on while its keys are held, or each press of a key is one action.",
     )
-    game: str | None = _key(
+    game: str | None = keyed.key(
         values.text("the name of an environment"),
         None,
         "Name of the environment, given to the agent's start(). Needed if there is a game step.",
         {"type": "string"},
     )
-    data_file: str = _choice(
+    data_file: str = keyed.choice(
         ("episode", "trial"),
         "Whether a recording is written after each episode or once at the end of the trial.",
     )
-    s3upload: bool = _flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
-    action_space: tuple[str, ...] = _key(
+    s3upload: bool = keyed.flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
+    action_space: tuple[str, ...] = keyed.key(
         values.items("action", 1000),
         (),
         "Names of the actions, in the order of the environment's numbers.",
         {"type": "array", "items": {"type": "string"}},
         each=values.action_name,
     )
-    allow_frame_rate_change: bool = _flag(False, "Whether participants may change the frame rate.")
+    allow_frame_rate_change: bool = keyed.flag(False, "Whether participants may change the frame rate.")
     frame_rate_step_size: int = _rate(5, "Frames per second by which fpsUp and fpsDown change the rate.")
     min_frame_rate: int = _rate(1, "Lowest rate, in frames per second.")
     max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
     starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
     ui: Ui = field(
-        default_factory=_usual_ui,
-        metadata=_about(
+        default_factory=usual_ui,
+        metadata=keyed.about(
             values.section("bad: …"),
             "Controls on the game page. Default: left, right, up, down, start, pause.",
             {"$ref": "#/$defs/Ui"},
             section=Ui,
         ),
     )
-    record_observations: bool = _flag(False, "Whether recordings hold the full observations, which can be large.")
-    lossless: bool = _flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
-    callback_seconds: float = _seconds(
+    record_observations: bool = keyed.flag(False, "Whether recordings hold the full observations, which can be large.")
+    lossless: bool = keyed.flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
+    callback_seconds: float = keyed.seconds(
         10,
         0.5,
         "Seconds for which the game waits for a callback of the agent; then it goes on without waiting.",
     )
-    gym: str = _choice(
+    gym: str = keyed.choice(
         ("none", "watch", "advise", "environments"),
         "What programs that have the server's token may do at its path /gym: nothing, see each step, also advise, or "
         "make environments of their own.",
     )
     scene: Scene | None = field(
         default=None,
-        metadata=_about(
+        metadata=keyed.about(
             values.section("width: 600"),
             "The game is drawn by objects that render() returns, in a picture of this size. Without it, by frames.",
             {"$ref": "#/$defs/Scene"},
@@ -300,7 +162,7 @@ class Trial:
     )
     players: dict[str, Any] = field(
         default_factory=dict,
-        metadata=_about(
+        metadata=keyed.about(
             who.players,
             "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
             "gym://name. One such map for each group, by its number, if groups differ. An environment with one player "
@@ -313,35 +175,74 @@ class Trial:
             },
         ),
     )
-    frame_skip: int = _whole(1, 1000, 1, "Policies choose anew at one step in so many.")
-    policy_seconds: float = _seconds(
+    frame_skip: int = keyed.whole(1, 1000, 1, "Policies choose anew at one step in so many.")
+    policy_seconds: float = keyed.seconds(
         600,
         10,
         "With pace: turns, the seconds that a policy may think; then the idle action is taken.",
         least=0.01,  # with 0, which elsewhere is no limit, each action would come late
     )
-    seed: int | None = _whole(
+    substitute: str | None = keyed.key(
+        who.policy,
+        None,
+        "What plays in the place of a participant who is not there, if project.players is 2 or more: a policy as in "
+        "players.",
+        {"type": "string"},
+    )
+    absent: float = keyed.seconds(
+        3600,
+        30,
+        "Seconds for which the game is held when a participant's connection is gone, if others play with them.",
+    )
+    gather: float = keyed.seconds(
+        3600,
+        120,
+        "Seconds for which those who are there wait, before the game and at a page between two episodes, for a "
+        "participant who has not come or who reads on, if others play with them.",
+    )
+    after_absent: str = keyed.choice(
+        ("end", "policy"),
+        "What happens then: the game ends for all, or substitute plays in the place until the participant is back.",
+    )
+    countdown: float = keyed.seconds(60, 3, "Seconds from when all participants are there until the game begins.")
+    max_ping: int = keyed.whole(
+        0,
+        10_000,
+        0,
+        "Milliseconds that a participant's round trip to the server may take before a game of several participants; "
+        "0 is no limit.",
+    )
+    ping_samples: int = keyed.whole(1, 100, 5, "Round trips that are measured before the game; their median counts.")
+    player_names: dict[str, str] = field(
+        default_factory=dict,
+        metadata=keyed.texts(
+            "red: The red one",
+            "What participants who play together read instead of the players' names in the environment.",
+            key_maps.player_names,
+        ),
+    )
+    seed: int | None = keyed.whole(
         0,
         2**31 - MOST_EPISODES - 1,  # the last episode's seed too is below 2**31
         None,
         "Seed of the first episode; each one after it has the next number. Without it, each has a random one.",
     )
-    pace: str = _choice(
+    pace: str = keyed.choice(
         ("realtime", "turns"),
         "Whether a step is taken at each frame, or as soon as all have chosen who are to act.",
     )
-    turn_seconds: float = _seconds(
+    turn_seconds: float = keyed.seconds(
         86_400,
         0,
         "With pace: turns, the seconds in which a participant must choose; 0 is no limit.",
     )
-    turn_ends: str = _choice(
+    turn_ends: str = keyed.choice(
         ("idle", "random", "episode"),
         "What happens when turnSeconds are over: the idle action, a random possible one, or the episode ends.",
     )
     idle_action: str | dict[str, str] | None = field(
         default=None,
-        metadata=_about(
+        metadata=keyed.about(
             who.idle_action,
             "Name of the action of no key, or one for each player. Default: noop, if there is one, else the first.",
             {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
@@ -349,7 +250,7 @@ class Trial:
     )
     options: dict[str, Any] = field(
         default_factory=dict,
-        metadata=_about(
+        metadata=keyed.about(
             values.options,
             "Whatever else the agent wants to know: a map of your own keys; at most 4 KB.",
             {"type": "object"},
@@ -383,6 +284,18 @@ class Trial:
         else:
             yield (), self.keys
 
+    def player_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
+        """The maps in `players`, each with its path below `players`: that of all groups, or one for each."""
+        if who.by_group(self.players):
+            yield from (((group,), each) for group, each in self.players.items())
+        else:
+            yield (), self.players
+
+    def humans(self) -> Iterator[tuple[Keys, list[str]]]:
+        """The players that participants play, as in `player_maps`."""
+        for path, players in self.player_maps():
+            yield path, [name for name, plays in players.items() if plays == who.HUMAN]
+
     def players_of(self, group: int | None) -> dict[str, str]:
         """What plays each player in this group; empty if the section does not say."""
         if who.by_group(self.players):
@@ -393,45 +306,15 @@ class Trial:
         """The groups that `players` names; empty if it does not differ between groups."""
         return tuple(map(int, self.players)) if who.by_group(self.players) else ()
 
-    def player_names(self) -> tuple[str, ...]:
+    def named_players(self) -> tuple[str, ...]:
         """The players that `players` names, in any group."""
-        tables = self.players.values() if who.by_group(self.players) else [self.players]
-        return tuple(dict.fromkeys(name for table in tables for name in table))
+        return tuple(dict.fromkeys(name for _, players in self.player_maps() for name in players))
 
     def document(self) -> dict[str, Any]:
         """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""
-        return _document(self)
+        return keyed.document(self)
 
-
-def _document(section: Trial | Ui | Scene) -> dict[str, Any]:
-    document = {
-        key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))
-    }
-    return document | dict.fromkeys(section.own, True) if isinstance(section, Ui) else document
-
-
-def _plain(value: Any, section: bool) -> Any:
-    if section and value is not None:
-        return _document(value)
-    return list(value) if isinstance(value, tuple) else value
-
-
-def keys(section: type[Trial | Ui | Scene]) -> tuple[Key, ...]:
-    """The keys of `Trial`, `Ui` or `Scene`, in order."""
-    found = []
-    for each in dataclasses.fields(section):
-        if not each.metadata:
-            continue
-        default = None if each.default is dataclasses.MISSING else each.default
-        found.append(Key(name=_camel(each.name), attribute=each.name, default=default, **each.metadata))
-    return tuple(found)
-
-
-def names(section: type[Trial | Ui | Scene]) -> frozenset[str]:
-    """The names of the keys as they stand in the file."""
-    return frozenset(key.name for key in keys(section))
-
-
-def _camel(name: str) -> str:
-    first, *others = name.split("_")
-    return first + "".join(other.capitalize() for other in others)
+    def registered(self) -> dict[str, Any]:
+        """The section as servers are told it, in few characters: without what of sessions is as by default."""
+        usual = Trial().document()
+        return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != usual[key]}

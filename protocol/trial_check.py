@@ -8,17 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from protocol import trial_rules, values
-from protocol.trial import (
-    MAX_OWN_CONTROLS,
-    RATE_CHANGE,
-    RATE_CHANGE_MISSPELT,
-    TAKEN,
-    Scene,
-    Trial,
-    Ui,
-    keys,
-    names,
-)
+from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, TAKEN, Trial
+from protocol.trial_keys import keys, names
+from protocol.trial_sections import Scene, Ui
 from protocol.values import LONGEST_NAME, Check, Keys, Problem, checked
 
 _CONTROL = values.text("the name of a control", LONGEST_NAME)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterator
 
-from protocol import players as who
 from protocol import values
 from protocol.players import GYM_PLAYER
 from protocol.trial import Trial
@@ -54,11 +53,20 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
 
 def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     """Keys by player name players of `players`, if that is given."""
-    known = trial.player_names()
+    known = trial.named_players()
     for player, keys in trial.keys.items():
         if known and isinstance(keys, dict) and player not in known:
             sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
             yield Problem(("keys", player), sentence, ("players", "keys"))
+
+
+def _players_of_names(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """Names name players of `players`, if that is given."""
+    known = trial.named_players()
+    for player in trial.player_names:
+        if known and player not in known:
+            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
+            yield Problem(("playerNames", player), sentence, ("players", "playerNames"))
 
 
 def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
@@ -74,12 +82,18 @@ def _programs(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     """A program that plays needs a way in."""
     if trial.gym == "advise":
         return
-    tables = trial.players.values() if who.by_group(trial.players) else [trial.players]
-    for table in tables:
-        for name, plays in table.items():
+    for _, players in trial.player_maps():
+        for name, plays in players.items():
             if plays.startswith(GYM_PLAYER):
                 yield Problem(("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",))
                 return
+
+
+def _substitute(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+    """A policy that takes a place."""
+    if trial.after_absent == "policy" and trial.substitute is None:
+        what = "afterAbsent: policy needs a policy that takes the place, such as substitute: random"
+        yield Problem(("substitute",), f"missing; {what}", ("afterAbsent", "substitute"))
 
 
 RULES: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
@@ -87,5 +101,7 @@ RULES: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
     _different_actions,
     _actions_that_exist,
     _players_of_keys,
+    _players_of_names,
     _programs,
+    _substitute,
 )

@@ -22,6 +22,7 @@ _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+_STEP_FILE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # ECS allows 8192 characters for all variables of a server
 
@@ -111,6 +112,17 @@ def action_name(value: object) -> str:
 
 
 _ACTION_NAME = text("the name of an action", LONGEST_NAME)
+
+
+def step_file(text: str) -> str:
+    """A file in the folder of pages, without `.html`. Raises ValueError with what to write."""
+    stem = text.removesuffix(".html")
+    if "/" in text or "\\" in text:
+        raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(text)}")
+    if not _STEP_FILE.fullmatch(stem) or ".." in stem:
+        letters = "letters (a to z), digits, spaces, dots, dashes and underscores"
+        raise ValueError(f"file names may hold {letters}; rename {show(text)}")
+    return stem
 
 
 def number_in(value: object) -> int | float | None:

@@ -28,6 +28,7 @@ Faults, one module for each height at which they are injected
     `os_faults`       at the system's calls of one machine; `power_cut` loses what was not synced
 
 How much and how fast
+    `quiet_log`       the log stands still meanwhile
     `exploration`     how many examples and cases `make test` and `make hunt` take
     `preloaded`       processes of `python -m …` that begin with their imports done
     `memoized_aws`    botocore and moto compute once per process what they would compute for each client and call

@@ -54,12 +54,17 @@ def chromium() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def game_page(
-    url: str, *, user: str, token: str, step: str = "1", trial: Mapping[str, Any] | None = None
+    url: str, *, user: str, token: str, step: str = "1", trial: Mapping[str, Any] | None = None, players: int = 1
 ) -> Iterator[str]:
-    """The address of Hippodrome's own game page, for the trial server at `url` of a project with this `trial`."""
+    """The address of Hippodrome's own game page, for the trial server at `url` of a project with this `trial`.
+
+    With `players` more than 1, `user` is a member of a full session.
+    """
     state = {"state": "ready", "seconds": 0, "attempt": 1, "url": url, "userId": user, "token": token}
+    if players > 1:
+        state |= {"session": True, "players": players, "members": players}
     game = Step(step, "game")
-    project = Project(id="bench", name="Bench", steps=[game], researcher="Bench", trial=trial or {})
+    project = Project(id="bench", name="Bench", steps=[game], researcher="Bench", trial=trial or {}, players=players)
     view = pages.GameView(project, game, user, state, "/?poll=1", "/", "/", "", "ws://127.0.0.1:*")
     page = pages.game_page(view)
     with html_page(page.html, page.headers, {"/?poll=1": json.dumps(state)}) as address:

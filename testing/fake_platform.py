@@ -67,7 +67,13 @@ class FakeDocuments:
         self.kept.pop(key, None)
 
     def put(self, key: str, body: bytes) -> None:
-        """Write without conditions: what a test or an outsider does."""
+        """Write without conditions."""
+        self.calls.append("put")
+        self._interfere()
+        self._write(key, body)
+
+    def keep(self, key: str, body: bytes) -> None:
+        """Write as an outsider does: no call of ours, so nothing comes before it."""
         self._write(key, body)
 
     def _interfere(self) -> None:

@@ -6,15 +6,19 @@ so a test can see no difference except in time. `testing/moto_world.py` has what
 
 from __future__ import annotations
 
+import copy
 import functools
 import os
 import re
+import string
 from collections.abc import Callable, Hashable
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import botocore.auth
 import botocore.client
+import botocore.endpoint
 import botocore.endpoint_provider
 import botocore.hooks
 import botocore.httpsession
@@ -34,6 +38,7 @@ from moto import backend_index
 from moto.core.models import DEFAULT_ACCOUNT_ID
 from moto.core.request import normalize_request
 from moto.moto_api import recorder
+from moto.moto_api._internal.moto_random import MotoRandom
 from werkzeug.exceptions import HTTPException
 
 
@@ -68,6 +73,8 @@ def _keep_clients() -> None:
     setattr(botocore.hooks._PrefixTrie, "__copy__", _copy_of_handlers)  # noqa: B010
     make = botocore.httpsession.create_urllib3_context
     setattr(botocore.httpsession, "create_urllib3_context", _context(make))  # noqa: B010
+    proxies = botocore.endpoint.get_environ_proxies
+    setattr(botocore.endpoint, "get_environ_proxies", _proxies(proxies))  # noqa: B010
 
 
 def _keep_calls() -> None:
@@ -97,6 +104,9 @@ def _keep_moto() -> None:
     setattr(mock, "_enable_patching", _intercept(mock._enable_patching))  # noqa: B010
     stubber = moto.core.botocore_stubber.BotocoreStubber
     setattr(stubber, "process_request", _route(stubber.process_request))  # noqa: B010
+    setattr(MotoRandom, "get_random_string", _random_string)  # noqa: B010 - two for each call of AWS
+    # A listing of versions sets in its copies of the bucket's objects which is the latest, and copied their bodies, too.
+    setattr(moto.s3.models, "copy", SimpleNamespace(copy=copy.copy, deepcopy=_copies))  # noqa: B010
     _keep(
         moto.core.base_backend.AccountSpecificBackend,
         "_generate_regions",
@@ -119,6 +129,11 @@ def _context(make: Callable[..., Any]) -> Callable[..., Any]:
         return (shared if moto.core.models.botocore_stubber.enabled else make)(*arguments, **more)
 
     return made
+
+
+def _proxies(find: Callable[[str], Any]) -> Callable[[str], Any]:
+    """`get_environ_proxies`, which reads the whole environment for each client; those of moto's worlds connect to nothing."""
+    return lambda url: {} if moto.core.models.botocore_stubber.enabled else find(url)
 
 
 def _sign(sign: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
@@ -203,6 +218,15 @@ _generate = moto.acm.models.CertBundle.generate_cert
 @functools.cache
 def _certificate(domain_name: str, sans: tuple[str, ...], authority: str | None) -> Any:
     return _generate(domain_name, DEFAULT_ACCOUNT_ID, "us-east-1", [*sans], authority)
+
+
+def _random_string(chance: MotoRandom, length: int = 20, include_digits: bool = True, lower_case: bool = False) -> str:
+    made = "".join(chance.choices(string.ascii_letters + (string.digits if include_digits else ""), k=length))
+    return made.lower() if lower_case else made
+
+
+def _copies(versions: list[Any]) -> list[Any]:
+    return [copy.copy(version) for version in versions]
 
 
 class _Addresses(dict[type, Any]):

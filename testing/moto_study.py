@@ -17,6 +17,7 @@ from urllib.parse import urlencode
 from hippodrome.config import read_project
 from hippodrome.model import ids, server
 from lambdas import installed, next_step, start_server, stop_server, task_changed, update_project_master_list
+from protocol.keys import membership_key
 from testing import aws_events
 from testing.moto_world import MotoWorld
 from testing.visitors import body_of, hidden
@@ -204,3 +205,62 @@ class Person:
         elif self.poll()["state"] == "ready":
             self.play()
         return True
+
+
+PAIRS: dict[str, Any] = {
+    "players": 2,
+    "trial": {**read_project(ROOT).registration()["trial"], "players": {"first_0": "human", "second_0": "human"}},
+}
+"""What makes the example study one that participants play in pairs."""
+
+
+class Member(Person):
+    """A participant of a study that several play together."""
+
+    def poll(self) -> Any:
+        """Ask as the page does, with the ticket that it has in its address."""
+        query = f"&poll={GAME}&ticket={self.hidden['hippodrome-ticket']}"
+        answer = self.send("http_get", query, headers={"accept": "application/json"})
+        assert answer["statusCode"] == 200
+        return json.loads(body_of(answer))
+
+    def leave(self) -> None:
+        """They close the lobby's page."""
+        body = urlencode({**self.hidden, "hippodrome-action": "leave"})
+        assert self.send("http_post_form", body=body)["statusCode"] == 204
+
+    @property
+    def membership(self) -> Any:
+        """The document that says in which session they play; None if it is not decided."""
+        return self.study.stored(membership_key(PROJECT, self.user))
+
+
+def come(study: StudyOnMoto, *members: Member) -> None:
+    """They come to the game. Their servers are started ahead, while they answer the page before it."""
+    for member in members:
+        member.look()
+        member.answer(consent="yes")
+    study.deliver()
+    for member in members:
+        member.answer(age="33")
+
+
+def meet(*members: Member, polls: int = 6) -> list[Any]:
+    """They wait in the lobby together, and ask in turn until none of them is in it any more; their last states."""
+    states: list[Any] = []
+    for _ in range(polls):
+        states = [member.poll() for member in members]
+        if all(state["state"] != "lobby" for state in states):
+            return states
+    raise AssertionError(f"not matched: {states}")
+
+
+def play_together(study: StudyOnMoto, *members: Member, score: int = 120) -> None:
+    """The trial writes each member's answer, and their browsers come back."""
+    session = members[0].membership["session"]
+    for member in members:
+        answers = {"score": score, "session": session, "player": member.membership["seat"], "outcome": "finished"}
+        body = json.dumps({"step": GAME, "answers": answers}).encode()
+        study.put(f"{PROJECT}/users/{member.user}/answers/{GAME}.json", body)
+    for member in members:
+        member.look()

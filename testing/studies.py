@@ -45,7 +45,7 @@ def installed(project: Project | None = None) -> FakePlatform:
     """A platform in memory with the study registered and its pages uploaded."""
     platform = FakePlatform()
     project = project or study()
-    platform.documents.put(MASTER_LIST, to_json(MasterList([project])))
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))
     for file, source in PAGES.items():
-        platform.documents.put(step_key(project.id, file), source.encode())
+        platform.documents.keep(step_key(project.id, file), source.encode())
     return platform

@@ -48,6 +48,11 @@ class Task:
         return self.request.environment.get("USER_ID", "")
 
     @property
+    def session(self) -> str:
+        """The id of the session whose it was from the beginning; empty for all others."""
+        return self.request.environment.get("SESSION", "")
+
+    @property
     def is_warm_server(self) -> bool:
         """Whether it was started ahead, for no participant."""
         return self.request.environment.get("SPARE") == "on"

@@ -19,6 +19,7 @@ from werkzeug.serving import BaseWSGIServer
 from testing import exploration, memoized_aws
 
 TESTS = Path(__file__).resolve().parent
+HUNT_TIMEOUT = 900  # seconds of a test that takes all its cases, where `make test` takes one of twelve
 ONE_AFTER_ANOTHER = (
     ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
     ("tests/browser/test_pages_browser.py",),
@@ -82,6 +83,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = [item for item in items if not wanted(item)]
     items[:] = sorted((item for item in items if wanted(item)), key=lambda item: (_turn(item), item.path))
     config.hook.pytest_deselected(items=left_out)
+    if exploration.TIMES:
+        for item in items:
+            if item.get_closest_marker("timeout") is None:
+                item.add_marker(pytest.mark.timeout(HUNT_TIMEOUT))
 
 
 def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:

@@ -16,7 +16,7 @@ MAY: dict[str, set[str]] = {
     "hippodrome": {"protocol"},
     "lambdas": {"hippodrome"},
     "trial": {"protocol"},
-    "export": {"console", "hippodrome"},
+    "export": {"console", "hippodrome", "protocol"},
     "bots": {"hippodrome", "protocol", "trial"},
     "local": {"hippodrome", "lambdas", "protocol", "bots", "trial"},
     "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "bots", "trial"},
@@ -26,7 +26,19 @@ MAY: dict[str, set[str]] = {
 PRODUCT = set(MAY) - {"testing", "bench"}
 ROOMS = {
     "hippodrome": (
-        *("ports", "model", "log", "storage", "certificates", "limits", "http", "servers", "participants", "config"),
+        *(
+            "ports",
+            "model",
+            "log",
+            "storage",
+            "certificates",
+            "limits",
+            "http",
+            "lobby",
+            "servers",
+            "participants",
+            "config",
+        ),
         *("aws", "metrics", "registry"),
     ),
     "trial": (

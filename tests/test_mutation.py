@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,11 @@ def test_each_mutant_is_one_small_change_of_what_runs() -> None:
     ]
 
 
+@pytest.mark.parametrize("line", ['Size = Literal["small", "large"]', 'self._emit(Log(20, "small"))'])
+def test_types_and_what_is_logged_are_left_as_they_are(line: str) -> None:
+    assert len(Mutants("core.py", line)) == 0
+
+
 def test_what_a_test_notices_is_killed_and_what_none_notices_survives(project: Path) -> None:
     mutants = Mutants("core.py", CORE)
     judged = Runner(project).judge([mutants[1], mutants[2]], {"core.py": ["test_core.py"]})
@@ -75,15 +81,50 @@ def test_what_a_test_notices_is_killed_and_what_none_notices_survives(project: P
 
 
 def test_a_mutant_without_tests_is_no_killed_one(project: Path) -> None:
-    with pytest.raises(Fails):
+    with pytest.raises(Fails, match=r"no test of core\.py"):
         list(Runner(project).judge([Mutants("core.py", CORE)[0]], {"core.py": ["test_nothing.py"]}))
+
+
+def test_tests_that_fail_without_a_mutation_judge_none(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They pass when they run for the first time, and not where their libraries are loaded."""
+    libraries = tmp_path_factory.mktemp("libraries")
+    (libraries / "loaded_once.py").write_text("")
+    monkeypatch.syspath_prepend(str(libraries))
+    (project / "test_core.py").write_text(
+        f"import sys\nassert 'loaded_once' not in sys.modules\nimport loaded_once\n{TESTS}"
+    )
+    runner, tests = Runner(project), {"core.py": ["test_core.py"]}
+    try:
+        runner.warm(tests["core.py"])
+        with pytest.raises(Fails, match=r"the tests of core\.py cannot judge it"):
+            list(runner.judge([Mutants("core.py", CORE)[0]], tests))
+    finally:
+        sys.modules.pop("loaded_once", None)
+
+
+def test_libraries_are_loaded_in_the_order_in_which_the_tests_load_them(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    libraries = tmp_path_factory.mktemp("libraries")
+    (libraries / "z_first.py").write_text("")
+    (libraries / "a_second.py").write_text("import sys\nassert 'z_first' in sys.modules\n")
+    monkeypatch.syspath_prepend(str(libraries))
+    (project / "test_core.py").write_text(f"import z_first, a_second\n{TESTS}")
+    try:
+        Runner(project).warm(["test_core.py"])
+        assert "a_second" in sys.modules
+    finally:
+        for name in ("z_first", "a_second"):
+            sys.modules.pop(name, None)
 
 
 def test_a_mutant_that_never_ends_is_killed(project: Path) -> None:
     mutants = Mutants("core.py", ENDLESS)
     changes = {mutant.becomes: mutant for mutant in map(mutants.__getitem__, range(len(mutants)))}
     tests = {"core.py": ["test_core.py"]}
-    assert [killed for _, killed in Runner(project, seconds=1).judge([changes["continue"]], tests)] == [True]
+    assert [killed for _, killed in Runner(project, seconds=3).judge([changes["continue"]], tests)] == [True]
     assert [killed for _, killed in Runner(project).judge([changes["if step > 10:"]], tests)] == [False]
 
 

@@ -1,4 +1,4 @@
-"""`python -m trial`: one participant's server, configured by its environment (protocol/environment.py)."""
+"""`python -m trial`: the server of a participant or a session, as its environment says (protocol/environment.py)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import signal
 import sys
 
 from protocol import environment, exits
-from trial.server import warm
+from trial.server import assignment
 from trial.server.preauth_limit import PortNotPermitted
 from trial.server.server import Server
 from trial.settings import Settings, SettingsError
@@ -41,8 +41,8 @@ def main() -> int:
         settings = Settings.from_env(os.environ)
         for secret in environment.SECRETS:
             os.environ.pop(secret, None)  # the researcher's code has no use for them
-        if settings.warm_server:
-            warm.set_environment(os.environ, None)
+        if not settings.assigned:
+            assignment.set_environment(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
     except SettingsError as error:
         print(f"trial: {error}", file=sys.stderr)

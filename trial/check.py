@@ -116,7 +116,7 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
     reader = PictureReader(scene, assets.load(folder, scene.assets) if scene is not None else assets.Assets())
     # One player takes the first action alone, which every game has.
     adapter = AgentAdapter(folder, config.game or DEFAULT_GAME, config.action_space or ("noop",), reader)
-    player = start(adapter, config.player_names())
+    player = start(adapter, config.named_players())
     if isinstance(player, AgentAdapter):
         player.reset(1)
         player.render()
@@ -129,7 +129,7 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
 def _play_jointly(adapter: JointAdapter, config: Trial, folder: Path) -> None:
     """One step, in which all who are to act take their first action and each policy is asked for one."""
     from trial.core.players import who_plays  # noqa: PLC0415 - as above
-    from trial.policies.seats import load_policies  # noqa: PLC0415
+    from trial.policies.places import load_policies  # noqa: PLC0415
 
     now, _ = adapter.reset(1)
     adapter.pictures()

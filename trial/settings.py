@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from protocol import environment as variables
-from protocol.keys import NAME, SERVER_NAME
+from protocol.keys import NAME, SERVER_NAME, recordings_folder, session_recordings_folder
+from protocol.session import Member, is_session_id
 from protocol.trial import Trial
 from protocol.trial_check import check
 from protocol.values import where_of
@@ -40,7 +41,8 @@ def trial_section(section: Mapping[str, Any]) -> Trial:
 class Settings:
     """Everything that one trial server is started with. Durations are seconds; `deadline` is seconds since the epoch.
 
-    A warm server without a participant has no `user_id` and no `group`, and `server` is its own name.
+    A warm server without a participant has no `user_id` and no `group`, and `server` is its own name. The server of a
+    session has no `user_id`; its `group` is the session's.
     """
 
     project_id: str
@@ -52,6 +54,14 @@ class Settings:
     trial: Trial
     group: int | None = None
     warm_server: bool = False
+    session: str = ""
+    """The id of the session whose members play here; empty if one participant plays."""
+    players: int = 1
+    """How many seats there are for participants."""
+    members: tuple[Member, ...] = ()
+    """The session's members, as its document says; none before it was read, and if one participant plays."""
+    match: bool = False
+    """The function `match` of agent.py says who plays with whom, and this server asks it."""
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
@@ -67,11 +77,37 @@ class Settings:
     step_seconds: float = 30.0
     hello_seconds: float = 10.0
     linger_seconds: float = 2.0
+    recordings_first_seconds: float = 120.0
     stop_seconds: float = 30.0
     credential: str = field(default="", repr=False)
     warm_server_seconds: float = 20.0
     plain_origins: frozenset[str] = frozenset()
     """Pages of these origins need no token (plainClients)."""
+
+    @property
+    def assigned(self) -> bool:
+        """It is known who plays here. A warm server, and one whose session is not formed yet, learn it later."""
+        return not self.warm_server and (not self.session or bool(self.members))
+
+    @property
+    def seats(self) -> Mapping[str, int]:
+        """The seat of each member of the session, by their id; empty if one participant plays.
+
+        `trial.substitute` plays in the seats of `range(players)` that are not among them.
+        """
+        return {member.user_id: member.seat for member in self.members if member.user_id}
+
+    @property
+    def private(self) -> tuple[str, ...]:
+        """The ids of those who play, which stand in no log."""
+        return tuple(self.seats) if self.session else (self.user_id,)
+
+    @property
+    def recordings_folder(self) -> str:
+        """The folder of this server's recordings, without a slash at its end."""
+        if self.session:
+            return session_recordings_folder(self.project_id, self.session) + self.server
+        return recordings_folder(self.project_id, self.user_id) + self.server
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
@@ -86,17 +122,23 @@ class Settings:
         port = _number(env, variables.PORT, 5000)
         if not (port.is_integer() and 0 <= port <= 65535):
             raise SettingsError("PORT must be a whole number from 0 to 65535")
+        session = "" if warm_server else env.get(variables.SESSION, "").strip()
+        if session and not is_session_id(session):
+            raise SettingsError("SESSION is not the id of a session")
+        origins = env.get(variables.PLAIN_ORIGINS, "").split()
         agent_dir, store = Path(env.get(variables.AGENT_DIR) or ".").resolve(), _required(env, variables.STORE)
         return cls(
             project_id=_name(env, variables.PROJECT_ID, NAME),
-            user_id="" if warm_server else _name(env, variables.USER_ID, NAME),
+            user_id="" if warm_server or session else _name(env, variables.USER_ID, NAME),
             server=_name(env, variables.SERVER, SERVER_NAME),
             token=_required(env, variables.TOKEN),
             game_steps=steps,
             store=store,
             trial=_trial_of(env),
-            group=None if warm_server else _group(env.get(variables.GROUP, "").strip()),
+            group=None if warm_server or session else _group(env.get(variables.GROUP, "").strip()),
             warm_server=warm_server,
+            session=session,
+            match=env.get(variables.MATCHING, "").strip() == "match",
             host=env.get(variables.HOST) or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls,
@@ -112,9 +154,10 @@ class Settings:
             step_seconds=_number(env, variables.STEP_SECONDS, 30.0),
             hello_seconds=_number(env, variables.HELLO_SECONDS, 10.0),
             linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
+            recordings_first_seconds=_number(env, variables.RECORDINGS_FIRST_SECONDS, 120.0),
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
             warm_server_seconds=_number(env, variables.WARM_SERVER_SECONDS, 20.0),
-            plain_origins=frozenset() if warm_server else frozenset(env.get(variables.PLAIN_ORIGINS, "").split()),
+            plain_origins=frozenset() if warm_server or session else frozenset(origins),
             credential=_required(env, variables.CREDENTIAL) if "://" in store and not store.startswith("s3://") else "",
         )
 

@@ -9,23 +9,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
 
 from console.formatting import count
 from console.problem import Problem
 from deploy.aws.account import Account
+from hippodrome.aws import errors
 
 BATCH = 1_000  # versions deleted by one call
+_PIECE = 256 * 1024  # bytes
 
 
 class Version(NamedTuple):
-    """One version or delete marker of an object, or an unfinished upload (`upload` is its id)."""
+    """One version or delete marker of an object, or an unfinished upload (`upload` is its id).
+
+    `latest`: it is what a reader of the key gets.
+    """
 
     key: str
     id: str
     size: int = 0
     marker: bool = False
     upload: str = ""
+    latest: bool = False
 
 
 class VersionedBucket:
@@ -40,9 +49,9 @@ class VersionedBucket:
         """Every version and delete marker below the prefix, 1,000 a request."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Prefix=prefix, **self._bucket):
             for line in page.get("Versions", ()):
-                yield Version(line["Key"], line["VersionId"], line["Size"])
+                yield Version(line["Key"], line["VersionId"], line["Size"], latest=line["IsLatest"])
             for line in page.get("DeleteMarkers", ()):
-                yield Version(line["Key"], line["VersionId"], marker=True)
+                yield Version(line["Key"], line["VersionId"], marker=True, latest=line["IsLatest"])
 
     def versions_of(self, key: str) -> Iterator[Version]:
         """Those of one object."""
@@ -58,6 +67,42 @@ class VersionedBucket:
         """The first parts of the keys of everything that has a version, without the slash."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Delimiter="/", **self._bucket):
             yield from (line["Prefix"].removesuffix("/") for line in page.get("CommonPrefixes", ()))
+
+    def read(self, version: Version) -> bytes:
+        """The content of a version; empty if it is gone, or is none."""
+        try:
+            return bytes(self._get(version)["Body"].read())
+        except ClientError as error:
+            if errors.code(error) in {"NoSuchKey", "NoSuchVersion", "404", "405"}:
+                return b""
+            raise
+
+    def fetch(self, version: Version, to: Path) -> None:
+        """The content of a version, into a file."""
+        with to.open("wb") as file:
+            for piece in self._get(version)["Body"].iter_chunks(_PIECE):
+                file.write(piece)
+
+    def store(self, key: str, file: Path) -> None:
+        """A new version of an object, in one PUT: no recording is larger than that takes."""
+        with file.open("rb") as body:
+            self._s3.put_object(Key=key, Body=body, **self._bucket)
+
+    def replace(self, key: str, before: bytes, after: bytes) -> bool:
+        """A new version of a small object if its newest one still is `before`; whether it was."""
+        try:
+            found = self._s3.get_object(Key=key, **self._bucket)
+            if found["Body"].read() != before:
+                return False
+            self._s3.put_object(Key=key, Body=after, IfMatch=found["ETag"], **self._bucket)
+        except ClientError as error:
+            if errors.code(error) in {"PreconditionFailed", "ConditionalRequestConflict", "NoSuchKey", "404"}:
+                return False
+            raise
+        return True
+
+    def _get(self, version: Version) -> Any:
+        return self._s3.get_object(Key=version.key, VersionId=version.id, **self._bucket)
 
     def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None] = lambda _: None) -> int:
         """Delete these for good; return how many. `note` gets those of each call that are deleted.

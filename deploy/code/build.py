@@ -19,7 +19,7 @@ from pathlib import Path
 
 from console.problem import Problem
 from deploy.code import bytecode
-from deploy.code.packages import ROOT, Member, Target, Wheel, WheelCache
+from deploy.code.packages import ROOT, Target, Wheel, WheelCache, ZipMember
 
 OURS = ("lambdas", "hippodrome", "protocol")
 DATA = {
@@ -41,7 +41,7 @@ class Function:
     """A Lambda function, ready to be packed: its files in the order of their names."""
 
     name: str
-    members: tuple[Member, ...]
+    members: tuple[ZipMember, ...]
     distributions: tuple[str, ...]
     python: str | None = None  # the version that runs it ("3.13"), to have bytecode for it
 
@@ -102,7 +102,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
     return Function(name, tuple(members[key] for key in sorted(members)), tuple(sorted(distributions)), python)
 
 
-def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, Member]:
+def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
     """The wheel's Python files that these imports reach without passing through `ends`."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
@@ -145,7 +145,7 @@ class _Tree:
         path = self._path(module)
         return Source(self._body(path).decode(), path.name == "__init__.py") if path else None
 
-    def files(self, module: str) -> Iterator[Member]:
+    def files(self, module: str) -> Iterator[ZipMember]:
         """The module's own file, and what it reads at run time."""
         path = self._path(module)
         if path:
@@ -155,9 +155,9 @@ class _Tree:
                 if one.is_file() and not any(part.startswith((".", "__")) for part in one.parts[-2:]):
                     yield self._member(one)
 
-    def _member(self, path: Path) -> Member:
+    def _member(self, path: Path) -> ZipMember:
         body = self._body(path)
-        return Member(path.relative_to(self._root).as_posix(), hashlib.sha256(body).hexdigest(), lambda: body)
+        return ZipMember(path.relative_to(self._root).as_posix(), hashlib.sha256(body).hexdigest(), lambda: body)
 
     def _path(self, module: str) -> Path | None:
         if module.partition(".")[0] not in OURS:

@@ -113,7 +113,7 @@ class Pin:
 
 
 @dataclass(frozen=True)
-class Member:
+class ZipMember:
     """A file in a zip: its name there, its sha256, and how to read it."""
 
     name: str
@@ -135,13 +135,13 @@ class Wheel:
         self.path = path
 
     @cached_property
-    def members(self) -> Mapping[str, Member]:
+    def members(self) -> Mapping[str, ZipMember]:
         """What of it goes into a zip, by name there."""
         found = {}
         for name, digest in self._record.items():
             place = _place(name)
             if place and digest and not _LEAVE_OUT.search(place):
-                found[place] = Member(place, digest, lambda name=name: self._zip.read(name))  # type: ignore[misc]
+                found[place] = ZipMember(place, digest, lambda name=name: self._zip.read(name))  # type: ignore[misc]
         return found
 
     @cached_property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
@@ -10,6 +10,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.records import from_json
 from hippodrome.model.server import RECORDS, PastAttempt, Server, past_attempt
 from hippodrome.ports import Documents, Entry
+from protocol.keys import handover_key
 
 READERS = 8  # documents read at once; botocore keeps ten connections
 SETTLED = timedelta(seconds=5)  # S3's times are whole seconds: what changed a moment ago may change again unseen
@@ -105,3 +106,14 @@ def _is_record(key: str) -> bool:
 def runs(record: Server) -> list[PastAttempt]:
     """Every attempt that a record knows of, oldest first."""
     return [*record.earlier, past_attempt(record)]
+
+
+def warm_servers_of(record: Server | None) -> list[str]:
+    """The names of the warm servers that were assigned to the owner of a record, in all attempts."""
+    return [run.warm_server_name for run in runs(record) if run.warm_server_name] if record else []
+
+
+def keys_of_warm_servers(project_id: str, names: Collection[str]) -> list[str]:
+    """The handovers and records of warm servers that were assigned."""
+    labels = [parsed[0] for name in names if (parsed := ids.parse_server_name(name))]
+    return sorted([*(handover_key(project_id, name) for name in names), *(server.key(label) for label in labels)])

@@ -107,6 +107,8 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
         spot=spot,
         observations=bool(trial.record_observations),
         at_link=starts_at_link(config),
+        players=project.players,
+        patience=project.patience,
     )
 
 

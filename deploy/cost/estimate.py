@@ -7,6 +7,7 @@ number of steps. What is not measured is assumed, low, likely and high, and said
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ S3_WRITES = 13  # PUT and LIST
 TRIAL_READS, TRIAL_WRITES = 2, 2  # the trial server: its certificate; a recording and the answer
 SIGNED = Range(4, 6, 20)  # requests that a server has signed: certificate, answer, recordings; after a loss more
 PUBLISHES = 2
+LOBBY_POLLS = Range(5, 15)  # looks of a page that waits for others, every two seconds, `patience` seconds at most
 POLLS = Range(2, 12, 60)  # looks of the waiting page, every two to four seconds
 WORKERS = Range(4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
 NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; the high one is a cold start each time
@@ -36,6 +38,7 @@ LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
 IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
 UNUSED = 10  # minutes until a server without its participant ends: IDLE_SECONDS in trial/settings.py
+UNUSED_AHEAD = 35  # until one that was started ahead of a session is stopped: LONGEST_OPEN, and the next sweep
 DNS_QUERIES = Range(4, 10, 40)
 
 
@@ -62,10 +65,30 @@ class Study:
     spot: bool = True
     observations: bool = False  # whether recordings hold every picture
     at_link: bool = False  # whether a server starts when a link is opened
+    players: int = 1  # participants of a session, who share a server
+    patience: float = 300  # seconds in the lobby at most
 
     @property
     def servers(self) -> int:
-        """How many servers run: one for each participant, if there is a game."""
+        """How many servers run: one for each participant, or for each session, if there is a game."""
+        return math.ceil(self.participants / self.players) if self.games else 0
+
+    @property
+    def has_sessions(self) -> bool:
+        """Whether several participants share a server."""
+        return self.players > 1
+
+    @property
+    def lobby_polls(self) -> Range:
+        """Requests of all who wait in a lobby for others."""
+        if not self.games or not self.has_sessions:
+            return Range()
+        most = self.patience / 2
+        return Range(min(LOBBY_POLLS.low, most), min(LOBBY_POLLS.likely, most), most) * self.participants
+
+    @property
+    def clients(self) -> int:
+        """How many pages wait for a server and play."""
         return self.participants if self.games else 0
 
     @property
@@ -86,7 +109,7 @@ def study_lines(study: Study, prices: Prices) -> list[Line]:
 def _servers(study: Study, prices: Prices) -> list[Line]:
     if not study.games:
         return []
-    hours = study.server_minutes * study.participants * (1 / 60)
+    hours = study.server_minutes * study.servers * (1 / 60)
     hour, on_demand = (prices.server_hour(study.cpu, study.memory, spot=spot) for spot in (study.spot, False))
     address = prices.ipv4_hour.usd
     # Where Spot has no room, a server runs on demand: at worst all of them.
@@ -130,8 +153,11 @@ def _functions(study: Study, prices: Prices) -> list[Line]:
 def _small_things(study: Study, prices: Prices) -> list[Line]:
     scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
     # A read more for each poll, two to sign.
-    reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + POLLS + SIGNED * 2) * servers
+    reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + SIGNED * 2) * servers + POLLS * study.clients
     writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers)
+    # In the lobby a poll reads the participant's membership and the decisions, lists who is there (which costs as much
+    # as a write), and writes that it is there.
+    reads, writes = reads + study.lobby_polls * 2, writes + study.lobby_polls * 2
     messages = WORKERS * (servers * 3)  # sent, received, deleted
     queries = DNS_QUERIES * servers
     return [
@@ -166,7 +192,7 @@ def _data(study: Study, prices: Prices) -> list[Line]:
 
 def _page_requests(study: Study) -> Range:
     """Requests to `next_step`: a GET and a POST for each step, none to answer the last; the polls; pages' own files."""
-    return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.servers
+    return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
 
 
 @dataclass(frozen=True)
@@ -230,11 +256,24 @@ def assumptions(study: Study) -> list[str]:
         f"{study.participants:,} participants who do all {study.steps} steps.",
     ]
     if study.games:
+        whom = f" {study.players}" if study.has_sessions else ""
         found.append(
-            f"A server for each: {known}, {high:g} at most (maxRuntime). "
+            f"A server for each{whom}: {known}, {high:g} at most (maxRuntime). "
             + ("" if study.minutes is not None else "Give the mean time with --minutes: it decides most of the cost.")
         )
-        if study.at_link:
+        if study.has_sessions:
+            likely_wait = min(2 * LOBBY_POLLS.likely, study.patience)
+            found.append(
+                f"Each waits {likely_wait:g} seconds in the lobby, {study.patience:g} at most. Servers that are "
+                f"started ahead and not used are not counted: one for {study.players} people who begin and do not "
+                f"come to the game, which runs for {UNUSED_AHEAD:g} minutes at most."
+            )
+        if study.at_link and study.has_sessions:
+            found.append(
+                f"Every {study.players} opened links start a server. Those of {study.players} people who look and "
+                f"leave are not counted here: each runs for up to {UNUSED_AHEAD:g} minutes."
+            )
+        elif study.at_link:
             found.append(
                 "Every opened link starts a server. Those of people who look and leave are not counted here: "
                 f"each runs for about {UNUSED:g} minutes."

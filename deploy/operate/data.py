@@ -17,7 +17,7 @@ from deploy.core import options
 
 if TYPE_CHECKING:
     from deploy.core.study_selection import StudySelection
-    from export.fetch import Tally
+    from export.listing import Tally
     from export.source import Source
 
 FORMATS = ("csv", "parquet", "minari")
@@ -212,6 +212,10 @@ def _tell(made: dict[str, Any], where: Path) -> None:
             screen.warning(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
         if not dataset["observations"]:
             screen.warning(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
+    if not all(dataset["observations"] for dataset in made["minari"]):
+        screen.info(
+            "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
+        )
     if counts["problems"]:
         screen.warning(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
     if where.stat().st_mode & 0o077:

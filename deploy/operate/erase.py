@@ -12,6 +12,7 @@ import typer
 from rich.progress import Progress, TaskID
 
 from console import screen
+from console.formatting import count
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.aws.versions import VersionedBucket
@@ -25,6 +26,10 @@ def command(
     user: Annotated[str, typer.Argument(help="The participant's id (userId), exactly as in their link.")],
     *,
     project: options.ProjectId = None,
+    from_: Annotated[
+        Path | None,
+        typer.Option("--from", help="From this data folder of `make run`, and not from AWS.", show_default=False),
+    ] = None,
     everywhere: Annotated[
         bool, typer.Option("--everywhere", help="In every project of the installation, not in one.")
     ] = False,
@@ -50,8 +55,9 @@ def command(
 
     if not ids.is_user_id(user):
         raise Problem("That is no participant's id.", "Ids have letters, digits, dashes and underscores, 64 at most.")
-    if everywhere and project is not None:
-        raise Problem("--project names one project, --everywhere means all of them.", "Give one of the two.")
+    _must_fit(project, everywhere, from_, receipt is not None or with_id)
+    if from_ is not None:
+        return _from_folder(from_, project_id(project), user, dry_run=dry_run, yes=yes, json=json)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     where = _projects(account, installation) if everywhere else [project_id(project)]
@@ -67,7 +73,7 @@ def command(
         here = [name for name, one in found.items() if one]
         screen.confirm(f"Erase this person for good from {', '.join(here)}?", yes)
     began, whole = datetime.now(UTC), False
-    target = receipt or Path(f"erased-{began:%Y%m%dT%H%M%SZ}.json")
+    target = receipt or _new_receipt(began)
     if target.exists() or not target.parent.is_dir():
         raise Problem(f"The receipt cannot be written to {target}.", "Name a new file in a folder that exists.")
     try:
@@ -87,6 +93,47 @@ def command(
     else:
         screen.success(f"There is nothing of this person. The receipt: {target}")
     return Exit.DONE
+
+
+def _new_receipt(began: datetime) -> Path:
+    """A file in this folder that does not exist: a script may erase several people in one second."""
+    name = f"erased-{began:%Y%m%dT%H%M%SZ}"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
+
+
+def _must_fit(project: str | None, everywhere: bool, data: Path | None, receipt: bool) -> None:
+    """Raises `Problem` if these options do not go together."""
+    if everywhere and project is not None:
+        raise Problem("--project names one project, --everywhere means all of them.", "Give one of the two.")
+    if data is not None and (everywhere or receipt):
+        raise Problem("--from erases one project's data on this machine, without a receipt.", "Leave out the others.")
+
+
+def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: bool, json: bool) -> int:
+    from deploy.operate import folder_eraser  # noqa: PLC0415 - only here
+
+    def confirm(files: int, sessions: int) -> None:
+        what = f"{count(files, 'file')}" + (f", and their part of {count(sessions, 'session')}" if sessions else "")
+        screen.confirm(f"Erase this person for good from {data} ({what})?", yes)
+
+    done, unreadable, found = folder_eraser.erase(data, project, user, dry_run=dry_run, confirm=confirm)
+    for key in unreadable:
+        screen.warning(f"{key} cannot be read, and may name this person: look at it yourself.")
+    for path in done.mentioned if done else ():
+        screen.warning(f".hippodrome/{path} still names them: delete it; `make run` does without it.")
+    if json:
+        screen.result_json(
+            {"found": found, "deleted": done.files if done else 0, "rewritten": done.rewritten if done else 0}
+        )
+    if done:
+        screen.success(f"{count(done.files, 'file')} deleted, {count(done.rewritten, 'recording')} written anew.")
+        screen.info("  Where this study was converted, run `python -m deploy data` again: it removes them there.")
+    elif found and not json:
+        screen.result(f"{count(found, 'document')} of this person in {data}.")
+    elif not found:
+        screen.success(f"There is nothing of this person in {data}.")
+    return Exit.CHANGES if dry_run and found else Exit.DONE
 
 
 def _projects(account: Account, installation: Installation) -> list[str]:
@@ -135,10 +182,20 @@ def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
         return
     rows = [(name, *one.counts().values()) for name, one in found.items() if one]
     if rows:
-        heads = list(Found().counts())
-        screen.table(["project", *heads], rows, right=heads)
+        heads = max((list(one.counts()) for one in found.values()), key=len)
+        screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
+        _warn_of_others(found)
     elif dry_run:
         screen.result(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
+
+
+def _warn_of_others(found: Mapping[str, Found]) -> None:
+    """Their session's server is stopped, too: that of others who play there."""
+    playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
+    if playing:
+        screen.warning(
+            f"They play with others now: {count(playing, 'session')} will be stopped, for all who play there."
+        )
 
 
 def _words(found: Found) -> str:

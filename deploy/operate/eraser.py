@@ -1,5 +1,8 @@
 """Erases one participant from one project: first their server, then their documents, then a look that proves it.
 
+Who has played with others did so on their session's server. It is stopped as one of their own would be; what the others
+need to read their game stays (`session_eraser.py`).
+
 If the participant played on a warm server, its handover document names them, and its own record has their label. The
 participant's record leads to both, so it is deleted last.
 
@@ -13,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import TYPE_CHECKING
 
@@ -23,9 +26,11 @@ from deploy.aws.account import Account, Installation
 from deploy.aws.versions import Version, VersionedBucket
 from deploy.core.captured_log import functions_log
 from deploy.core.leftover_steps import cluster_steps, removal_steps
-from deploy.core.server_records import runs
+from deploy.core.server_records import keys_of_warm_servers, warm_servers_of
 from deploy.core.stages import Executor, Step, step
+from deploy.operate.lobby_eraser import LobbyEraser
 from deploy.operate.receipt import ProjectReceipt
+from deploy.operate.session_eraser import FoundSession, SessionEraser
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StopServer
 from hippodrome.model.records import from_json
@@ -34,7 +39,7 @@ from hippodrome.ports import DnsRecord, RunningTask
 from hippodrome.servers import resources
 from hippodrome.servers.leftovers import Scope, leftovers
 from hippodrome.servers.resources import Resources
-from protocol.keys import handover_key, participant_folder
+from protocol.keys import participant_folder
 
 if TYPE_CHECKING:
     from hippodrome.limits.slots import Slots
@@ -54,6 +59,8 @@ class Found:
     resources: Resources = field(default_factory=Resources)
     draining: list[RunningTask] = field(default_factory=list)  # tasks that were told to stop and have not ended
     slots: int = 0  # held by the participant; `maxParticipants` counts them
+    sessions: list[FoundSession] = field(default_factory=list)  # that name the participant
+    of_sessions: list[Server] = field(default_factory=list)  # the records of their servers
 
     def __bool__(self) -> bool:
         return any(self.counts().values())
@@ -61,12 +68,17 @@ class Found:
     @property
     def runs(self) -> bool:
         """Whether a server, or a part of one, is left."""
-        is_closed = self.record is None or self.record.is_closed
-        return bool(self.resources or self.draining or not is_closed)
+        return bool(self.resources or self.draining or any(not each.is_closed for each in self.records))
+
+    @property
+    def records(self) -> list[Server]:
+        """The records of the participant's own server, and of their sessions'."""
+        return [*([self.record] if self.record else []), *self.of_sessions]
 
     def counts(self) -> dict[str, int]:
         counts = {"documents": self.documents, **self.resources.counts(), "places": self.slots}
-        return counts | {"tasks": counts["tasks"] + len(self.draining)}
+        counts |= {"tasks": counts["tasks"] + len(self.draining)}
+        return counts | ({"sessions": len(self.sessions)} if self.sessions else {})
 
 
 class Eraser:
@@ -98,6 +110,9 @@ class Eraser:
         self._folder = participant_folder(project, user)
         self._record_key = server.key(self._label)
         self._scope = Scope(labels=frozenset({self._label}))
+        self._warm_servers = frozenset[str]()  # those that were assigned to the participant
+        self._sessions = SessionEraser(self._bucket, project, user)
+        self._lobby = LobbyEraser(self._bucket, project, user)
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> Found:
         """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
@@ -105,18 +120,25 @@ class Eraser:
 
     def look(self) -> Found:
         """Count everything there is of this participant; change nothing."""
-        record = self._record()
-        self._scope = replace(self._scope, names=self._scope.names.union(warm_servers_of(record)))
+        record = self._record(self._record_key)
+        sessions = self._sessions.sessions()
+        labels = {each.id: ids.server_label(self.project, each.id) for each in sessions}
+        of_sessions = [each for label in labels.values() if (each := self._record(server.key(label)))]
+        self._warm_servers = self._warm_servers.union(warm_servers_of(record))
+        names = self._warm_servers.union(*map(warm_servers_of, of_sessions))
+        self._scope = Scope(labels=frozenset({self._label, *labels.values()}), names=names)
         there = leftovers(resources.list_resources(self._platform), {}, self._scope)
         own_name = record.dns_record if record else None
         if own_name and own_name not in there.dns_records and self._resolves(own_name):
             there.dns_records.append(own_name)
         found = Found(
-            documents=sum(1 for _ in itertools.chain.from_iterable(self._documents())),
+            documents=sum(1 for _ in itertools.chain(self._lobby.look(), *self._documents())),
             record=record,
             resources=there,
             draining=self._draining(there.clusters),
             slots=len(self._slots().documents_naming(self.project, self._user)),
+            sessions=sessions,
+            of_sessions=of_sessions,
         )
         self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
         return found
@@ -127,9 +149,12 @@ class Eraser:
         if found.runs:
             steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
             steps += cluster_steps(self._platform, found.resources)
-        if found.record and not found.resources.tasks and self._settling(found.record):
+        if not found.resources.tasks and any(map(self._settling, found.records)):
             steps += [step(self._settle), step(self._wait)]
-        steps.append(step(self._delete, advance))
+        if self._late and found.of_sessions:
+            steps.append(step(self._outlast_sessions, found.sessions))
+        steps += [step(self._leave_session, each, advance) for each in found.sessions]
+        steps += [step(self._leave_lobby, advance), step(self._delete, advance)]
         if found.slots:
             steps.append(step(self._slots().release_participant, self.project, self._user))
         if self._late and found.record:
@@ -138,7 +163,7 @@ class Eraser:
 
     def unreadable(self) -> list[str]:
         """Documents that may name this participant, but cannot be read."""
-        return self._slots().unreadable(self.project)
+        return [*self._slots().unreadable(self.project), *self._sessions.unreadable, *self._lobby.unreadable]
 
     # -- looking
 
@@ -156,8 +181,8 @@ class Eraser:
         found = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
         return [task for task in found if self._scope.erases(task.name)]
 
-    def _record(self) -> Server | None:
-        document = self._platform.documents.get(self._record_key)
+    def _record(self, key: str) -> Server | None:
+        document = self._platform.documents.get(key)
         try:
             return from_json(document.body, Server) if document else None
         except (ValueError, RecursionError):  # it will be deleted as any document
@@ -194,9 +219,7 @@ class Eraser:
 
     def _warm_server_keys(self) -> list[str]:
         """The handovers and records of the warm servers that were assigned to this participant."""
-        labels = [parsed[0] for name in self._scope.names if (parsed := ids.parse_server_name(name))]
-        handovers = [handover_key(self.project, name) for name in self._scope.names]
-        return sorted([*handovers, *(server.key(label) for label in labels)])
+        return keys_of_warm_servers(self.project, self._warm_servers)
 
     # -- steps
 
@@ -210,11 +233,12 @@ class Eraser:
 
         for kind, number in found.resources.counts().items():
             self.receipt.removed[kind] += number
-        if found.record and not found.record.is_closed:
+        stops = [
+            StopServer(self.project, each.user_id, None, Reason.STOPPED) for each in found.records if not each.is_closed
+        ]
+        if stops:
             with functions_log():  # what fails here is done by the steps that follow
-                Termination(ServerServices(self._platform)).stop(
-                    [StopServer(self.project, self._user, None, Reason.STOPPED)]
-                )
+                Termination(ServerServices(self._platform)).stop(stops)
 
     def _wait(self) -> None:
         """Wait until no task is left that could store something; stop tasks that appear. Raises `Problem`."""
@@ -239,13 +263,36 @@ class Eraser:
         """Wait until ECS lists the task, or so long that it would have been listed."""
         self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
 
-    def _delete(self, advance: Callable[[int], None]) -> None:
+    def _leave_session(self, found: FoundSession, advance: Callable[[int], None]) -> None:
+        """Take them out of a session. If its server plays again, the next round stops it first."""
+        note = self._noting(advance)
+        key = server.key(ids.server_label(self.project, found.id))
+        if not found.others:
+            record = self._record(key)
+            if record is None or record.is_closed:
+                for each in (*keys_of_warm_servers(self.project, warm_servers_of(record)), key):
+                    self._bucket.delete(self._bucket.versions_of(each), note)
+                self._sessions.delete_session(found, note)
+            return
+        self._sessions.take_out(found, note)
+        self.receipt.rewritten = self._sessions.rewritten
+        record = self._record(key)
+        if record is None or record.is_closed:
+            self._sessions.take_name(found, note)
+
+    def _leave_lobby(self, advance: Callable[[int], None]) -> None:
+        self._lobby.erase(self._noting(advance))
+
+    def _noting(self, advance: Callable[[int], None]) -> Callable[[Sequence[Version]], None]:
         def note(versions: Sequence[Version]) -> None:
             self.receipt.note(versions)
             advance(len(versions))
 
+        return note
+
+    def _delete(self, advance: Callable[[int], None]) -> None:
         for versions in self._documents():
-            self._bucket.delete(versions, note)
+            self._bucket.delete(versions, self._noting(advance))
 
     def _outlast(self, record: Server) -> None:
         """Wait until all presigned requests of their server are invalid. It gets no more: its record is gone."""
@@ -254,12 +301,19 @@ class Eraser:
         signed = STORE_AFTER_CLOSE.total_seconds()  # how long after its end a server may still get one
         if record.closed is not None:
             signed -= (self._platform.now() - record.closed).total_seconds()
-        left = VALID_SECONDS + SIGNING + min(signed, 0)
+        self._sleep(VALID_SECONDS + SIGNING + min(signed, 0))
+
+    def _outlast_sessions(self, sessions: Sequence[FoundSession]) -> None:
+        """Wait until no presigned request of their sessions' servers is valid, and these get no more."""
+        from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
+
+        records = (self._record(server.key(ids.server_label(self.project, each.id))) for each in sessions)
+        ends = [each.closed for each in records if each is not None and each.closed is not None]
+        if ends:
+            over = (self._platform.now() - max(ends)).total_seconds()
+            self._sleep(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING - over)
+
+    def _sleep(self, left: float) -> None:
         if left > 0:
             screen.info(f"{left:.0f} seconds more: until then what their server was given might store something.")
             self._executor.sleep(left)
-
-
-def warm_servers_of(record: Server | None) -> list[str]:
-    """The names of the warm servers that were assigned to a participant, in all attempts."""
-    return [run.warm_server_name for run in runs(record) if run.warm_server_name] if record else []

@@ -14,13 +14,14 @@ from typing import Any
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import Version
+from hippodrome.lobby import decisions, entries
 from hippodrome.model import ids
-from protocol.keys import participant_folder
+from protocol.keys import QUESTIONS, groups_folder, participant_folder, sessions_folder
 
 NOT_COVERED = (
     "Downloaded copies: `python -m deploy data` into the same folder removes this person there too.",
     "Messages about their server that are still in a queue; SQS deletes them, dead letters after 14 days at most.",
-    "Older versions of the lists of who holds a place where places are limited: hashes, soon deleted by the bucket.",
+    "Older versions of the lists of who holds a slot where slots are limited: hashes, soon deleted by the bucket.",
     "AWS's own records: ECS shows a stopped task for about an hour, CloudTrail may keep the call that ran it 90 days.",
     "What the recruiter knows of them.",
 )
@@ -36,6 +37,7 @@ class ProjectReceipt:
     keys: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=lambda: {"tasks": 0, "timers": 0, "names": 0, "clusters": 0})
     rounds: int = 0
+    rewritten: int = 0  # recordings of sessions, which stay for the others
     remains: Mapping[str, int] | None = None
     looked: datetime | None = None
 
@@ -55,6 +57,7 @@ class ProjectReceipt:
             "deleted": self.deleted,
             "letGo": self.removed,
             "keys": self.keys,
+            **({"rewritten": self.rewritten} if self.rewritten else {}),
             "rounds": self.rounds,
             "remains": self.remains,
             "listed": _time(self.looked),
@@ -62,6 +65,10 @@ class ProjectReceipt:
 
     def _kind(self, key: str) -> str:
         rest = key.removeprefix(participant_folder(self.project, self.user))
+        if key.startswith(sessions_folder(self.project)):
+            return "sessions"
+        if key.startswith((entries.FOLDER, decisions.LOBBIES, QUESTIONS, groups_folder(self.project))):
+            return "lobby"
         if rest == key:
             return "server record"
         if rest == "participant.json":
@@ -72,6 +79,12 @@ class ProjectReceipt:
     def _nameless(self, key: str) -> str:
         """The key without the id and without the server's label, which can be computed from it."""
         rest = key.removeprefix(participant_folder(self.project, self.user))
+        if key.startswith(sessions_folder(self.project)):  # its names say nothing of the members
+            return "/".join("{userId}" if self.user in part else part for part in key.split("/"))
+        if key.startswith(entries.FOLDER):
+            return f"{entries.folder(self.project)}{{participant}}"
+        if key.startswith((decisions.LOBBIES, QUESTIONS, groups_folder(self.project))):
+            return key
         if rest == key:
             return f"{key.rpartition('/')[0]}/{{server}}.json"
         rest = rest.replace(ids.server_label(self.project, self.user), "{server}")

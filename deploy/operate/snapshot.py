@@ -27,6 +27,8 @@ from hippodrome.model.project import Project, UnreadableEntry
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import Documents
 from hippodrome.servers.causes import Cause, FailureCategory, parse_cause
+from hippodrome.servers.sessions import readable_session
+from hippodrome.storage.repository import Repository
 
 T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"
@@ -95,6 +97,7 @@ class Snapshot:
     at: datetime
     projects: list[tuple[Project, ParticipantCounts]] = field(default_factory=list)
     servers: list[Server] = field(default_factory=list)  # open ones
+    members: dict[str, int] = field(default_factory=dict)  # of formed sessions with an open server, by its name
     recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
     tasks: int | None = None  # that ECS says are running
     spent: Spent = field(default_factory=Spent)
@@ -141,6 +144,8 @@ class Monitor:
         self._project_id = project_id
         self._platform = account.platform(installation)
         self._records = Records(self._platform.documents)
+        self._repository = Repository(self._platform.documents)
+        self._formed: dict[str, int] = {}  # by session, its members: they never change
 
     def look(self, told: Callable[[str], None] = lambda _: None) -> Snapshot:
         """One look. `told` gets how far a long listing is."""
@@ -197,6 +202,18 @@ class Monitor:
             look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
         look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
         look.recent = found
+        look.members = dict(self._members([server for server in look.servers if server.is_sessions]))
+
+    def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
+        """By server, how many members its session has. A read for each that was not formed at an earlier look."""
+        for server in servers:
+            known = self._formed.get(server.user_id)
+            if known is None:
+                session = readable_session(self._repository, server.project_id, server.user_id)
+                known = len(session.members) if session else None
+            if known is not None:
+                self._formed[server.user_id] = known
+                yield server.name, known
 
     def _tasks(self, look: Snapshot) -> None:
         look.tasks = self._platform.tasks.count()

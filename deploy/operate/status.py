@@ -43,8 +43,8 @@ def command(
 ) -> int:
     """Who is where and what runs: participants by step, servers by state, queues, certificate, alarms, today's cost.
 
-    Counts only, no ids; servers are called by their names, which are hashes. Reads listings and the servers' records,
-    never a participant's documents.
+    Counts only, no ids; servers are called by their names, which are hashes. Reads listings, the servers' records and
+    how many members a session has, never a participant's documents.
     """
     if watch and as_json:
         raise Problem("--watch and --json do not go together.", "For scripts, ask again: `status --json`.")
@@ -132,7 +132,7 @@ def as_data(look: Snapshot, installation: Installation, bill: Billed | None = No
         ],
         "servers": {
             "byState": dict(Counter(str(server.state) for server in look.servers)),
-            "open": [_server(server, look.at) for server in look.servers],
+            "open": [_server(server, look) for server in look.servers],
             "tasks": look.tasks,
             "closedToday": dict(look.closed_today),
             "failed": [
@@ -172,7 +172,9 @@ def _warm(look: Snapshot, project: Project) -> Mapping[str, int]:
     return {"wanted": wanted, "ready": found.ready, "there": found.there, "takenToday": found.taken_today}
 
 
-def _server(server: Server, now: datetime) -> Mapping[str, Any]:
+def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
+    now = look.at
+    of_session = {"session": True, "members": look.members.get(server.name, 0)} if server.is_sessions else {}
     return {
         "server": server.name,
         "project": server.project_id,
@@ -182,6 +184,7 @@ def _server(server: Server, now: datetime) -> Mapping[str, Any]:
         "warm": server.is_warm_server,
         "ageMinutes": round((now - server.requested).total_seconds() / 60, 1),
         "minutesLeft": round((server.deadline - now).total_seconds() / 60, 1),
+        **of_session,
     }
 
 
@@ -241,6 +244,9 @@ def _servers(look: Snapshot) -> list[RenderableType]:
     counts = ", ".join(f"{count:,} {state}" for state, count in sorted(states.items())) or "none"
     waiting = sum(server.is_warm_server for server in look.servers)
     counts += f", {waiting:,} of them warm" if waiting else ""
+    sessions = sum(server.is_sessions for server in look.servers)
+    members = sum(look.members.values())
+    counts += f", {sessions:,} of sessions with {count(members, 'member')}" if sessions else ""
     tasks = "" if look.tasks is None else f" ({look.tasks:,} tasks on ECS)"
     closed = ", ".join(f"{count:,} {reason}" for reason, count in look.closed_today.most_common())
     parts: list[RenderableType] = [
@@ -257,7 +263,7 @@ def _servers(look: Snapshot) -> list[RenderableType]:
                 Text(str(server.state)),
                 Text(duration((look.at - server.requested).total_seconds())),
                 Text(duration(left) if left >= 0 else "overdue", style="" if left >= 0 else "red"),
-                Text(_kind(server), style="dim"),
+                Text(_kind(server, look.members.get(server.name)), style="dim"),
             )
         parts.append(table)
     if len(look.servers) > MAX_SERVERS:
@@ -295,10 +301,12 @@ def _warm_lines(look: Snapshot) -> list[RenderableType]:
     return lines
 
 
-def _kind(server: Server) -> str:
+def _kind(server: Server, members: int | None) -> str:
     kind = "Spot" if server.spot else "on demand"
     if server.is_warm_server:
         return f"{kind}, warm"
+    if server.is_sessions:
+        kind += ", started ahead" if members is None else f", session of {members}"
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 

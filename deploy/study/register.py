@@ -8,7 +8,7 @@ removed. If it is interrupted, the next run finds what is done and goes on.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -275,12 +275,20 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
     """Let the installation register the project. Raises `Problem` with what it objects to."""
     answer = register_function.ask(account, installation, {"project": registration})
     if "registered" not in answer:
-        said = answer.get("problems")
-        raise Problem(
-            "The installation did not take the project.",
-            "Correct this and run it again." if said else "Bring it up to date with `python -m deploy apply`.",
-            [str(problem) for problem in said or []],
+        said = [str(problem) for problem in answer.get("problems") or []]
+        raise Problem("The installation did not take the project.", _what_to_do(said), said)
+
+
+def _what_to_do(said: Sequence[str]) -> str:
+    """What the researcher does about these problems. This machine has checked the same keys, and knew all of them."""
+    if not said:
+        return "Bring it up to date with `python -m deploy apply`."
+    if any("unknown key" in problem for problem in said):
+        return (
+            "The installation is older than this study: bring it up to date with `make deploy` "
+            "(or `python -m deploy apply`), or ask your administrator to. Then run this again."
         )
+    return "Correct this and run it again."
 
 
 def _tell_warm(registration: Mapping[str, Any]) -> None:

@@ -28,13 +28,18 @@ HANDS = {UP: (0.0, -0.16), DOWN: (0.0, 0.22), LEFT: (-0.3, 0.12), RIGHT: (0.3, 0
 class Agent:
     def start(self, game):
         """Make the environment and return it. Its `reset`, `step` and `close` are called as PettingZoo has them."""
-        options = json.loads(os.environ.get("TRIAL", "{}")).get("options", {})
+        trial = json.loads(os.environ.get("TRIAL", "{}"))
+        options, plays = trial.get("options", {}), trial.get("players", {})
+        self.two_people = list(plays.values()).count("human") == 2
         layout, seconds = options.get("layout", CRAMPED), options.get("seconds", 90)
         self.env = Overcooked(layout, max_steps=round(seconds * STEPS_PER_SECOND))
         return self.env
 
-    def render(self):
-        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins."""
+    def render(self, player):
+        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins.
+
+        If two people play, each reads who they are. With the policy, the instructions say it.
+        """
         kitchen = self.env.kitchen()
         objects = _room(kitchen) if self.env.steps_left == self.env.max_steps else []
         for cell, (onions, timer) in kitchen.pots.items():
@@ -43,7 +48,8 @@ class Agent:
         for number, chef in enumerate(kitchen.chefs):
             objects += _chef(number, chef)
         seconds = math.ceil(self.env.steps_left / STEPS_PER_SECOND)
-        return {"objects": objects, "hud": f"Soups: {self.env.soups} · {seconds} s"}
+        you = f"You are {COLOURS[int(player)]} · " if self.two_people else ""
+        return {"objects": objects, "hud": f"{you}Soups: {self.env.soups} · {seconds} s"}
 
 
 def _sprite(name, frame, cell, **more):

@@ -17,23 +17,29 @@ SAND = 30
 """Pixels from the bottom of the picture to the ground."""
 
 SLIMES = {LEFT: "slime-left", RIGHT: "slime-right"}
+COLOURS = {LEFT: "red", RIGHT: "blue"}
 NET, WHITE, BLACK = "#7a5230", "#ffffff", "#20242a"
 
 
 class Agent:
     def start(self, game):
         """Make the environment and return it. Its `reset`, `step` and `close` are called as PettingZoo has them."""
-        options = json.loads(os.environ.get("TRIAL", "{}")).get("options", {})
+        trial = json.loads(os.environ.get("TRIAL", "{}"))
+        options, plays = trial.get("options", {}), trial.get("players", {})
+        self.two_people = list(plays.values()).count("human") == 2
         self.env = Volleyball(points=options.get("points", 5), seconds=options.get("seconds", 100))
         return self.env
 
-    def render(self):
-        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins."""
+    def render(self, player):
+        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins.
+
+        If two people play, each reads who they are. Against the policy, the instructions say it.
+        """
         places = self.env.places()
         ball = places["ball"]
         objects = [*(STILL if self.env.begins() else ()), *_ball(ball)]
-        for player in PLAYERS:
-            objects += _slime(player, places[player], ball)
+        for each in PLAYERS:
+            objects += _slime(each, places[each], ball)
         if self.env.serve() and any(self.env.scores.values()):  # before the first point the page says so
             x, y = _at(0, 14)
             objects.append(
@@ -41,7 +47,8 @@ class Agent:
             )
         scores = self.env.scores
         left = math.ceil(self.env.seconds_left())
-        return {"objects": objects, "hud": f"Red {scores[LEFT]} : {scores[RIGHT]} Blue · {left} s"}
+        you = f"You are {COLOURS[player]} · " if self.two_people else ""
+        return {"objects": objects, "hud": f"{you}Red {scores[LEFT]} : {scores[RIGHT]} Blue · {left} s"}
 
 
 def _at(x, y):

@@ -81,6 +81,9 @@ class S3Documents:
     def replace(self, key: str, body: bytes, etag: str) -> str:
         return self._put(key, body, {"IfMatch": etag})
 
+    def put(self, key: str, body: bytes) -> None:
+        self._put(key, body, {})
+
     def list(self, prefix: str) -> Iterator[Entry]:
         """Lazy, 1,000 keys a request."""
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)

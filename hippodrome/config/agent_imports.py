@@ -92,8 +92,8 @@ def of_players(folder: Path, config: Config) -> list[Diagnostic]:
 
 def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str, str]]:
     """What in config.yml needs a package, and the line for requirements.txt that brings it."""
-    for path, file in players.files(config.trial.players):
-        yield ("trial", "players", *path), file, players.ONNXRUNTIME
+    for path, file in players.files_of(config.trial):
+        yield ("trial", *path), file, players.ONNXRUNTIME
     game = config.trial.game or ""
     package = game.partition(".")[0]
     if package != game and all(map(str.isidentifier, game.split("."))) and layout.find(folder).agent is None:
@@ -184,6 +184,7 @@ def _requirements(text: str) -> list[Requirement | None]:
     return [_requirement(line) for line in lines if line and not line.startswith(("#", "--"))]
 
 
+@cache
 def _requirement(line: str) -> Requirement | None:
     try:
         return Requirement(line.partition(" --")[0])
@@ -204,9 +205,8 @@ def _closure(asked: Sequence[Requirement | None]) -> _Image:
         requirement, first = waiting.pop()
         name = canonicalize_name(requirement.name)
         image.held.add(name)
-        try:
-            needs = [Requirement(need) for need in metadata.requires(requirement.name) or ()]
-        except (metadata.PackageNotFoundError, InvalidRequirement):
+        needs = _needs(requirement.name)
+        if needs is None:
             if first:
                 image.unknown.add(name)
             continue
@@ -214,6 +214,15 @@ def _closure(asked: Sequence[Requirement | None]) -> _Image:
             seen.add((name, extra))
             waiting += [(need, False) for need in needs if not need.marker or need.marker.evaluate({"extra": extra})]
     return image
+
+
+@cache
+def _needs(name: str) -> Sequence[Requirement] | None:
+    """What a package asks for; None for one that is not installed here, or says it so that it cannot be read."""
+    try:
+        return [Requirement(need) for need in metadata.requires(name) or ()]
+    except (metadata.PackageNotFoundError, InvalidRequirement):
+        return None
 
 
 @cache

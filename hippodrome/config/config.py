@@ -12,6 +12,7 @@ from hippodrome.config.each_value import Checked
 from hippodrome.config.project_keys import AwsSetup, Events, Project, Ssl
 from hippodrome.config.step_files import CLOSING
 from hippodrome.config.step_order import resolve_events, step_name
+from hippodrome.model.project import number_of_groups
 from hippodrome.model.step_types import StepType, type_of
 from protocol.trial import Trial
 
@@ -72,7 +73,7 @@ class Config:
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
             "gamePages": {each.key: each.variants for each in self.game_pages},
-            "trial": self.trial.document(),
+            "trial": self.trial.registered(),
         }
 
     @property
@@ -83,7 +84,12 @@ class Config:
     @property
     def groups(self) -> int:
         """How many groups of participants there are; 0 if there are none."""
-        return max((page.variants for page in (*self.steps, *self.game_pages)), default=0)
+        return number_of_groups(page.variants for page in (*self.steps, *self.game_pages))
+
+    @property
+    def each_group(self) -> list[int | None]:
+        """The groups of participants; None alone if there are none."""
+        return [*range(self.groups)] or [None]
 
     @property
     def own_pages(self) -> list[Path]:
@@ -93,11 +99,12 @@ class Config:
     def summary(self) -> str:
         """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
-        parts += [f"{step_name(step.key)} is the game ({self.trial.game})" for step in self.game_steps]
+        together = f" for {self.project.players} participants together" if self.project.has_sessions else ""
+        parts += [f"{step_name(step.key)} is the game ({self.trial.game}){together}" for step in self.game_steps]
         parts += [f"{step.page} in {step.variants} groups" for step in (*self.steps, *self.game_pages) if step.variants]
         start, stop = self.events.start_server_step, self.events.stop_server_step
         if start and stop:
-            limit = f"at most {self.project.max_runtime} minutes"
+            limit = f"at most {self.project.max_runtime} minute{'' if self.project.max_runtime == 1 else 's'}"
             parts.append(f"a server from {step_name(start)} to {step_name(stop)}, {limit}")
         if self.project.warm_servers:
             parts.append(f"{self.project.warm_servers} kept warm")

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from hippodrome.config import fargate
+from hippodrome.config import fargate, sessions
 from hippodrome.config.diagnostics import Keys, Mistake
 from hippodrome.config.each_value import Checked, check_values
 from hippodrome.config.project_keys import STEPS
@@ -31,6 +31,7 @@ def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
         _warm,
         _plain_clients,
         _environment_size,
+        sessions.mistakes,
     )
     checked.mistakes += [mistake for find in checks for mistake in find(checked)]
     return checked
@@ -140,7 +141,7 @@ def _environment_size(checked: Checked) -> Iterator[Mistake]:
     """ECS refuses a task whose environment is too long."""
     if not checked.valid(("trial",), STEPS):
         return
-    project, trial = checked.root.project, checked.trial.document()
+    project, trial = checked.root.project, checked.trial.registered()
     games = ",".join(key for key, page in project.steps.items() if type_of(page).on_server)
     pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
     length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), games, pages))

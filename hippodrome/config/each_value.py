@@ -18,8 +18,10 @@ from hippodrome.config.project_keys import NAMES, STEPS, TRIAL_SECTIONS, Root
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
-from protocol.trial import RATE_CHANGE_MISSPELT, Trial, Ui, names
+from protocol.trial import RATE_CHANGE_MISSPELT, Trial
 from protocol.trial_check import check as check_trial
+from protocol.trial_keys import names
+from protocol.trial_sections import Ui
 from protocol.values import show
 
 _ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hippodrome.config import hippo_pages
+from hippodrome.config import hippo_pages, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Keys, Mistake, in_order, where_of
@@ -16,6 +16,7 @@ from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
 from hippodrome.config.layout import Layout, find
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_files import CLOSING, StepFileError, open_folder
+from hippodrome.model.project import number_of_groups
 from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
 from protocol import players
@@ -74,6 +75,9 @@ def read_project(folder: Path) -> Config:
     steps, missing_files = _step_files(folder, checked)
     game_pages, more_missing = _game_pages(folder, checked, steps)
     missing_files += [*more_missing, *_missing_policies(source.layout, checked)]
+    if checked.valid(STEPS) and not missing_files:
+        groups = number_of_groups(page.variants for page in (*steps, *game_pages))
+        missing_files += sessions.mistakes_of_groups(checked, groups)
     mistakes = [source.diagnostic(m.path, m.message, line=m.line) for m in (*checked.mistakes, *missing_files)]
     mistakes += [source.diagnostic(m.path, m.message, line=m.line) for m in source.parsed.mistakes]
     agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
@@ -90,16 +94,11 @@ def read_project(folder: Path) -> Config:
 
 
 def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
-    """Policies' files that `trial.players` names and that there are not."""
-    for path, file in players.files(checked.trial.players):
+    """Policies' files that `trial.players` and `trial.substitute` name and that there are not."""
+    for path, file in players.files_of(checked.trial):
         if not (layout.agent_folder / file).is_file():
-            near = sorted(one.relative_to(layout.agent_folder).as_posix() for one in _policies(layout.agent_folder))
-            hint = f"; there are {', '.join(near[:5])}" if near else ""
-            yield Mistake(("trial", "players", *path), f"there is no file {file} beside agent.py{hint}")
-
-
-def _policies(folder: Path) -> Iterator[Path]:
-    return folder.glob("policies/**/*.onnx")
+            hint = players.files_there(layout.agent_folder)
+            yield Mistake(("trial", *path), f"there is no file {file} beside agent.py{hint}")
 
 
 def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:

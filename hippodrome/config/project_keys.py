@@ -17,10 +17,14 @@ from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys
 from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
+from hippodrome.model.matching import MATCHED_BY, MATCHINGS
 from hippodrome.model.step_order import FINAL
 from protocol import values
-from protocol.trial import Scene, Trial, Ui, names
-from protocol.values import Plain, as_text, number_in, show
+from protocol.session import MOST_PLAYERS
+from protocol.trial import Trial
+from protocol.trial_keys import names
+from protocol.trial_sections import Scene, Ui
+from protocol.values import Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
 
@@ -32,7 +36,6 @@ _REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
 _BUCKET_ENDS = ("-s3alias", "--ol-s3", ".mrap", "--x-s3", "--table-s3")
-_PAGE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 _STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
 _CERTIFICATES = "SSL"  # where servers may write nothing (infra/template.yml): a study there would keep no answer
 _DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
@@ -154,18 +157,34 @@ def page(value: object) -> str:
     if value is None or value == "":
         raise ValueError(f"has no page; write the name of its file, or {step_types.NAMES}")
     found = as_text(value, f"the name of a file, or {step_types.NAMES}")
-    stem = found.removesuffix(".html")
-    if "/" in found or "\\" in found:
-        raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(found)}")
+    stem = step_file(found)
     if stem in step_types.RESERVED and found != stem:
         raise ValueError(f"a page cannot be called {stem}.html; write {stem} for the {stem} step, or rename the page")
-    if not _PAGE.fullmatch(stem) or ".." in stem:
-        raise ValueError(
-            f"file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename {show(found)}"
-        )
     return stem
 
 
+def who_with_whom(value: object) -> str | dict[str, str]:
+    """Who plays with whom: one of `MATCHINGS`, or a field of an earlier page whose answers are the same or different.
+
+    Raises ValueError with what to write instead.
+    """
+    if not isinstance(value, dict):
+        if isinstance(value, str) and value.strip() in MATCHINGS:
+            return value.strip()
+        choices = [*MATCHINGS, *(f"{{{how}: field}}" for how in MATCHED_BY)]
+        raise ValueError(f"must be {' or '.join(choices)}, not {values.show(value)}")
+    if len(value) != 1 or next(iter(value)) not in MATCHED_BY:
+        raise ValueError("must name one field, such as {same: language} or {different: role}")
+    how, given = next(iter(value.items()))
+    return {str(how): str(values.text("the name of a field of an earlier page", 64)(given))}
+
+
+_MATCHING: dict[str, object] = {
+    "anyOf": [
+        {"enum": list(MATCHINGS)},
+        *({"type": "object", "properties": {how: {"type": "string"}}, "required": [how]} for how in MATCHED_BY),
+    ]
+}
 _Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
 _Text = Annotated[str, Rule(values.text())]
 _Bucket = Annotated[str, Rule(bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
@@ -267,6 +286,19 @@ class Project(Model):
     """Servers that are started ahead and wait, so that participants need not. Each is paid for while it waits."""
     signed_links: _Flag = False
     """Whether only links that `deploy links` has signed are let in."""
+    players: Annotated[int, whole(1, MOST_PLAYERS)] = 1
+    """Participants who play together in one environment. 1: each plays alone, on a server of their own."""
+    matching: Annotated[str | dict[str, str], Rule(who_with_whom, _MATCHING)] = "arrival"
+    """Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py."""
+    patience: Annotated[float, Rule(values.number(10, 3600), {"type": "number", "minimum": 10, "maximum": 3600})] = 300
+    """Seconds after which a participant no longer waits in the lobby for others."""
+    after_patience: Annotated[str, one_of("unmatched", "policies")] = "unmatched"
+    """Then: on to the next step as unmatched, or a game with policies in the empty places (trial.substitute)."""
+
+    @property
+    def has_sessions(self) -> bool:
+        """Whether several participants share a server."""
+        return self.players > 1
 
 
 class Root(Model):

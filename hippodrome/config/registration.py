@@ -8,14 +8,14 @@ from typing import Annotated, Any
 
 from pydantic import ValidationError
 
-from hippodrome.config import project_keys
+from hippodrome.config import project_keys, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
 from hippodrome.config.each_value import message_of
 from hippodrome.config.key_types import Model, Rule, whole
 from hippodrome.config.project_keys import STEPS
-from hippodrome.model.project import STEPS_FOLDER
+from hippodrome.model.project import STEPS_FOLDER, number_of_groups
 from hippodrome.model.step_order import FINAL, ordered, visited
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
@@ -51,6 +51,9 @@ def parse_registration(data: object) -> dict[str, Any]:
         checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
     task = {key: data[key] for key in _OURS if key in data}
     checked.mistakes += [*_task_findings(task), *_page_findings(task.get("gamePages", {}), checked.trial.pages)]
+    if not checked.mistakes:
+        variants = [*(step.variants for step in steps), *task.get("gamePages", {}).values()]
+        checked.mistakes += sessions.mistakes_of_groups(checked, number_of_groups(variants))
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))

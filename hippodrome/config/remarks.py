@@ -6,11 +6,11 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from hippodrome.config import sessions
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import Source, read_source
 from protocol import keyboard
-from protocol.players import HUMAN
 from protocol.values import printable
 
 START: Keys = ("project", "events", "startServerStep")
@@ -26,7 +26,6 @@ PARTS = frozenset({*ARROWS, "fire"})
 """Keys that act together with others: "up" and "right" are "upright" (`trial/core/controls.py`)."""
 
 KEYS: Keys = ("trial", "keys")
-PLAYERS: Keys = ("trial", "players")
 
 CERTIFICATE: Keys = ("project", "ssl")
 NO_EFFECT = "no effect: servers get the certificate of the installation"
@@ -114,16 +113,15 @@ def combined_after_single(config: Config) -> Iterator[Remark]:
 
 
 def several_humans(config: Config) -> Iterator[Remark]:
-    """What to say about players whom no participant plays: there is one participant in a game."""
-    groups = config.trial.groups()
-    for group in groups or (None,):
-        names = [name for name, plays in config.trial.players_of(group).items() if plays == HUMAN]
+    """What to say about players whom no participant plays, if each participant plays alone."""
+    if config.project.has_sessions:
+        return
+    for path, names in config.trial.humans():
         if len(names) > 1:
-            said = (
-                f"{len(names)} players are human ({printable(', '.join(names), 100)}), and a game has one participant"
-            )
-            advice = "let the others be played by a policy, random or idle"
-            yield Remark((*PLAYERS, *([] if group is None else [str(group)])), f"{said}, who plays the first; {advice}")
+            shown = printable(", ".join(names), 100)
+            said = f"{len(names)} players are human ({shown}), and a game has one participant, who plays the first"
+            advice = f"write players: {len(names)} under project, or let the others be played by a policy"
+            yield Remark((*sessions.WHO_PLAYS, *path), f"{said}; {advice}")
 
 
 def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
@@ -150,6 +148,12 @@ def without_observations(source: Source, config: Config) -> Iterator[Remark]:
         yield Remark(("trial",), NO_OBSERVATIONS)
 
 
+def keys_of_sessions(source: Source, config: Config) -> Iterator[Remark]:
+    """What to say about keys that are for several participants, if each participant plays alone."""
+    if not config.project.has_sessions:
+        yield from (Remark(path, sessions.NO_EFFECT) for path in sessions.OF_SESSIONS if source.names(path))
+
+
 def remarks(config: Config) -> Iterator[Remark]:
     """What to say about a configuration without mistakes."""
     if _names_a_certificate(config):
@@ -159,6 +163,7 @@ def remarks(config: Config) -> Iterator[Remark]:
         yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")
     yield from combined_after_single(config)
     yield from several_humans(config)
+    yield from sessions.remarks(config)
     idle = without_a_key(config)
     if idle is not None:
         yield idle
@@ -183,5 +188,5 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     arrows = [
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
     ]  # without ui all are on
-    found = [*remarks(config), *arrows, *without_observations(source, config)]
+    found = [*remarks(config), *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
     return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

@@ -8,8 +8,9 @@ import itertools
 from typing import Any
 
 from hippodrome.config.project_keys import SECTIONS, Root
-from protocol import trial, values
-from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Scene, Trial, Ui
+from protocol import trial, trial_keys, values
+from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial
+from protocol.trial_sections import Scene, Ui
 
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
@@ -49,7 +50,7 @@ def _of_trial(section: type[Trial | Ui | Scene]) -> dict[str, Any]:
             **({"description": key.meaning} if key.meaning else {}),
             **dict(sorted(key.schema.items())),
         }
-        for key in trial.keys(section)
+        for key in trial_keys.keys(section)
     }
     others = _OWN_CONTROLS if section is Ui else {"additionalProperties": False}
     return {

@@ -32,6 +32,8 @@ _WIDE_BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)
 
 _NO_SPACE = re.compile(r"\s*(?:- +)?(?P<key>[\w-]+):(?P<value>[^\s:/].*)")
 """`key:value`, which YAML takes for a text."""
+_MATCHED_BY = re.compile(r"\s*matching: +(?P<how>same|different): +(?P<field>[^\s{}#][^{}#]*?)\s*(?:#|$)")
+"""`matching: same: language`: a map in one line needs braces."""
 
 
 class UnreadableConfig(Exception):
@@ -121,6 +123,10 @@ def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
             if found:
                 better = printable(f"{found['key']}: {found['value']}")
                 return UnreadableConfig(f'the space after the colon is missing; write "{better}"', near + 1)
+        matched = _MATCHED_BY.match(source)
+        if matched:
+            better = printable(f"matching: {{{matched['how']}: {matched['field']}}}")
+            return UnreadableConfig(f'an unexpected colon; write "{better}"', number + 1)
         message = "an unexpected colon; check the indentation, put text with a colon in quotes"
         return UnreadableConfig(message, number + 1)
     if "expected <block end>" in problem and "<scalar>" not in problem:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import hmac
 import re
+import secrets
 from datetime import datetime
 
 PROJECT_ID = re.compile(r"(?!_)[A-Za-z0-9_-]{1,64}")
@@ -39,6 +40,11 @@ def warm_id(project_id: str, asked: datetime, number: int) -> str:
 def is_warm_id(text: object) -> bool:
     """Whether this user id is that of a warm server."""
     return isinstance(text, str) and _WARM_ID.fullmatch(text) is not None
+
+
+def new_session_id() -> str:
+    """The id of a new session: random. It is no valid participant's id, so no link can name it."""
+    return f"s.{secrets.token_hex(10)}"
 
 
 def server_label(project_id: str, user_id: str) -> str:
@@ -106,9 +112,13 @@ def link_signature(secret: str, project_id: str, user_id: str) -> str:
     return hmac.new(secret.encode(), f"link\0{project_id}\0{user_id}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
-def completion_code(secret: str, user_id: str) -> str:
-    """The code that a participant gives to the recruiter: 10 characters, which only the project's secret makes."""
-    digest = hmac.new(secret.encode(), f"completion\0{user_id}".encode(), hashlib.sha256).digest()
+def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
+    """The code that a participant gives to the recruiter: 10 characters, which only the project's secret makes.
+
+    With an `outcome`, such as `unmatched`, it is another code.
+    """
+    about = f"completion\0{user_id}" + (f"\0{outcome}" if outcome else "")
+    digest = hmac.new(secret.encode(), about.encode(), hashlib.sha256).digest()
     return base64.b32encode(digest).decode()[:10]
 
 

@@ -12,6 +12,7 @@ import msgspec
 from hippodrome.model import ids
 from hippodrome.model.records import Record
 from hippodrome.ports import Message
+from protocol.session import is_session_id
 
 STOP_REASON_PREFIX = "hippodrome:"  # begins each stoppedReason that our functions give
 _WORDS_BEFORE_CODE = (  # in stoppedReason; they decide even if there is a stopCode
@@ -29,7 +30,11 @@ _WORDS_WITHOUT_CODE = (  # they decide only if there is no stopCode
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: start this participant's server, or a warm server if `user_id` is a warm id. `attempt` is from 1."""
+    """Start topic: start this participant's server. `attempt` is from 1.
+
+    `user_id` may also be a warm server's id, or a session's. If sessions of the project have several players, a
+    participant's message starts no server of their own: it says that they are under way to the game.
+    """
 
     project_id: str
     user_id: str
@@ -219,5 +224,5 @@ def _read(body: Any, kind: type[Any]) -> Any:
 
 
 def _ids_are_valid(message: StartServer | StopServer) -> bool:
-    known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id)
+    known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id) or is_session_id(message.user_id)
     return known and ids.is_project_id(message.project_id)

@@ -130,6 +130,13 @@ def may_have_server(project: Project, step: Step) -> bool:
     return here is not None and first is not None and first <= here and (last is None or here < last)
 
 
+def is_past_server(project: Project, step: Step) -> bool:
+    """Whether the participant needs no server any more at this step: it is the stop step or a later one."""
+    stop = project.events.stop_server_step
+    here, last = project.index(step.key), project.index(stop) if stop else None
+    return here is not None and last is not None and here >= last
+
+
 def reached_without_post(project: Project, step: Step) -> bool:
     """Whether this step follows a game: the trial stored the answer, so no POST has published this step's messages."""
     at = project.index(step.key)

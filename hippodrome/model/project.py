@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import msgspec
 
 from hippodrome.model import hippo_entry, ids
+from hippodrome.model.matching import MATCH
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
@@ -86,6 +87,10 @@ class Project(Record, frozen=True):
     max_server_hours: int | None = None  # of all servers together, ever
     warm_servers: int = 0  # how many to keep started ahead of participants
     signed_links: bool = False
+    players: int = 1  # participants of one session; 1: each participant has a server of their own
+    matching: str | dict[str, str] = "arrival"  # who plays with whom: see `matching.py`
+    patience: float = 300  # seconds in the lobby
+    after_patience: str = "unmatched"  # or `policies`
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
@@ -120,6 +125,21 @@ class Project(Record, frozen=True):
         return self.aws_setup or AwsSetup()
 
     @property
+    def has_sessions(self) -> bool:
+        """Whether several participants share a server."""
+        return self.players > 1
+
+    @property
+    def asks_match(self) -> bool:
+        """Whether the function `match` of agent.py says who plays with whom."""
+        return self.has_sessions and self.matching == MATCH
+
+    @property
+    def groups(self) -> int:
+        """How many groups of participants there are; 0 if there are none."""
+        return number_of_groups(page.variants for page in (*self.steps, *self.pages_in_game))
+
+    @property
     def limits_servers(self) -> bool:
         """Whether a server needs a slot before it starts."""
         return self.max_servers is not None or self.max_server_hours is not None
@@ -144,14 +164,17 @@ class Project(Record, frozen=True):
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
         """The participant's group at this step if it has variants, else in the study; None if there are no groups."""
-        variants = (step.variants if step else 0) or max(
-            (page.variants for page in (*self.steps, *self.pages_in_game)), default=0
-        )
+        variants = (step.variants if step else 0) or self.groups
         return ids.group(self.id, user_id, variants) if variants else None
 
     def file(self, user_id: str, step: Step) -> str:
         """The step file that this participant sees, such as `consent-1`; without variants, the page itself."""
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
+
+
+def number_of_groups(variants: Iterable[int]) -> int:
+    """How many groups of participants there are if pages have so many variants; 0 if no page has any."""
+    return max(variants, default=0)
 
 
 class UnreadableEntry(NamedTuple):

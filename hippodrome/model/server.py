@@ -12,19 +12,22 @@ assigned to a participant, whose record then owns its resources (the warm server
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from datetime import datetime
 from enum import StrEnum
 from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from hippodrome.model import ids, warm_pool
+from hippodrome.model import ids, sessions, warm_pool
 from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Address, DnsRecord, Settings
+from protocol.session import is_session_id
 
 RECORDS = "_servers/"  # the folder of all servers' records
 SPOT_ATTEMPTS = 2  # so many attempts of a participant run on Spot; later ones run on demand
+AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # a lost server is replaced automatically up to this attempt, which is on demand
+MAX_ATTEMPTS = 8  # and at the participant's request up to this one
 
 R = TypeVar("R")
 
@@ -51,6 +54,9 @@ class Reason(StrEnum):
     ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
 
 
+REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which it makes sense to start another automatically
+
+
 class PastAttempt(Record, frozen=True):
     """An earlier attempt, kept in the record of the present one; `deploy cost` counts it."""
 
@@ -69,7 +75,10 @@ class PastAttempt(Record, frozen=True):
 
 
 class Server(Record, frozen=True):
-    """`_servers/{label}.json`: one per participant, with the present attempt and the earlier ones."""
+    """`_servers/{label}.json`: one per participant or session, with the present attempt and the earlier ones.
+
+    `user_id` is the participant's id, the session's, or that of a warm server.
+    """
 
     project_id: str
     user_id: str
@@ -99,6 +108,7 @@ class Server(Record, frozen=True):
     )  # of a warm server: the label of the participant's record that owns its resources now
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # it may store their answers; as in the project when it was started
+    may_match: bool = False  # `matching: match`: until there are members, it may say who plays with whom
 
     @property
     def label(self) -> str:
@@ -113,6 +123,11 @@ class Server(Record, frozen=True):
     def is_warm_server(self) -> bool:
         """Whether it is a warm server, started without a participant."""
         return ids.is_warm_id(self.user_id)
+
+    @property
+    def is_sessions(self) -> bool:
+        """Whether it is the server of a session: several participants play there."""
+        return is_session_id(self.user_id)
 
     @property
     def warm_server_label(self) -> str:
@@ -188,14 +203,15 @@ def new_attempt(
     Its DNS name is a hash below the servers' domain. With `subdomain: userId` it is the participant's id instead, if
     the installation allows it and the id is a valid DNS label: ids come with the link, so the author of a link chooses
     the name, but only on that level. A warm server's deadline bounds its waiting; once it is assigned, it gets the same
-    time to play as other servers.
+    time to play as other servers. A session's server may have been started before its members are matched, and gets
+    that time in addition (`sessions.lifetime`).
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
     is_warm_server = ids.is_warm_id(user_id)
     by_id = project.subdomain == "userId" and settings.user_id_names
     first = user_id.lower() if by_id and not is_warm_server and ids.is_host_label(user_id.lower()) else name
-    played = now + timedelta(minutes=min(project.max_runtime, settings.max_runtime))
+    played = now + sessions.lifetime(project, settings)
     return Server(
         project_id=project.id,
         user_id=user_id,
@@ -213,6 +229,7 @@ def new_attempt(
         counted=project.limits_servers,
         nonce=nonce,
         game_steps=tuple(project.game_steps),
+        may_match=is_session_id(user_id) and project.asks_match,
     )
 
 
@@ -232,6 +249,22 @@ def past_attempt(server: Server) -> PastAttempt:
         nonce=server.nonce,
         game_steps=server.game_steps,
     )
+
+
+def next_attempt(closed: Server) -> int | None:
+    """The attempt that replaces a closed server automatically; None if it stays closed, as a warm server does."""
+    if closed.is_warm_server or not closed.is_closed or closed.attempt >= AUTOMATIC_ATTEMPTS:
+        return None
+    return closed.attempt + 1 if closed.reason in REPLACED else None
+
+
+def requestable_attempt(record: Server) -> int | None:
+    """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
+    if not record.is_closed or next_attempt(record) is not None:
+        return None
+    if record.reason is Reason.FULL:
+        return record.attempt
+    return record.attempt + 1 if record.attempt < MAX_ATTEMPTS else None
 
 
 def replacing(before: Server, wanted: Server) -> Server:

@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 
 import msgspec
 
-from hippodrome.model import ids
+from hippodrome.model import ids, sessions
 from hippodrome.model.project import Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Settings
@@ -27,7 +27,7 @@ def pool_key(project_id: str) -> str:
 def longest_wait(project: Project, settings: Settings) -> timedelta:
     """How long a warm server waits at most: the installation's maxRuntime bounds waiting and play together."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
-    return min(longest, timedelta(minutes=max(0, settings.max_runtime - project.max_runtime)))
+    return min(longest, timedelta(minutes=settings.max_runtime) - sessions.lifetime(project, settings))
 
 
 def deadline(project: Project, settings: Settings, label: str, now: datetime) -> datetime:

@@ -84,9 +84,13 @@ def frame(
     heading: bool = False,
     head: Html = Html(),  # noqa: B008 - immutable
     body: str = "step",
+    sheet: str = "",
     data: Html = Html(),  # noqa: B008
 ) -> Html:
-    """A whole page. `data` are attributes of its body; `heading` makes the study's name the page's first heading."""
+    """A whole page. `data` are attributes of its body; `heading` makes the study's name the page's first heading.
+
+    `sheet` is a style sheet of `web/` that only some pages need, besides that of every page.
+    """
     name = project.name or project.id
     at, steps = project.index(step.key) or 0, len(project.steps)
     progress = fill("progress", step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
@@ -95,7 +99,7 @@ def frame(
         lang=lang or "en",
         title=f"{title or name} · step {at + 1} of {steps}" if steps > 1 else title or name,
         head=head,
-        style=Html(style(body)),
+        style=Html(style(body) + (_sheet(sheet) if sheet else "")),
         body=body,
         data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
         header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),
@@ -179,6 +183,11 @@ $texts
 <p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
 </section>""",
     "text": '<div class="page" id="text-$key" hidden>\n$content\n</div>',
+    "alone": """<h1>Your game is getting ready</h1>
+<p>We are starting a computer for you alone. You need not do anything: the game appears on this page by itself.</p>""",
+    "together": """<h1>Your game is being prepared</h1>
+<p><span id="company"></span> We are starting a computer for your game.
+You need not do anything: the game appears on this page by itself.</p>""",
     "stages": """<ol class="stages">
 <li id="stage-queued"$queued_now>Your request has been received</li>
 <li id="stage-starting"$starting_now>A computer is starting for you</li>
@@ -204,6 +213,11 @@ def _style(kind: str | None) -> str:
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
     return _plain("style.css", text)
+
+
+@cache
+def _sheet(name: str) -> str:
+    return _plain(name, (WEB / name).read_text(encoding="utf-8"))
 
 
 @lru_cache(maxsize=16)

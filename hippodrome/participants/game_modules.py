@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hippodrome.model.project import GAME_PAGES
+from hippodrome.model.project import GAME_PAGES, Project
 
 
 def _has_scene(trial: Mapping[str, Any]) -> bool:
@@ -33,7 +33,14 @@ MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
 }
 """By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""
 
+TOGETHER = ("people.js", "lobby.js")
+"""The modules of a game that several participants play together. `lobby.js` is last: what stands behind it waits."""
 
-def of(trial: Mapping[str, Any]) -> tuple[str, ...]:
+OF_SOME = (*MODULES, *TOGETHER)
+"""All modules that are not part of every project's page."""
+
+
+def of(project: Project) -> tuple[str, ...]:
     """The names of the modules that a project needs besides those of every project."""
-    return tuple(name for name, needed in MODULES.items() if needed(trial))
+    own = tuple(name for name, needed in MODULES.items() if needed(project.trial))
+    return own + TOGETHER if project.has_sessions else own

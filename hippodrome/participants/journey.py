@@ -8,6 +8,7 @@ step).
 from __future__ import annotations
 
 import secrets
+from typing import Any
 
 from hippodrome import http
 from hippodrome.http import Request, Response
@@ -23,6 +24,7 @@ from hippodrome.participants.page_error import PROJECT_NOT_FOUND, REFUSED, PageE
 from hippodrome.participants.previews import PreviewKind
 from hippodrome.participants.steps import HANDLERS
 from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.shared_game import SharedGame, StepAnswered
 from hippodrome.participants.steps.visit import Visit
 from hippodrome.participants.waiting import Waiting
 from hippodrome.ports import Platform
@@ -32,6 +34,8 @@ from hippodrome.storage.secret import SecretCache
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
+LEAVE = "leave"
+"""The action in the form that the lobby's page sends when it is closed."""
 FULL = (
     "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
     "Now and then a place becomes free: you are welcome to come back later with the same link."
@@ -52,6 +56,7 @@ class Journey:
         self._answers = Answers(platform)
         waiting = Waiting(platform.settings, self._secrets)
         self._services = StepServices(platform, self._project_cache, self._repository, self._answers, waiting)
+        self._shared_game = SharedGame(self._services)
         self._steps = {name: handler(self._services) for name, handler in HANDLERS.items()}
 
     def respond(self, request: Request) -> Response:
@@ -84,7 +89,7 @@ class Journey:
         if request.method == "POST":
             return self._post(request, project, user_id)
         if request.has_query("poll"):
-            return self._poll(project, user_id, request.query_value("poll"))
+            return self._poll(request, project, user_id)
         return self._get(request, project, user_id)
 
     def _project(self, request: Request) -> Project:
@@ -107,6 +112,12 @@ class Journey:
     # Reading
 
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
+        try:
+            return self._show(request, project, user_id)
+        except StepAnswered:  # by this very request: the participant was not matched with others
+            return self._show(request, project, user_id)
+
+    def _show(self, request: Request, project: Project, user_id: str) -> Response:
         progress = self._repository.progress(project.id, user_id)
         step = progress.position(project)
         if not progress.has_arrived:
@@ -134,6 +145,8 @@ class Journey:
         except forms.BadForm as bad:
             then = "Please answer the page again." if request.wants_json else "Nothing is lost: go back."
             raise PageError(bad.status, "Your answers were not saved", f"{bad.text} {then}") from None
+        if form.action == LEAVE and project.has_sessions:
+            return self._leave(project, user_id, form)
         step = self._step_of(form, project, user_id)
         if step is not None:
             self._steps[step.type.name].post(project, user_id, step, form)
@@ -157,10 +170,31 @@ class Journey:
         repeated = may_repeat and self._answers.repeats(project, user_id, progress, form.answers)
         return None if repeated else current
 
-    def _poll(self, project: Project, user_id: str, step: str | None) -> Response:
-        """The state of the server, for the waiting page: one read of its record."""
+    def _leave(self, project: Project, user_id: str, form: forms.Form) -> Response:
+        """The page of the lobby was closed, and says so with its ticket. A redirect would be followed, as a visit."""
+        if project.step_of_ticket(user_id, form.step, form.ticket):
+            self._shared_game.leave(project, user_id)
+        return Response(204)
+
+    def _poll(self, request: Request, project: Project, user_id: str) -> Response:
+        """The state of the server, for the waiting page: one read of its record. With sessions see `SharedGame`."""
+        step = project.step(request.query_value("poll"))
+        if project.has_sessions:
+            return http.as_json(200, self._poll_together(request, project, user_id, step))
         record = self._repository.server_of(project.id, user_id)
-        return http.as_json(200, self._services.state(project, user_id, project.step(step), record))
+        return http.as_json(200, self._services.state(project, user_id, step, record))
+
+    def _poll_together(self, request: Request, project: Project, user_id: str, step: Step | None) -> dict[str, Any]:
+        """The state of the lobby, or of the session's server. Who has no membership shows the step's ticket."""
+        shown = project.step_of_ticket(user_id, step.key if step else None, request.query_value("ticket"))
+        if shown is not None and shown.type.on_server:
+            standing = self._shared_game.visit(project, user_id, shown)
+        else:
+            found = self._shared_game.decided(project, user_id)
+            if found is None:
+                raise PageError(403, "This page is out of date", "Please open your study link again.")
+            standing = found
+        return self._shared_game.state(project, user_id, step, standing)
 
 
 def _user_id(request: Request) -> str | None:

@@ -23,6 +23,8 @@ from hippodrome.participants.frame import (
 )
 
 STAGES = ("queued", "starting", "naming", "ready")  # of waiting, in this order
+LOBBY = "lobby"
+"""The state of a participant who waits for others to play with."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def game_page(view: GameView) -> Page:
     nonce = secrets.token_urlsafe(16)
     state = str(view.state.get("state", "queued"))
     over = is_over(view.state)
-    data = {
+    data: dict[str, Any] = {
         "state": dict(view.state),
         "poll": view.poll,
         "page": view.page,
@@ -121,10 +123,17 @@ def game_page(view: GameView) -> Page:
     }
     over_title, over_text = _over_texts(view.state) if over else ("", "")
     moved = bool(view.state.get("replaces"))
+    together = view.project.has_sessions
+    if together:
+        trial = view.project.trial
+        data |= {"players": view.project.players, "absentEnds": trial.get("afterAbsent") != "policy"}
+        data |= {"names": names} if (names := trial.get("playerNames")) else {}
     main = fill(
         "game.html",
         stages=_stages(state),
         waiting=Html(" hidden") if over else Html(),
+        lobby=_lobby(view) if together else Html(),
+        prepared=fill("together" if together else "alone"),
         first=Html(" hidden") if moved else Html(),
         moved=Html() if moved else Html(" hidden"),
         over=Html() if over else Html(" hidden"),
@@ -145,8 +154,9 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project.trial)),
-        head=Html() if over else Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n'),
+        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project)),
+        head=Html() if over or in_lobby(view.state) else _REFRESH,
+        sheet="sessions.css" if together else "",
         body="game",
     )
     return Page(text, headers(view.project, nonce, connect=view.sources))
@@ -155,6 +165,11 @@ def game_page(view: GameView) -> Page:
 def is_over(state: Mapping[str, Any]) -> bool:
     """Whether no server is there or on its way."""
     return state.get("state") in ("ended", "failed")
+
+
+def in_lobby(state: Mapping[str, Any]) -> bool:
+    """Whether the participant waits for others to play with. They have not been matched yet."""
+    return state.get("state") == LOBBY
 
 
 def game_message(view: GameView) -> str:
@@ -176,6 +191,8 @@ def _step_fields(view: StepView) -> Html:
     return fill("named", step=view.step.key, ticket=view.ticket)
 
 
+_REFRESH = Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n')
+"""Asks again in a browser without JavaScript. Not in the lobby: who asks there can be matched, and could not play."""
 _MOVED = (
     "The connection to your game was lost",
     "Your game goes on on another computer, which takes about a minute to start. Press the button to wait for it.",
@@ -228,6 +245,18 @@ def _stages(state: str) -> Html:
         for at, name in enumerate(STAGES)
     }
     return fill("stages", **marks)
+
+
+def _lobby(view: GameView) -> Html:
+    """Where participants wait for each other (`web/game/lobby.js` fills it in). Hidden once they are matched."""
+    players = view.project.players
+    two = players == 2
+    return fill(
+        "lobby.html",
+        lobby=Html() if in_lobby(view.state) else Html(" hidden"),
+        title="Waiting for another participant" if two else "Waiting for other participants",
+        text="Two people play this game together." if two else f"{players} people play this game together.",
+    )
 
 
 def _prepared(view: StepView) -> Fragment:

@@ -3,6 +3,9 @@
 The participant must exist, must be allowed to do so now, and must prove who they are: by a ticket of one of their
 pages, or by the token of their running server. A POST has the fields in its body, a GET, as HIPPO's scripts send it, in
 its query.
+
+A member of a session has a token of their own for its server, and cannot stop it for the others: their stop message
+says that they have left (`hippodrome/servers/sessions.py`).
 """
 
 from __future__ import annotations
@@ -16,14 +19,14 @@ from hippodrome.http import Request, Response
 from hippodrome.model import ids, participant
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import Server
+from hippodrome.model.server import Server, requestable_attempt
 from hippodrome.participants import forms, previews
 from hippodrome.participants.forms import BadForm, Form
 from hippodrome.ports import Platform, Topic
-from hippodrome.servers.replacement import requestable_attempt
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
+from protocol.session import member_token
 
 LONGEST_DELAY = 24 * 60 * 60  # seconds
 NO_PROOF = (
@@ -92,7 +95,8 @@ class Relays:
         raise Refusal(403, f"{NO_PROOF} A token needs the projectId as well.")
 
     def _start(self, project: Project, user_id: str, form: Form) -> None:
-        record = self._repository.server_of(project.id, user_id)
+        owner = self._repository.session_id(project, user_id) or user_id
+        record = self._repository.server_of(project.id, owner)
         self._authorize(project, user_id, form, record)
         progress = self._repository.progress(project.id, user_id)
         if not progress.has_arrived or not participant.may_have_server(project, progress.position(project)):
@@ -105,24 +109,30 @@ class Relays:
             attempt = wished
         else:
             raise Refusal(409, "No further server can be started.")
-        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
+        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
 
     def _stop(self, project: Project, user_id: str, form: Form) -> None:
         delay = _delay(form.answers)
-        record = self._repository.server_of(project.id, user_id)
+        owner = self._repository.session_id(project, user_id) or user_id
+        record = self._repository.server_of(project.id, owner)
         self._authorize(project, user_id, form, record)
-        if record is None or record.is_closed:
+        if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
-        message = to_message(StopServer(project.id, user_id, record.attempt))
+        if record is None or record.is_sessions:  # it may leave the lobby, or leaves the session: it stops no attempt
+            message, name = StopServer(project.id, user_id), ids.server_name(ids.server_label(project.id, user_id), 1)
+        else:
+            message, name = StopServer(project.id, user_id, record.attempt), record.name
         if delay:
             at = self._platform.now() + timedelta(seconds=delay)
-            self._platform.timers.set(ids.delayed_timer(record.name), at, message)
+            self._platform.timers.set(ids.delayed_timer(name), at, to_message(message))
         else:
-            self._platform.bus.publish(Topic.STOP, message)
+            self._platform.bus.publish(Topic.STOP, to_message(message))
 
     def _authorize(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
+        if expected and record and record.is_sessions:
+            expected = member_token(expected, user_id)
         if expected and ids.secrets_equal(str(token), expected):
             return
         if project.step_of_ticket(user_id, form.step, form.ticket):

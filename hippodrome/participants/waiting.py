@@ -6,9 +6,8 @@ from datetime import datetime
 from typing import Any
 
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, State, next_attempt, requestable_attempt
 from hippodrome.ports import Dns, Settings
-from hippodrome.servers.replacement import next_attempt, requestable_attempt
 from hippodrome.storage.secret import SecretCache
 
 MAX_START_TIMES = 50  # starts

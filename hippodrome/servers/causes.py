@@ -44,6 +44,7 @@ class Cause(StrEnum):
     NO_PORT = "no port"
     CRASHED = "crashed"
     OUT_OF_MEMORY = "out of memory"
+    KILLED = "killed"
     DEFINITION = "no task definition"
     PERMISSION = "no permission"
     SIZE = "impossible size"
@@ -115,6 +116,11 @@ _EXPLANATIONS = {
         "The program needed more memory than its server has.",
         "Choose more memory in config.yml and register the project again.",
     ),
+    Cause.KILLED: _Explanation(
+        FailureCategory.PROGRAM,
+        "The process was killed, on one machine: by hand, or by the system because the memory was full.",
+        "If it was not by hand, close other programs, and run the study again.",
+    ),
     Cause.DEFINITION: _Explanation(
         FailureCategory.REFUSED,
         "The project's task definition is gone.",
@@ -169,6 +175,7 @@ _EXPLANATIONS = {
 }
 
 _TASK_PATTERNS = (  # the first match counts
+    (Cause.KILLED, re.compile(r"process was killed")),  # of local/backend/task_record.py, not of AWS
     (Cause.OUT_OF_MEMORY, re.compile(r"OutOfMemory", re.IGNORECASE)),
     (Cause.IMAGE, re.compile(r"CannotPull|pull image manifest", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"exec:|exec format|executable file|exec user process", re.IGNORECASE)),

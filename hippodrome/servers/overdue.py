@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, State, next_attempt
 from hippodrome.ports import RunningTask
-from hippodrome.servers.replacement import next_attempt
 
 RETRY_AFTER = timedelta(minutes=3)  # a server should be in its next state by then: the message is sent again
 LOST_AFTER = timedelta(minutes=10)  # a server without a task after this time has lost it

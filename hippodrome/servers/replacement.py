@@ -1,13 +1,13 @@
-"""How a lost server is replaced: by the participant's next attempt.
+"""How a lost server is replaced: by the next attempt of the participant, or of the session, for all its members.
 
 1. `termination.py` closes the record with the reason why the server ended, and calls `Replacement.request`.
 2. `request` publishes the start message of the next attempt, if `next_attempt` names one.
 3. `start.py` handles that message, and calls `Replacement.write_record`: the next attempt's record replaces the closed
    one. The trial on the new server resumes from the recordings (`trial/recordings/resume.py`).
 
-After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`). If the message of step
-2 is lost, the sweep sends it again (`overdue.py`), and so does the participant's next GET
-(`participants/steps/game.py`).
+After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`, like these in
+`model/server.py`). If the message of step 2 is lost, the sweep sends it again (`overdue.py`), and so does the
+participant's next GET (`participants/steps/game.py`).
 """
 
 from __future__ import annotations
@@ -16,32 +16,14 @@ from typing import TYPE_CHECKING
 
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, to_message
-from hippodrome.model.server import SPOT_ATTEMPTS, Reason, Server
+from hippodrome.model.server import Server, next_attempt
 from hippodrome.ports import Conflict, Topic
+from hippodrome.servers.sessions import members_of
 
 if TYPE_CHECKING:  # next_step needs the rules alone, and its zip holds what it imports
+    from hippodrome.model.project import Project
     from hippodrome.servers.services import ServerServices
     from hippodrome.storage.repository import Versioned
-
-AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # a lost server is replaced automatically up to this attempt, which is on demand
-MAX_ATTEMPTS = 8  # and at the participant's request up to this one
-REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which it makes sense to start another automatically
-
-
-def next_attempt(closed: Server) -> int | None:
-    """The attempt that replaces a closed server automatically; None if it stays closed, as a warm server does."""
-    if closed.is_warm_server or not closed.is_closed or closed.attempt >= AUTOMATIC_ATTEMPTS:
-        return None
-    return closed.attempt + 1 if closed.reason in REPLACED else None
-
-
-def requestable_attempt(record: Server) -> int | None:
-    """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
-    if not record.is_closed or next_attempt(record) is not None:
-        return None
-    if record.reason is Reason.FULL:
-        return record.attempt
-    return record.attempt + 1 if record.attempt < MAX_ATTEMPTS else None
 
 
 class Replacement:
@@ -51,7 +33,7 @@ class Replacement:
         self._services = services
 
     def request(self, closed: Server) -> None:
-        """Publish the start message of the next attempt, unless the participant has finished all game steps."""
+        """Publish the start message of the next attempt, unless all who play there have finished all game steps."""
         following = next_attempt(closed)
         if following is None or self._has_played(closed):
             return
@@ -70,5 +52,15 @@ class Replacement:
         project = self._services.project_cache.live_project(closed.project_id)
         if project is None or not project.game_steps:
             return False
-        progress = self._services.repository.progress(closed.project_id, closed.user_id)
+        players = self._players(closed)
+        return bool(players) and all(self._has_finished(project, user_id) for user_id in players)
+
+    def _players(self, closed: Server) -> list[str]:
+        """The ids of those who play on this server; none if it was started ahead of its session."""
+        if not closed.is_sessions:
+            return [closed.user_id]
+        return members_of(self._services.repository, closed.project_id, closed.user_id)
+
+    def _has_finished(self, project: Project, user_id: str) -> bool:
+        progress = self._services.repository.progress(project.id, user_id)
         return all(step in progress.answered for step in project.game_steps)

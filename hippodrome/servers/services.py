@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from hippodrome.limits.slots import Slots
+from hippodrome.lobby.lobby import Lobby
 from hippodrome.ports import Platform
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.warm.handover import Handovers
@@ -22,6 +23,7 @@ class ServerServices:
         self.project_cache = ProjectCache(platform)
         self.repository = Repository(platform.documents)
         self.secrets = SecretCache(platform.documents)
+        self.lobby = Lobby(platform, self.repository)
         self.slots = Slots(platform)
         self.pools = Pools(platform, self.project_cache)
         self.handovers = Handovers(platform, self.repository, self.slots, self.pools)

@@ -5,6 +5,10 @@ certificate, its handover document if it is a warm server, and the recordings of
 create the answers of its game steps and its own recordings. The credential is derived from the installation's secret
 (`secret.py`). It is not the token, which the participant's browser knows.
 
+A session's server may read the session's document as well, and create the answers of its members, whom that document
+names; its recordings are the session's. With `matching: match`, as long as it has no members, it may read who waits in
+its project's lobby, and create the groups that the function `match` of agent.py has chosen.
+
 What a server may do follows from its record. After that is closed, the server may still store data for as long as a
 task has to end, so that an answer given before the stop message is not lost.
 
@@ -17,7 +21,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import Enum
 from typing import Any, NamedTuple, Protocol
@@ -30,9 +34,21 @@ from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Documents, Settings
+from hippodrome.servers.sessions import members_of
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
-from protocol.keys import answer_key, handover_key, recordings_folder
+from protocol.keys import (
+    QUESTION_ID,
+    answer_key,
+    groups_folder,
+    groups_key,
+    handover_key,
+    recordings_folder,
+    session_key,
+    session_recordings_folder,
+    waiting_key,
+)
+from protocol.session import is_session_id
 
 VALID_SECONDS = 60  # of a presigned request; S3 checks it when the request begins, and servers send it at once
 STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end once it gets SIGTERM
@@ -118,7 +134,8 @@ class ServerAccess:
     """Whose a server is. What it may read and create follows from this alone. Pure.
 
     `name` is its own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id` and
-    `certificate` are set.
+    `certificate` are set. `user_id` may be a session's id; then `members` are the ids of those who play there, once the
+    session is formed.
     """
 
     name: str
@@ -129,6 +146,13 @@ class ServerAccess:
     game_steps: Sequence[str] = ()
     closed: datetime | None = None
     certificate: Sequence[str] = ()  # the keys of its two files
+    members: Sequence[str] = ()
+    may_match: bool = False  # while it has no members
+
+    @property
+    def is_sessions(self) -> bool:
+        """Whether it is the server of a session."""
+        return is_session_id(self.user_id)
 
     @property
     def is_unassigned(self) -> bool:
@@ -142,7 +166,8 @@ class ServerAccess:
 
     @property
     def _recordings(self) -> str:
-        return recordings_folder(self.project_id, self.user_id)
+        folder = session_recordings_folder if self.is_sessions else recordings_folder
+        return folder(self.project_id, self.user_id)
 
     def is_open(self, now: datetime) -> bool:
         """Whether it may still get any request signed."""
@@ -154,7 +179,7 @@ class ServerAccess:
             return self.closed is None and self._allows_reading(wanted.key)
         if self.is_unassigned or wanted.size is None or wanted.size < 0:
             return False
-        if self._is_answer(wanted.key):
+        if self._is_answer(wanted.key) or self._is_groups(wanted.key):
             return wanted.size <= MAX_ANSWER
         return self.is_recording(wanted.key) and wanted.size <= MAX_RECORDING
 
@@ -166,16 +191,31 @@ class ServerAccess:
             and self._names_recording(key.removeprefix(self.folder))
         )
 
+    @property
+    def _is_asked_to_match(self) -> bool:
+        return self.may_match and self.is_sessions and not self.members and self.closed is None
+
+    def _is_groups(self, key: str) -> bool:
+        """Whether it is an answer of the function `match`, which a server without members asks."""
+        question = key.removeprefix(groups_folder(self.project_id)).removesuffix(".json")
+        is_key = QUESTION_ID.fullmatch(question) is not None and key == groups_key(self.project_id, question)
+        return self._is_asked_to_match and is_key
+
     def _allows_reading(self, key: str) -> bool:
+        if self._is_asked_to_match and key == waiting_key(self.project_id):
+            return True
         if key in self.certificate or key == handover_key(self.project_id, self.name):
+            return True
+        if self.is_sessions and key == session_key(self.project_id, self.user_id):
             return True
         return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key))
 
     def _is_answer(self, key: str) -> bool:
-        return any(key == answer_key(self.project_id, self.user_id, step) for step in self.game_steps)
+        players = self.members if self.is_sessions else (self.user_id,)
+        return any(key == answer_key(self.project_id, user, step) for user in players for step in self.game_steps)
 
     def _is_earlier(self, key: str) -> bool:
-        """Whether it is a recording of one of the participant's servers before this one."""
+        """Whether it is a recording of one of the participant's or the session's servers before this one."""
         if not key.startswith(self._recordings):
             return False
         name, _, file = key.removeprefix(self._recordings).partition("/")
@@ -199,6 +239,7 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
                 game_steps=run.game_steps,
                 closed=run.closed,
                 certificate=certificate,
+                may_match=record.may_match,
             )
     return None
 
@@ -218,7 +259,10 @@ class Signing:
         self._secrets = SecretCache(platform.documents)
 
     def respond(self, request: Request) -> Response:
-        """One read of the record, two for an assigned warm server; and one listing if a recording is announced."""
+        """One read of the record, two for an assigned warm server; for a session's, one of the session's document.
+
+        And one listing if a recording is announced.
+        """
         try:
             asked = _read(request)
             access = self._authenticate(asked)
@@ -240,6 +284,8 @@ class Signing:
         if not ids.secrets_equal(asked.credential, secret.credential(asked.server, nonce)):
             raise refused
         found = self._access(stored.server, asked.server)
+        if found is not None and found.is_sessions:
+            found = replace(found, members=members_of(self._repository, found.project_id, found.user_id))
         if found is None or not found.is_open(self._platform.now()):
             logger.info("a server that has ended asked for requests", extra={"server": asked.server})
             raise refused

@@ -1,6 +1,7 @@
 """What `start_server` does: create the record, take a slot if the project has limits, set the timer, run the task.
 
-With `warmServers` a participant is assigned a warm server instead, if one is ready.
+With `warmServers` a participant or a session is assigned a warm server instead, if one is ready. In a project with
+sessions the message of a participant starts no server of their own: the lobby is told that they are under way.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from datetime import timedelta
 from hippodrome.certificates.rules import location
 from hippodrome.log import logger
 from hippodrome.model import ids, server
+from hippodrome.model.matching import MATCH
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.model.project import LEGACY_PORT, Project
 from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.sessions import lifetime_asked_for
 from hippodrome.ports import Conflict, NoCapacity, Refused, Settings, TaskRequest, Topic
 from hippodrome.servers import causes
 from hippodrome.servers.replacement import Replacement
@@ -25,6 +28,7 @@ from hippodrome.storage.project_cache import FRESH
 from hippodrome.storage.repository import Versioned
 from hippodrome.storage.secret import Secret
 from protocol import environment
+from protocol.session import is_session_id
 
 
 class Start:
@@ -46,8 +50,11 @@ class Start:
         # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
         project = self._services.project_cache.live_project(message.project_id, fresh)
-        if project is None:
+        if project is None or (is_session_id(message.user_id) and not project.has_sessions):
             self._cancel_start(message)
+            return
+        if project.has_sessions and ids.is_user_id(message.user_id):
+            self._services.lobby.under_way(project, message.user_id)
             return
         self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
         stored = self._create_or_find(project, message)
@@ -62,8 +69,8 @@ class Start:
             self._start(project, own)
 
     def _cancel_start(self, message: StartServer) -> None:
-        """The project is closed: start nothing, and stop what an earlier delivery may have started."""
-        logger.warning("start for a project that is not live: dropped")
+        """The project is closed, or has no sessions any more: start nothing, and stop what was already started."""
+        logger.warning("start for a project that is not live or has no sessions: dropped")
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
@@ -169,7 +176,8 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
     """The environment variables of a trial server (`protocol/environment.py`)."""
     certificate = location(record.domain, settings.root_domain)
     return {
-        **(_warm_environment(project, record) if record.is_warm_server else _participant_environment(project, record)),
+        **_own_environment(project, record, settings),
+        **({environment.MATCHING: MATCH} if project.asks_match else {}),
         **_plain_environment(project, record, settings),
         environment.PROJECT_ID: record.project_id,
         environment.SERVER: record.name,
@@ -182,12 +190,15 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
     }
 
 
-def _participant_environment(project: Project, record: Server) -> dict[str, str]:
-    return {
-        environment.USER_ID: record.user_id,
-        environment.GROUP: environment.group_text(project.group(record.user_id)),
-        environment.DEADLINE: str(int(record.deadline.timestamp())),
-    }
+def _own_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
+    """For whom the server is, and when it ends."""
+    if record.is_warm_server:
+        return _warm_environment(project, record, settings)
+    deadline = {environment.DEADLINE: str(int(record.deadline.timestamp()))}
+    if record.is_sessions:
+        return {environment.SESSION: record.user_id, **deadline}
+    group = environment.group_text(project.group(record.user_id))
+    return {environment.USER_ID: record.user_id, environment.GROUP: group, **deadline}
 
 
 def _plain_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
@@ -196,7 +207,10 @@ def _plain_environment(project: Project, record: Server, settings: Settings) -> 
     return {environment.PLAIN_ORIGINS: " ".join(project.front_end)} if allowed and project.front_end else {}
 
 
-def _warm_environment(project: Project, record: Server) -> dict[str, str]:
-    """Without a participant. The deadline leaves one who is assigned at the last moment all of maxRuntime."""
-    last = record.deadline + timedelta(minutes=project.max_runtime)
+def _warm_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
+    """Without a participant. The deadline leaves one who is assigned at the last moment all of maxRuntime.
+
+    It leaves a session the time to wait for its members as well.
+    """
+    last = record.deadline + lifetime_asked_for(project, settings)
     return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}

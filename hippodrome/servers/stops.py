@@ -2,7 +2,7 @@
 
 Whoever may publish to the stop topic may stop any server of the installation, so a message without a project is for all
 its projects. Servers are found by their labels, so this takes a read of the master list, and one of a record for each
-project.
+project. A participant's message does not stop the server of a session that others still play on (`sessions.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from hippodrome.model import ids
 from hippodrome.model.messages import StopServer, StopUser
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.services import ServerServices
+from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 
 MOST_READS = 2_000  # of records in one call, but at least one message is handled; the others come again
@@ -25,6 +26,7 @@ class Stops:
     def __init__(self, services: ServerServices) -> None:
         self._services = services
         self._termination = Termination(services)
+        self._sessions = Sessions(services)
 
     def handle(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
         """Stop servers; return the messages that should be delivered again."""
@@ -52,6 +54,8 @@ class Stops:
         return [message for message in wanted if message not in now or message.user_id in failed]
 
     def _open(self, stop: StopServer) -> StopServer | None:
-        """The message, if the participant has an open server in the project; else None."""
+        """The message, if the participant has an open server in the project or may have a session; else None."""
         stored = self._services.repository.server(ids.server_label(stop.project_id, stop.user_id))
-        return stop if stored and not stored.server.is_closed else None
+        if stored is None:
+            return stop if self._sessions.has_sessions(stop.project_id) else None
+        return None if stored.server.is_closed else stop

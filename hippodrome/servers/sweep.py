@@ -8,7 +8,7 @@ no server's name, and those without a record in our bucket (they may be another 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from functools import partial
@@ -18,6 +18,7 @@ from hippodrome.limits.rules import ServerSlots
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages
 from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskSeen, to_message
+from hippodrome.model.project import Project
 from hippodrome.model.server import RECORDS, Reason, Server, State
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
@@ -28,6 +29,7 @@ from hippodrome.servers.dns import delete_dns_records
 from hippodrome.servers.leftovers import Scope
 from hippodrome.servers.overdue import OVERDUE_AFTER, RETRY_AFTER, Remedy, remedy
 from hippodrome.servers.services import ServerServices
+from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 from hippodrome.storage.repository import Versioned
 
@@ -46,6 +48,7 @@ class SweepResult:
     clusters: int = 0
     slots: int = 0
     warm_servers: int = 0
+    sessions: int = 0  # servers of sessions that no members are matched to, or that all members have left
     handovers: int = 0
     overdue: int = 0
     lost: int = 0
@@ -72,6 +75,8 @@ class Sweep:
         self._slots = services.slots
         self._project_cache = services.project_cache
         self._pools = services.pools
+        self._lobby = services.lobby
+        self._sessions = Sessions(services)
         self._owners: dict[str, Versioned] = {}  # by resource name
         self._other_records: list[Versioned] = []  # records that no resource led to
         self._unread: set[str] = set()  # names
@@ -107,6 +112,7 @@ class Sweep:
                 self._try("slots", partial(self._slots.release_forgotten, project_id, gone), len(gone))
         self._check_states({task.name: task for task in found.tasks})
         self._repair_pools()
+        self._stop_sessions(self._repair_lobbies())
         logger.info("swept", extra=asdict(self._result))
         return self._result
 
@@ -219,6 +225,58 @@ class Sweep:
                 record.user_id not in known and record.state is not State.DRAINING
             ):  # which was sent a stop message already
                 self._try("warm_servers", partial(self._send_stop, record, Reason.STOPPED))
+
+    def _stop_sessions(self, listed: Mapping[str, Collection[str] | None]) -> None:
+        """Stop the servers of sessions that are not needed. `listed` is what the lobbies list, read after the records.
+
+        A session is in its lobby before its server has a record, and leaves it when its document is written, or when
+        its server is not needed any more.
+        """
+        running = [stored.server for stored in self._open() if stored.server.is_sessions]
+        unlisted = [
+            record
+            for record in running
+            if (known := listed.get(record.project_id, ())) is not None and record.user_id not in known
+        ]
+        stopped, failed = for_each(
+            self._platform, unlisted, self._stop_if_over, "a session's server is not stopped yet", lambda r: r.name
+        )
+        self._add("sessions", len(stopped), len(failed))
+
+    def _repair_lobbies(self) -> dict[str, Collection[str] | None]:
+        """Finish what interrupted runs of lobbies have left.
+
+        Return, by project, the sessions that its lobby lists; None if that is not known.
+        """
+        listed: dict[str, Collection[str] | None] = {}
+        for project in self._projects_with_sessions():
+            try:
+                listed[project.id] = self._lobby.repair(project)
+            except Exception as error:  # noqa: BLE001 - the other projects go on, and the next sweep tries again
+                failure("a lobby could not be repaired", error, project=project.id)
+                self._result.failed += 1
+                listed[project.id] = None
+        return listed
+
+    def _projects_with_sessions(self) -> list[Project]:
+        """The registered projects whose sessions have several players; none if the list cannot be read."""
+        try:
+            return [project for project in self._project_cache.projects() if project.has_sessions]
+        except (ValueError, RecursionError) as error:
+            failure("the list of projects cannot be read", error)
+            return []
+
+    def _stop_if_over(self, record: Server) -> bool | None:
+        """Stop the server of a session that no lobby lists, if it was never formed or all members have left it.
+
+        Return True if it is stopped. Raises `BadSession` if the session's document cannot be read.
+        """
+        session = self._repository.session(record.project_id, record.user_id)
+        project = self._project_cache.project(record.project_id)
+        if session is not None and not (project and self._sessions.is_over(project, session)):
+            return None
+        self._send_stop(record, Reason.STOPPED)
+        return True
 
     def _records(self) -> list[Versioned]:
         """Every record that was read, once. An assigned warm server is left out: its participant's record owns it."""

@@ -19,19 +19,21 @@ from hippodrome.limits.slots import Release
 from hippodrome.log import logger
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StopServer, TaskChanged
-from hippodrome.model.server import Reason, Server, State, TaskStopped
+from hippodrome.model.server import Reason, Server, State, TaskStopped, next_attempt
 from hippodrome.ports import Conflict
 from hippodrome.servers import causes
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.causes import Cause, FailureCategory
 from hippodrome.servers.dns import delete_dns_records
-from hippodrome.servers.replacement import Replacement, next_attempt
+from hippodrome.servers.replacement import Replacement
 from hippodrome.servers.services import ServerServices
+from hippodrome.servers.sessions import Sessions
 from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.repository import Versioned
 
 I = TypeVar("I")  # noqa: E741 - the item that a server was found by: a message or an event
 ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended
+STOP_TRIES = 4  # a start writes a record three times (task, address, DNS record); then the queue delivers again
 
 
 class ServerToClose(NamedTuple):
@@ -50,22 +52,39 @@ class Termination:
         self._services = services
         self._platform = services.platform
         self._repository = services.repository
+        self._sessions = Sessions(services)
 
     # Told to stop
 
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
         """Stop servers; return the messages that should be delivered again.
 
-        In this order: tasks, DNS records, slots, timers, clusters, the servers' records.
+        In this order: tasks, DNS records, slots, clusters, the servers' records, timers.
         """
         wanted = list(dict.fromkeys(batch))  # a message may be in a batch twice
-        closing, again = for_each(self._platform, wanted, self._stop_task, "a server is not stopped yet")
+        again, changed = self._stop_once(wanted)
+        for _ in range(STOP_TRIES - 1):
+            if not changed:
+                break
+            more, changed = self._stop_once(changed)
+            again += more
+        return again + changed
+
+    def _stop_once(self, wanted: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
+        """Stop servers; return the messages that failed, and those whose server's record changed at the same time.
+
+        The latter are repeated at once and from the beginning: the change may have brought a task or an address. The
+        queue would deliver them again only after its visibility timeout.
+        """
+        found, again = for_each(self._platform, wanted, self._stop_task, "a server is not stopped yet")
+        closing = _each_once(found)
         self._delete_dns_records(one.stored for _, one in closing)
         freed, stuck = self._free_slots(closing)
-        _, failed = for_each(
+        tried, failed = for_each(
             self._platform, freed, lambda one: self._close_stopped(one[1]), "a server is not closed yet", _server_name
         )
-        return again + stuck + [message for message, _ in failed]
+        changed = [message for (message, _), closed in tried if not closed]
+        return again + stuck + [message for message, _ in failed], changed
 
     def _stop_task(self, message: StopServer) -> ServerToClose | None:
         """Stop the task of the server that the message names; None if there is nothing to stop."""
@@ -81,18 +100,25 @@ class Termination:
         return ServerToClose(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
 
     def _record_to_stop(self, message: StopServer) -> Versioned | None:
-        """The record of the server to stop; None if it is closed. If there is no record, create a tombstone."""
+        """The record of the server to stop; None if it is closed. If there is no record, create a tombstone.
+
+        In a project with sessions participants have no record. Their message may be for their session's server.
+        """
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
-        if stored is None:
-            if message.reason == Reason.STOPPED:
-                try:
-                    self._repository.create(
-                        server.stopped_before_start(message.project_id, message.user_id, 1, self._platform.now())
-                    )
-                except Conflict:
-                    raise RetryLater("started at this very moment") from None
+        if stored is not None:
+            return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
+        if message.reason != Reason.STOPPED:
             return None
-        return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
+        if ids.is_user_id(message.user_id) and self._sessions.has_sessions(message.project_id):
+            stop = self._sessions.stop_of(message)
+            return self._record_to_stop(stop) if stop else None
+        try:
+            self._repository.create(
+                server.stopped_before_start(message.project_id, message.user_id, 1, self._platform.now())
+            )
+        except Conflict:
+            raise RetryLater("started at this very moment") from None
+        return None
 
     def _drain(self, stored: Versioned) -> Versioned | None:
         """Write `draining`, so that the warm server cannot be assigned any more; None if it is assigned or closed."""
@@ -100,10 +126,12 @@ class Termination:
             return stored
         return self._repository.update(stored, lambda r: None if r.is_closed else server.draining(r))
 
-    def _close_stopped(self, closing: ServerToClose) -> None:
+    def _close_stopped(self, closing: ServerToClose) -> bool:
+        """Close the record of a server whose task is stopped; False if it has changed since it was read and is open.
+
+        The timer is deleted last: if this is interrupted and not repeated, the timer leads to the record.
+        """
         record = closing.stored.server
-        if closing.reason is not Reason.DEADLINE:  # the timer that sent this message has deleted itself
-            self._platform.timers.cancel(record.name)
         if record.has_own_cluster:
             self._platform.tasks.delete_cluster(record.cluster)
         self._leave_pool(record)
@@ -112,11 +140,13 @@ class Termination:
                 server.close(record, closing.reason, self._platform.now()), closing.stored.etag
             )
         except Conflict:
-            if (present := self._repository.server(record.label)) and not present.server.is_open(record.attempt):
-                return  # another stop was faster
-            raise RetryLater("the record changed while its server was stopped") from None
+            present = self._repository.server(record.label)
+            return present is None or not present.server.is_open(record.attempt)  # another stop was faster
         logger.info("server closed", extra={"server": record.name, "reason": closing.reason})
         self._refill_pool(closed.server)
+        if closing.reason is not Reason.DEADLINE:  # the timer that sent this message has deleted itself
+            self._platform.timers.cancel(record.name)
+        return True
 
     # Ended without our asking
 
@@ -245,6 +275,11 @@ class Termination:
         freed_slot = closed.reason is Reason.STOPPED and closed.counted
         if closed.reason is Reason.DEADLINE or taken_back or freed_slot:
             self._services.pools.request_adjustment(closed.project_id)
+
+
+def _each_once(found: Sequence[tuple[StopServer, ServerToClose]]) -> list[tuple[StopServer, ServerToClose]]:
+    """Each server once: the messages of several members may be for the server of their session."""
+    return list({one.stored.server.name: (message, one) for message, one in reversed(found)}.values())[::-1]
 
 
 def _server_name(one: tuple[object, ServerToClose]) -> str:

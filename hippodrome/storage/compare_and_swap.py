@@ -33,12 +33,15 @@ class SharedDocuments:
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
-    def change(self, key: str, kind: type[R], change: Callable[[R], R], *, renew: bool = False) -> Changed[R]:
+    def change(
+        self, key: str, kind: type[R], change: Callable[[R], R], *, renew: bool = False, anew: R | None = None
+    ) -> Changed[R]:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
         If `change` returns an equal record, nothing is written: one call instead of two. Raises `RetryLater` after
         `TRIES` conflicts, and ValueError or RecursionError if the document holds no such record; nothing is written
-        then. With `renew`, such a document is replaced by the change of an empty record: for what can be rebuilt.
+        then. With `renew`, such a document is replaced by the change of an empty record, or of `anew`: for what can be
+        rebuilt.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
@@ -49,7 +52,7 @@ class SharedDocuments:
                 except (ValueError, RecursionError) as error:
                     if not renew:
                         raise
-                    unreadable = True
+                    before, unreadable = anew or before, True
                     failure("a document cannot be read and is made anew", error, kind=kind.__name__)
             after = change(before)
             if after == before and not unreadable:

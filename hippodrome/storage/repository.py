@@ -6,13 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hippodrome.log import logger
-from hippodrome.model import ids, participant, server
+from hippodrome.model import ids, memberships, participant, server
+from hippodrome.model.memberships import Membership
 from hippodrome.model.participant import Participant, Progress
+from hippodrome.model.project import Project
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Conflict, Documents
 from hippodrome.storage.errors import RetryLater
-from protocol.keys import participant_folder
+from protocol import session
+from protocol.keys import membership_key, participant_folder, session_key
+from protocol.session import Session
 
 TRIES = 8  # for a change; then the queue delivers the message again
 
@@ -54,6 +58,29 @@ class Repository:
         except Conflict:
             return False
         return True
+
+    # Sessions (`project.players`)
+
+    def membership(self, project_id: str, user_id: str) -> Membership | None:
+        """In which session a participant plays, or that they are unmatched; None as long as neither is decided.
+
+        Raises ValueError or RecursionError if the document cannot be read.
+        """
+        found = self._documents.get(membership_key(project_id, user_id))
+        return memberships.read(found.body) if found else None
+
+    def session_id(self, project: Project, user_id: str) -> str | None:
+        """The id of the session that the participant is a member of; None if there is none. Errors as in `membership`.
+
+        No call in a project without sessions.
+        """
+        membership = self.membership(project.id, user_id) if project.has_sessions else None
+        return membership.session if membership else None
+
+    def session(self, project_id: str, session_id: str) -> Session | None:
+        """The session's document; None if there is none. Raises `BadSession` if it cannot be read."""
+        found = self._documents.get(session_key(project_id, session_id))
+        return session.parse(found.body) if found else None
 
     # Servers
 

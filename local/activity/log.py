@@ -22,12 +22,14 @@ from rich.text import Text
 from hippodrome.model import ids
 from hippodrome.model.step_types import type_of
 from local.activity.server_logs import WatchedServer
+from local.backend.task_record import folder_of
 from local.backend.tasks import ProcessTasks
 
 LOOK = 0.5  # seconds
 HELD = 0.8  # seconds for which a server's line is held back: the participant's line that caused it comes first
 SHOWN = 6  # characters of an id
 
+_SESSION = re.compile(r"[^/]+/sessions/([^/]+)/session\.json")
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
 _GONE = {
     "stopped": "stopped",
@@ -78,7 +80,7 @@ class ActivityLog:
 
     def person(self, user_id: str, text: str, style: str = "") -> None:
         """Show something that happens to a participant."""
-        self._line(user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…", text, style)
+        self._line(_short(user_id), text, style)
 
     def _later(self, user_id: str, text: str) -> None:
         """Hold back a server's line, so that the participant's line which caused it comes first.
@@ -119,18 +121,36 @@ class ActivityLog:
     def wrote(self, key: str, body: bytes) -> None:
         """Show what it means that this document was written."""
         found = _PERSON.fullmatch(key)
-        record = _json(body) if found or key.startswith("_servers/") else {}
+        together = _SESSION.fullmatch(key)
+        record = _json(body) if found or together or key.startswith("_servers/") else {}
         if key.startswith("_servers/"):
-            self._catch_up(f"{record.get('projectId')}/users/{record.get('userId')}")
+            self._catch_up(folder_of(str(record.get("projectId")), str(record.get("userId"))))
             self._server(record)
         elif found and found[2] == "participant":
             self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
             self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
             self._now(found[1])
+        elif together:
+            self._plays_together(together[1], record)
+        elif found and found[2] == "session":
+            if record.get("unmatched"):
+                self.person(found[1], "found no others to play with", "yellow")
         elif found and found[2].startswith("answers/"):
             self._catch_up(key.partition("/answers/")[0])
             self._answer(key, found[1], record)
+
+    def _plays_together(self, session_id: str, record: dict[str, Any]) -> None:
+        """Show who plays with whom, once. The lines of their server have the session's id."""
+        with self._lock:
+            if session_id in self._told:
+                return
+            self._told.add(session_id)
+        members = sorted(record.get("members", ()), key=lambda each: each.get("seat", 0))
+        names = ", ".join(_short(str(each.get("userId"))) for each in members)
+        lacking = int(record.get("players", 0)) - len(members)
+        rest = f"; a policy plays in {lacking} place{'s' if lacking > 1 else ''}" if lacking > 0 else ""
+        self.person(session_id, f"{names} {'play together' if len(members) > 1 else 'plays'}{rest}")
 
     def _forget(self, folder: str) -> None:
         """Forget the answers of a participant who arrives: they have none yet, if the data was deleted."""
@@ -188,7 +208,7 @@ class ActivityLog:
         if state in ("starting", "ready"):
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
         elif state == "closed" and reason == "full":
-            self.say("no place for another warm server just now: maxServers or maxServerHours is reached")
+            self.say("no slot for another warm server just now: maxServers or maxServerHours is reached")
         elif state == "closed" and reason != "taken":
             text = f"a warm server is gone ({_GONE.get(reason, reason)})"
             (self.say if reason in ("stopped", "deadline") else self.trouble)(text)
@@ -239,9 +259,13 @@ class ActivityLog:
 
     def _tell(self, watched: WatchedServer) -> None:
         for key, body in watched.answers():
-            self._answer(key, watched.user_id, _json(body))
+            self._answer(key, key.split("/")[2], _json(body))
         for text in watched.complaints():
             self.person(watched.user_id, text, "yellow")
+
+
+def _short(user_id: str) -> str:
+    return user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…"
 
 
 def _json(body: bytes) -> dict[str, Any]:

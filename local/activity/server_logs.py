@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from local.backend.task_record import Task
 from local.check.remedies import remedy
+from protocol import session
+from protocol.keys import participant_folder
+from protocol.session import BadSession, is_session_id
 
 _ERROR = re.compile(r"(?:\S+:\d+: )?(?:\w+\.)*(?P<kind>\w+): (?P<text>.*)")
 
 
 class WatchedServer:
-    """A server that runs: which answers of its participant are there, and how far its log has been read."""
+    """A server that runs: which answers of its participant, or of its session's members, are there already.
+
+    And how far its log has been read.
+    """
 
     def __init__(self, task: Task, data: Path, log: Path, anew: bool) -> None:
         self.folder = task.folder
         self.user_id = task.folder.rpartition("/")[2]
-        self._place = data / task.folder / "answers"
-        self._known = self._names()
+        self._data = data
+        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (task.folder,)  # of those who play
+        self._known = self._keys()
         self._log = log
         self._read = 0 if anew else _size(log)
         self._rest = b""
@@ -27,12 +35,15 @@ class WatchedServer:
         self._said: set[str] = set()
 
     def answers(self) -> list[tuple[str, bytes]]:
-        """Answers that were not there at the last look."""
+        """Answers that were not there at the last look, with their keys."""
+        if not self._folders:
+            self._find_members()
+            return []
         found = []
-        for name in sorted(self._names() - self._known):
+        for key in sorted(self._keys() - self._known):
             with contextlib.suppress(OSError):
-                found.append((f"{self.folder}/answers/{name}", (self._place / name).read_bytes()))
-                self._known.add(name)
+                found.append((key, (self._data / key).read_bytes()))
+                self._known.add(key)
         return found
 
     def complaints(self) -> list[str]:
@@ -52,10 +63,22 @@ class WatchedServer:
                 found.append(text)
         return found
 
-    def _names(self) -> set[str]:
+    def _keys(self) -> set[str]:
+        """The answers that are there now."""
         with contextlib.suppress(OSError):
-            return {path.name for path in self._place.glob("[!.]*.json")}
+            return {f"{folder}/answers/{path.name}" for folder in self._folders for path in self._answers(folder)}
         return set()
+
+    def _answers(self, folder: str) -> Iterable[Path]:
+        return (self._data / folder / "answers").glob("[!.]*.json")
+
+    def _find_members(self) -> None:
+        """Look whether the session is formed. What its members have answered before it was is theirs, not its own."""
+        with contextlib.suppress(OSError, BadSession):
+            found = session.parse((self._data / self.folder / "session.json").read_bytes())
+            project, ids = self.folder.partition("/")[0], [member.user_id for member in found.members if member.user_id]
+            self._folders = tuple(participant_folder(project, each).rstrip("/") for each in ids)
+            self._known = self._keys()
 
 
 class Errors:

@@ -112,6 +112,14 @@ class FolderDocuments:
         self._tell(key, body)
         return _etag(body)
 
+    def put(self, key: str, body: bytes) -> None:
+        """Raises ValueError for a key that cannot be a file."""
+        path = self._writable(key)
+        with self._lock(key):
+            disk.make_folder(path.parent)
+            disk.replace(path, body, self._scratch)
+        self._tell(key, body)
+
     def list(self, prefix: str) -> Iterator[Entry]:
         """Lazily, a folder at a time. What comes and goes meanwhile may be seen or not."""
         folder, _, start = prefix.rpartition("/")

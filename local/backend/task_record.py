@@ -13,10 +13,13 @@ from typing import Any
 from hippodrome.ports import TaskRequest
 from local.backend import files
 from protocol import environment
-from protocol.keys import handover_key, participant_folder
+from protocol.keys import handover_key
+from protocol.session import owner_folder
 
 ARN = "arn:aws:ecs:local:000000000000"
 HOST = "127.0.0.1"
+KILLED = 137
+"""The exit code of a process that SIGKILL has ended."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Task:
     started: str | None = None
     stopped: str | None = None
     asked: str | None = None  # why it was asked to stop
-    folder: str = ""  # the participant's, below the data folder and the spool; empty until a warm server has one
+    folder: str = ""  # the participant's or the session's, below data and spool; empty until a warm server has one
     server: str = ""  # the name of its recordings' folder, if not its own
     handover_key: str = ""  # of a warm server's handover; stored as `warm_server`
     kept: bool = False  # whether recordings belong into the data folder
@@ -145,7 +148,9 @@ def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
         elif exit_code is None:
             detail |= {"stopCode": "TaskFailedToStart", "stoppedReason": "The process could not be started"}
         else:
-            detail |= {"stopCode": "EssentialContainerExited", "stoppedReason": "Essential container in task exited"}
+            killed = ": the process was killed" if exit_code == KILLED else ""
+            said = f"Essential container in task exited{killed}"
+            detail |= {"stopCode": "EssentialContainerExited", "stoppedReason": said}
         if exit_code is not None:
             detail["containers"][0]["exitCode"] = exit_code
     return {
@@ -166,10 +171,15 @@ def claim_of(request: TaskRequest) -> str:
     return hashlib.sha256(request.environment.get(environment.TOKEN, "").encode()).hexdigest()[:16]
 
 
+def folder_of(project_id: str, owner: str) -> str:
+    """Where everything of a server's participant lies, or of its session if that is the `owner`."""
+    return owner_folder(project_id, owner).rstrip("/")
+
+
 def _folder(told: Mapping[str, str]) -> str:
-    """Where everything of the participant lies; empty for a warm server."""
-    user_id = told.get(environment.USER_ID)
-    return participant_folder(told.get(environment.PROJECT_ID, ""), user_id).rstrip("/") if user_id else ""
+    """As `folder_of`; empty for a warm server."""
+    owner = told.get(environment.SESSION) or told.get(environment.USER_ID)
+    return folder_of(told.get(environment.PROJECT_ID, ""), owner) if owner else ""
 
 
 def _handover_key(request: TaskRequest) -> str:

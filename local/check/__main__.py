@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from hippodrome.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
-from local.check import agent
+from local.check import agent, agent_file
 from local.check.project import check_project
 
 
@@ -33,7 +33,7 @@ def main(
     except ConfigErrors as errors:
         found += errors.diagnostics
     found += check_project(folder, config)
-    label = agent.label_of(folder)
+    label = agent_file.label_of(folder)
     playable = not _mistakes(found, label) and config is not None and bool(config.game_steps)
     if playable and config and agent_imports.may_run_on_aws(config):
         lacking = [*agent_imports.missing(folder), *agent_imports.of_players(folder, config)]

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -22,12 +22,15 @@ from random import Random
 from typing import Any, ClassVar
 
 from local.check import idle
+from local.check.outside import Outside
 from local.check.pace import Pace
 from local.check.several import Game
 from protocol import environment as variables
 from protocol import handover
+from protocol.session import MOST_PLAYERS, Session, is_session_id
 from protocol.trial import Trial
-from trial.agent.agent import AgentAdapter
+from trial.agent import match
+from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.callbacks import About, Callbacks
 from trial.agent.joint import JointAdapter
 from trial.agent.starting import start
@@ -35,7 +38,8 @@ from trial.core.players import PLAYER, Player, who_plays
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.reader import PictureReader
-from trial.server import warm
+from trial.recordings import recording
+from trial.server import assignment
 from trial.settings import trial_section
 
 PLAY_STEPS = 5_000  # in each group
@@ -70,7 +74,7 @@ def _try(report: Path) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = _Progress(report, folder)
+    progress = _Progress(report, folder, Outside(config.scene))
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     document = os.environ.pop("GIVEN", "")
     group = _group(document)
@@ -84,10 +88,13 @@ def _try(report: Path) -> None:
     def reset() -> Any:
         os.environ.__class__ = plain
         if document:
-            warm.set_environment(os.environ, handover.parse(document.encode()))
+            assignment.set_environment(os.environ, _whose(document))
         progress.callbacks.session_begins()
         return player.reset(1)
 
+    question = json.loads(os.environ.pop("MATCH", "null"))
+    if question and not progress.call("match", lambda: _match(adapter, question)):
+        return
     spaces = {PLAYER: player.action_space} if isinstance(player, AgentAdapter) else player.action_spaces
     progress.known = _actions(player, config)
     if not progress.call("players", lambda: who_plays(config, spaces, group)):
@@ -112,11 +119,29 @@ def _try(report: Path) -> None:
         progress.over()
 
 
+def _match(adapter: AgentAdapter, question: dict[str, Any]) -> None:
+    """Ask the function `match` about made-up people. Raises AgentError, and what `match` raises."""
+    function = match.function_of(adapter.agent_module)
+    if function is None:
+        raise AgentError("agent.py has no function match(waiting), and config.yml says matching: match")
+    _, problem = match.groups(function, question)
+    if problem:
+        raise AgentError(problem)
+
+
 def _reader(config: Trial, folder: Path, progress: _Progress) -> PictureReader:
     """Reads pictures, and notes what in the project's images and objects cannot be drawn."""
     found = Assets() if config.scene is None else assets.load(folder, config.scene.assets)
     progress.undrawn.extend(found.problems)
     return PictureReader(config.scene, found, progress.undrawn.append)
+
+
+def _whose(document: str) -> assignment.Found:
+    """What tells a server who plays there: the handover itself, or the document of the session that it names."""
+    given = handover.parse(document.encode())
+    if not is_session_id(given.user_id):
+        return given
+    return Session(given.user_id, MOST_PLAYERS, (), given.group)
 
 
 def _group(document: str) -> int | None:
@@ -227,6 +252,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
             if not progress.call("render", player.render):
                 return False
             progress.pace.took(time.monotonic() - began)
+            progress.returned((outcome.info,), outcome.extra)
             seen = {PLAYER: outcome.observation}, {PLAYER: outcome.info}
             callbacks.stepped({PLAYER: progress.action}, {PLAYER: outcome.reward}, *seen)
         progress.episodes = episode
@@ -238,8 +264,8 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
 class _Progress:
     """Writes down each method before it calls it: if the process ends or hangs, the last line names the method."""
 
-    def __init__(self, report: Path, folder: Path) -> None:
-        self._report, self._folder = report, folder
+    def __init__(self, report: Path, folder: Path, outside: Outside) -> None:
+        self._report, self._folder, self._outside = report, folder, outside
         self.episodes = self.steps = 0
         self.action: Any = 0  # or by player
         self.known: dict[str, Any] = {}
@@ -266,14 +292,30 @@ class _Progress:
         except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
             self._write(call=name, error=_told(error, self._folder))
             return False
+        if name == "render":
+            self._outside.see(self.result)
         return True
 
     def callback_failed(self, name: str, error: BaseException) -> None:
         """A callback of the agent has raised."""
         self._callback_errors.append({"name": name, **_told(error, self._folder)})
 
+    def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
+        """Note the first value of these that is too large for the recording."""
+        if "tooLarge" in self.known:
+            return
+        for where, values in (
+            *(("info", info) for info in infos if recording.is_too_large(info)),
+            ("what it returns", extra),
+        ):
+            found = recording.bounded_extra(values)[1] if values else {}
+            for name, size in found.items():
+                self.known["tooLarge"] = {"name": name[:100], "size": size, "where": where}
+                return
+
     def over(self) -> None:
         """All has been tried."""
+        self.known["outside"] = self._outside.found()
         self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
 
     def _write(self, **what: Any) -> None:

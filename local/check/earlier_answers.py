@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
 
-from bots import form_filling
+from bots import form_filling, forms
 from hippodrome.config import Config
+from hippodrome.config.config import StepFiles
 from hippodrome.participants import fragments
 from local.check import spans
+from protocol.answer import UNMATCHED
 
 
 class EarlierAnswers:
     """The answers of a participant who sees a page: to every question, or only to the required ones."""
 
-    def __init__(self, folder: Path, config: Config | None, name: str) -> None:
+    def __init__(self, folder: Path, config: Config | None, steps: Sequence[StepFiles]) -> None:
+        """`steps` are those that the participant has done, of the pages in `folder`."""
         self._folder = folder
+        self._steps = steps
+        self._least_played = {"outcome": UNMATCHED} if config and config.project.has_sessions else _PLAYED
+
+    @classmethod
+    def before_the_game(cls, folder: Path, config: Config) -> EarlierAnswers:
+        """Those of a participant who comes to the first game step."""
+        return cls(folder, config, list(itertools.takewhile(lambda step: not step.type.on_server, config.steps)))
+
+    @classmethod
+    def before_page(cls, folder: Path, config: Config | None, name: str) -> EarlierAnswers:
+        """Those of a participant who comes to the page with this file."""
         steps = list(config.steps) if config else []
         in_game = [file.name for page in (config.game_pages if config else ()) for file in page.files]
         place = next(
@@ -27,7 +43,29 @@ class EarlierAnswers:
             ),
             0,
         )
-        self._steps = steps[:place]
+        return cls(folder, config, steps[:place])
+
+    def fields(self) -> tuple[list[str], str]:
+        """The names of the fields of all pages before, and the text of these pages."""
+        texts = self._texts()
+        found = (name for text in texts for name in _answered(text)[0])
+        return list(dict.fromkeys(found)), "\n".join(texts)
+
+    def choices(self, field: str) -> int | None:
+        """How many different answers a participant can give to a field; None if they write it, or a script makes it."""
+        texts = self._texts()
+        if any("<script" in text.lower() for text in texts):
+            return None
+        found: set[str] = set()
+        for text in texts:
+            controls = [control for form in _forms(text) for control in form.controls if control.name == field]
+            if not controls:
+                continue
+            answers = _choices(controls)
+            if answers is None:
+                return None
+            found |= answers
+        return len(found) if found else None
 
     def answers(self, group: int | None) -> list[dict[str, dict[str, Any]]]:
         """By step: the most that may have been answered there, and the least."""
@@ -35,23 +73,32 @@ class EarlierAnswers:
         least: dict[str, dict[str, Any]] = {}
         for step in self._steps:
             if step.type.on_server:
-                most[step.key] = least[step.key] = dict(_PLAYED)
+                most[step.key], least[step.key] = dict(_PLAYED), dict(self._least_played)
                 continue
             if not step.files:  # a type of step without a researcher's page: no fields to answer
                 most[step.key] = least[step.key] = {}
                 continue
             file = step.files[(group or 0) if step.variants else 0]
-            page = spans.replace(source_of(self._folder / file.name), lambda jinja: spans.MARK, *spans.JINJA)
-            most[step.key], least[step.key] = _answered(page)
+            most[step.key], least[step.key] = _answered(source_of(self._folder / file.name))
         return [most, least]
+
+    def _texts(self) -> list[str]:
+        """The pages of all groups."""
+        return [source_of(file) for step in self._steps for file in step.files]
 
 
 _PLAYED = {"episodes": 1, "score": 1.5, "frames": 100, "seconds": 3.5, "trial": "t", "outcome": "finished"}
 
 
-def _answered(page: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _forms(text: str) -> list[forms.Form]:
+    """The forms of a page, with a mark in the place of each Jinja expression."""
+    page = spans.replace(text, lambda _: spans.MARK, *spans.JINJA)
+    return forms.read(f"<form>{fragments.prepare(page).text}</form>")
+
+
+def _answered(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Answers to a page: to all its questions, and to those only that must be answered."""
-    found = form_filling.forms(f"<form>{fragments.prepare(page).text}</form>")
+    found = _forms(text)
     if not found:
         return {}, {}
     controls = found[0].controls
@@ -63,6 +110,25 @@ def _answered(page: str) -> tuple[dict[str, Any], dict[str, Any]]:
         name: (value if name in needed else "") for name, value in most.items() if name in needed or name not in boxes
     }
     return most, least
+
+
+def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
+    """The answers to a question of one page, "" for none; None if they are more than can be counted."""
+    kinds = {control.kind for control in controls}
+    needed = any(control.required for control in controls)
+    if kinds == {"radio"} or (kinds == {"checkbox"} and len(controls) == 1):
+        found = {control.given.get("value", "on") for control in controls}
+        unanswered = not needed
+    elif kinds == {"select"} and len(controls) == 1 and "multiple" not in controls[0].given:
+        found = {option.value for option in controls[0].options if not option.disabled}
+        if needed:
+            found.discard("")
+        unanswered = False
+    else:
+        return None
+    if any(spans.MARK in value for value in found):
+        return None
+    return {value.strip().casefold() for value in found} | ({""} if unanswered else set())
 
 
 def source_of(path: Path) -> str:

@@ -33,7 +33,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
             continue  # the configuration's check says so
         label = f"{steps.path.name}/{name}"
         here = [
-            *check_template(label, source, config, groups, EarlierAnswers(steps.path, config, name)),
+            *check_template(label, source, config, groups, EarlierAnswers.before_page(steps.path, config, name)),
             *Tags(label, steps.names, config).read(source),
             *check_structure(label, source),
         ]
@@ -98,9 +98,8 @@ def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | 
     """The files of the pages in the study's order, and the groups that may see each."""
     if config is None:
         return {name: [None] for name in names if name.endswith(".html")}
-    everybody: list[int | None] = [*range(config.groups)] or [None]
     pages: dict[str, list[int | None]] = {}
     for step in (*config.steps, *config.game_pages):
         for group, file in enumerate(step.files):
-            pages[file.name] = [group] if step.variants else everybody
+            pages[file.name] = [group] if step.variants else config.each_group
     return pages

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from hippodrome.config import Config, Diagnostic, agent_imports, remarks
-from local.check.agent import read_agent
+from local.check.agent_file import read_agent
 from local.check.pages import check_pages
+from local.check.sessions import check_sessions
 
 
 def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
@@ -15,4 +16,6 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
     found = remarks.remarks_on(folder, config) if config else []
     if config and plays and agent_imports.may_run_on_aws(config):
         found += agent_imports.requirement_remarks(folder)
+    if config:
+        found += check_sessions(folder, config)
     return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

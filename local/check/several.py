@@ -1,14 +1,14 @@
 """Plays an environment with several players: in the agent's process (`agent_process.py`).
 
 Participants press random keys, and policies play in their places, as on a server but one after another: each is timed
-by itself.
+by itself. If several participants play together, `substitute` plays in each of their places for a while.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -19,8 +19,10 @@ from protocol.trial import Trial
 from trial.agent.joint import Joint, JointAdapter
 from trial.core.players import Player, legal_actions
 from trial.core.seeds import policy_seed
+from trial.policies.places import load_policies
 from trial.policies.policy import Policy
-from trial.policies.seats import load_policies
+
+STAYS = 20  # steps for which a substitute plays, before another does
 
 
 class Reporting(Protocol):
@@ -36,6 +38,8 @@ class Reporting(Protocol):
 
     def call(self, name: str, function: Callable[[], Any]) -> bool: ...
 
+    def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None: ...
+
 
 class Game:
     """A game of several players; `play` lets them."""
@@ -50,20 +54,32 @@ class Game:
         self._last: dict[str, int] = {}
         self._random = Random(1)  # noqa: S311 - the same each time
         self._pressed = 0
+        self._substitutes: dict[str, Policy] = {}  # by the player in whose place each plays
         self._acted: set[frozenset[str]] = set()  # who was to act at the same time
         adapter.views = tuple(player.name for player in players if player.human)
 
     def load(self) -> bool:
         """Load the policies; whether that went well."""
-        agent = self._adapter
-        if not self._progress.call(
-            "policies",
-            lambda: load_policies(self._players, self._folder, agent.agent_module, agent.observation_spaces),
-        ):
+        humans = [player for player in self._players if player.human]
+        plays = self._config.substitute if len(humans) > 1 else None
+        policies = self._loaded(self._players)
+        if policies is None:
             return False
-        self._policies = self._progress.result
-        self._paces = {name: Pace() for name in self._policies}
+        self._policies = policies
+        substitutes = self._loaded([replace(player, plays=plays) for player in humans]) if plays else {}
+        if substitutes is None:
+            return False
+        self._substitutes = substitutes
+        self._paces = {name: Pace() for name in (*policies, *substitutes)}
         return True
+
+    def _loaded(self, players: Sequence[Player]) -> dict[str, Policy] | None:
+        """The policies of these players; None if one cannot be loaded, which is reported."""
+        agent = self._adapter
+        done = self._progress.call(
+            "policies", lambda: load_policies(players, self._folder, agent.agent_module, agent.observation_spaces)
+        )
+        return dict(self._progress.result) if done else None
 
     def play(self, first_reset: Callable[[], Any], over: Callable[[], bool]) -> bool:
         """Play up to the end of the last episode, or until `over`; False if something failed."""
@@ -95,6 +111,7 @@ class Game:
                 progress.pace.took(time.monotonic() - began)
                 progress.known["policies"] = {name: asdict(pace) for name, pace in self._paces.items()}
                 progress.known["takeTurns"] = self._take_turns()
+                progress.returned(now.infos.values(), now.extra)
                 callbacks.stepped(actions, now.rewards, now.observations, now.infos)
             progress.episodes = episode
             callbacks.episode_ended(now.why)
@@ -103,14 +120,14 @@ class Game:
 
     def close(self) -> bool:
         """Close the policies and the agent."""
-        for policy in self._policies.values():
+        for policy in (*self._policies.values(), *self._substitutes.values()):
             if not self._progress.call("close", policy.close):
                 return False
         return self._progress.call("close", self._adapter.close)
 
     def _reset_policies(self, episode: int) -> bool:
         self._last = {}
-        for name, policy in self._policies.items():
+        for name, policy in (self._policies | self._substitutes).items():
             seed = policy_seed(episode, name)
             if not self._progress.call(f"policy {name} reset", partial(policy.reset, seed)):
                 return False
@@ -119,14 +136,15 @@ class Game:
     def _actions(self, now: Joint, step: int) -> dict[str, int] | None:
         """What those who are to act do; None if a policy failed."""
         actions: dict[str, int] = {}
+        replaced = self._replaced()
         for player in self._players:
             name = player.name
             if name not in now.to_act:
                 continue
             allowed = legal_actions(len(player.action_space), now.masks.get(name))
-            if player.human:
+            if player.human and name != replaced:
                 actions[name] = self._press(allowed)
-            elif name in self._policies:
+            elif name in self._policies or name == replaced:
                 action = self._asked(name, now) if self._due(step) else self._between(player)
                 if action is None:
                     return None
@@ -134,6 +152,11 @@ class Game:
             else:
                 actions[name] = player.idle if player.idle in allowed else allowed[0]
         return actions
+
+    def _replaced(self) -> str | None:
+        """In whose place the substitute plays at this step: in none at first, then in each in turn."""
+        names = (None, *self._substitutes)
+        return names[self._progress.steps // STAYS % len(names)]
 
     def _take_turns(self) -> bool:
         """Whether each step was taken by one player alone, and not always by the same."""
@@ -154,7 +177,8 @@ class Game:
     def _asked(self, name: str, now: Joint) -> int | None:
         def act() -> int:
             began = time.monotonic()
-            action = self._policies[name].act(now.observations.get(name), now.infos.get(name, {}), now.masks.get(name))
+            policy = self._policies.get(name) or self._substitutes[name]
+            action = policy.act(now.observations.get(name), now.infos.get(name, {}), now.masks.get(name))
             self._paces[name].took(time.monotonic() - began)  # without what reporting takes
             return action
 

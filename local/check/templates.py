@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from jinja2 import meta, nodes
@@ -13,6 +13,7 @@ from hippodrome.participants import fragments
 from hippodrome.participants.fragments import FragmentError
 from local.check.earlier_answers import EarlierAnswers
 from local.check.wording import nearest, short
+from protocol.answer import UNMATCHED
 
 VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
 
@@ -45,8 +46,11 @@ def check_template(
             yield Diagnostic(label, name.lineno, "", message, remark=True)
     for group in groups:
         for answers in earlier.answers(group):
+            known = _nothing_known(config, group)
+            if config:
+                known["participant"] |= _met(answers, config)
             try:
-                page.render({**_nothing_known(config, group), "answers": answers})
+                page.render({**known, "answers": answers})
             except FragmentError as error:
                 yield _failing(label, error, may_depend=bool(fragments.records_mentioned(page.text)))
                 return
@@ -85,6 +89,15 @@ def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
         "completion_code": "ABCDEF",
         "answers": {},
     }
+
+
+def _met(answers: Mapping[str, Mapping[str, Any]], config: Config) -> dict[str, Any]:
+    """What a page after a game of several may mention of the participant; nothing on pages before it."""
+    played = [answers[step.key] for step in config.game_steps if step.key in answers]
+    if not config.project.has_sessions or not played:
+        return {}
+    alone = played[0].get("outcome") == UNMATCHED
+    return {"unmatched": alone, "members": 0 if alone else config.project.players}
 
 
 def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:

@@ -35,7 +35,16 @@ from hippodrome.config import Config, ConfigErrors, read_project
 from local.rehearsal.crashes import ServerLogs
 from local.rehearsal.logs import FunctionLog, verify
 from local.rehearsal.report import report
-from local.rehearsal.study_process import TRIED, NotHeld, StudyProcess, copy_of, logs_of, wait_until_gone
+from local.rehearsal.study_process import (
+    TRIED,
+    NotHeld,
+    StudyProcess,
+    copy_of,
+    logs_of,
+    sessions_not_open,
+    sessions_of,
+    wait_until_gone,
+)
 
 # The rehearsal
 
@@ -82,6 +91,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], 
                 f"{stages.count(stage)} {words}"
                 for stage, words in (
                     ("answers pages", "answering"),
+                    ("waits for others", "in the lobby"),
                     ("waits for its server", "waiting"),
                     ("plays", "playing"),
                     ("failed", "failed"),
@@ -174,7 +184,11 @@ def _rehearse_and_report(
     servers = ServerLogs(data) if data else None
     with _bar(console, crowd.bots) as watch:
         accounts = interruptible(rehearse(link, crowd, watch))
-    left = wait_until_gone(data, {account.user_id for account in accounts}) if data else None
+    left = None
+    if data:
+        ids = {account.user_id for account in accounts}
+        sessions = sessions_of(data, config.project.id, ids)
+        left = wait_until_gone(data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set()))
     if study and left:
         left.stubborn = not study.interrupt()
         left.processes = max(left.processes, study.clear())
@@ -230,7 +244,7 @@ def main(
             fine = _rehearse_and_report(
                 folder,
                 config,
-                Crowd(bots, play=play, at_once=at_once, patience=patience, ramp=ramp),
+                Crowd(bots, play=play, at_once=max(at_once, config.project.players), patience=patience, ramp=ramp),
                 link=study.link if study else str(link),
                 data=place,
                 study=study,

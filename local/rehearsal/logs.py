@@ -14,6 +14,7 @@ from hippodrome.model import ids
 from local.activity.function_log import complaint
 from local.activity.server_logs import last_error
 from local.rehearsal.study_process import logs_of
+from protocol.keys import membership_key
 
 
 def verify(data: Path, project_id: str, accounts: Sequence[Account], *, recorded: bool = True) -> Verification:
@@ -24,8 +25,9 @@ def verify(data: Path, project_id: str, accounts: Sequence[Account], *, recorded
 
 
 def _last_error(data: Path, project_id: str, user_id: str) -> str:
-    """What the log of the participant's last server says of its last error."""
-    label = ids.server_label(project_id, user_id)
+    """What the log of the participant's last server, or of their session's, says of its last error."""
+    owner = document(data / membership_key(project_id, user_id)).get("session") or user_id
+    label = ids.server_label(project_id, owner)
     attempt = document(data / "_servers" / f"{label}.json").get("attempt", 1)
     return last_error(logs_of(data) / f"{ids.server_name(label, attempt)}.log")
 

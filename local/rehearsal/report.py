@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from statistics import median
 
@@ -10,12 +11,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bots.account import Account
+from bots.account import Account, Play
 from bots.verification import Verification
 from local.rehearsal.crashes import Crash
 from local.rehearsal.study_process import Leftovers
 
+EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended before their time
 SHOWN = 10  # lines of each kind
+SHOWN_NAMES = 3  # of those who found no others
 SHOWN_CRASHES = 3  # tracebacks of agent.py
 
 
@@ -72,6 +75,7 @@ def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
     """What the bots have seen."""
     plays = [play for account in accounts for play in account.plays]
     rows = [("bots finished", _of(sum(account.finished for account in accounts), len(accounts)))]
+    rows += _together(accounts)
     if plays:
         rows.append(("wait on the game page", _spread([play.waited for play in plays])))
     if found and found.starts:
@@ -83,6 +87,33 @@ def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
         rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {asked} set"))
         rows.append(("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB"))
     return rows
+
+
+def _together(accounts: Sequence[Account]) -> Rows:
+    """Who played with others, for a study of several participants."""
+    plays = [play for account in accounts for play in account.plays]
+    waited = [play.lobby for play in plays if play.lobby is not None]
+    if not waited and not any(play.unmatched or play.members > 1 for play in plays):
+        return []
+    sessions: dict[str, list[Play]] = {}
+    for play in plays:
+        if not play.unmatched and play.addresses:
+            sessions.setdefault(f"{play.step} {play.addresses[0]}", []).append(play)
+    sizes = Counter(play.members for members in sessions.values() for play in members[:1])
+    made = " and ".join(
+        f"{count} of {size} participant{'' if size == 1 else 's'}"
+        for size, count in sorted(sizes.items(), reverse=True)
+    )
+    early = Counter(play.outcome for play in plays if play.outcome in EARLY)
+    ended = ", ".join(f"{count} {outcome}" for outcome, count in sorted(early.items()))
+    alone = [account.user_id for account in accounts if any(play.unmatched for play in account.plays)]
+    names = ", ".join(alone[:SHOWN_NAMES]) + (" …" if len(alone) > SHOWN_NAMES else "")
+    return [
+        ("games played together", made or "none"),
+        *([("wait in the lobby", _spread(waited))] if waited else []),
+        ("unmatched", f"{len(alone)}: {names}" if alone else "0"),
+        *([("ended early", ended)] if ended else []),
+    ]
 
 
 def _found(accounts: Sequence[Account], found: Verification | None, *, recorded: bool, live: bool) -> Rows:

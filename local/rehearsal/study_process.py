@@ -20,13 +20,16 @@ import yaml
 
 from bots.verification import document
 from hippodrome.config.folder import read_source
+from hippodrome.lobby import decisions
 from protocol import environment, handover
 from protocol import players as who
-from protocol.keys import handover_key
+from protocol.keys import handover_key, membership_key
+from protocol.session import is_session_id
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
 START_SECONDS = 60.0  # until the study must be held
+PATIENCE = 30  # seconds in which a bot must have found others, in the copy of a study
 GONE_SECONDS = 45.0  # until the servers must be gone after the last bot
 END_SECONDS = 30.0  # until local mode must have ended
 
@@ -141,9 +144,10 @@ def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.
 
 
 def _plays(told: Mapping[str, str], data: Path) -> str | None:
-    """The participant of a server: from its environment, or for a warm server from its handover."""
-    if environment.USER_ID in told:
-        return told[environment.USER_ID]
+    """The participant or session of a server: from its environment, or for a warm server from its handover."""
+    for name in (environment.USER_ID, environment.SESSION):
+        if told.get(name):
+            return told[name]
     with contextlib.suppress(OSError, ValueError, KeyError):
         key = handover_key(told[environment.PROJECT_ID], told[environment.SERVER])
         return handover.parse((data / key).read_bytes()).user_id
@@ -159,7 +163,7 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
             (folder / path.name).symlink_to(path.resolve())
     tree = yaml.safe_load(config.read_text(encoding="utf-8"))
-    _copy_policies(project, folder, (tree.get("trial") or {}).get("players"))
+    _copy_policies(project, folder, tree.get("trial") or {})
     known_as = source.adapted.at(("project", "id"))  # it may come from the folder's name, which the copy has not
     if isinstance(known_as, str):
         tree["project"]["id"] = known_as
@@ -172,6 +176,9 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         changes.append(f"there are no limits (no {', '.join(f'`{key}`' for key in limits)})")
     if tree["project"].pop("signedLinks", None):
         changes.append("no link need be signed")
+    if tree["project"].get("players", 1) != 1 and tree["project"].get("patience", 300) > PATIENCE:
+        tree["project"]["patience"] = PATIENCE
+        changes.append(f"`patience` is {PATIENCE}")
     trial = tree.get("trial") or {}
     shown = trial.get("ui")
     if isinstance(shown, list):
@@ -184,12 +191,13 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     return changes
 
 
-def _copy_policies(project: Path, folder: Path, players: object) -> None:
+def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> None:
     """Copy the policies' files and what lies beside them: a server reads none that a link leads to.
 
-    What is wrong in `players` is said by local mode.
+    What is wrong in `players` and `substitute` is said by local mode.
     """
-    for top in {Path(file).parts[0] for _, file in who.files(players) if (project / file).is_file()}:
+    named = {key: trial.get(key) for key in ("players", "substitute")}
+    for top in {Path(file).parts[0] for _, file in who.files(named) if (project / file).is_file()}:
         (folder / top).unlink()
         if (project / top).is_dir():
             shutil.copytree(project / top, folder / top)
@@ -200,6 +208,22 @@ def _copy_policies(project: Path, folder: Path, players: object) -> None:
 def logs_of(data: Path) -> Path:
     """Where a study with this data folder puts what its functions and servers say."""
     return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
+
+
+def sessions_of(data: Path, project_id: str, users: Collection[str]) -> set[str]:
+    """The sessions in which these participants play together with others."""
+    keys = (membership_key(project_id, user_id) for user_id in users)
+    return {str(membership["session"]) for key in keys if (membership := document(data / key)).get("session")}
+
+
+def sessions_not_open(data: Path, project_id: str) -> set[str]:
+    """The sessions that have a server, but those that the lobby lists as open.
+
+    Their servers were started ahead, and wait for participants who may still come.
+    """
+    ahead = {each["id"] for each in document(data / decisions.key(project_id)).get("open", ())}
+    owners = {str(document(path).get("userId")) for path in (data / "_servers").glob("*.json")}
+    return {owner for owner in owners - ahead if is_session_id(owner)}
 
 
 def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:

@@ -59,6 +59,10 @@ def about_key(key: str) -> str:
     parts = key.split("/")
     if len(parts) > 3 and parts[1] == "users":
         return parts[3]
+    if len(parts) > 3 and parts[1] == "sessions":
+        return f"a session's {parts[3]}"
+    if len(parts) > 2 and parts[1] == "lobby":
+        return f"lobby/{parts[2]}"
     if len(parts) == 2 and key.endswith(".html"):
         return "steps"  # a page that HIPPO's script uploaded
     return parts[1] if len(parts) > 2 and parts[1] in ("steps", "places", "spares") else parts[0]

@@ -73,6 +73,27 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
     "s3:GetObject spares": {SIGN},
+    # Sessions: who waits in a lobby, what is decided there, and the documents of sessions and of their members, which are
+    # written once. start_server and stop_server note who is under way, and who is not; the sweep finishes what was
+    # interrupted. A lost server is replaced unless all members have played; the relays look whose session it is.
+    "s3:GetObject _lobby": {NEXT, SWEEP},
+    "s3:PutObject _lobby": {NEXT, START},
+    "s3:DeleteObject _lobby": {NEXT, START, STOP, SWEEP},
+    "s3:GetObject _lobbies": {NEXT, START, SWEEP},
+    "s3:PutObject _lobbies": {NEXT, START, SWEEP},
+    "s3:GetObject session.json": {NEXT, START, STOP, SEND_START, SEND_STOP, SWEEP},
+    "s3:PutObject session.json": {NEXT, SWEEP},
+    "s3:GetObject a session's session.json": {NEXT, START, TASK, STOP, SWEEP, SIGN},
+    "s3:PutObject a session's session.json": {NEXT, SWEEP},
+    "s3:GetObject a session's trials": {SIGN},
+    "s3:PutObject a session's trials": {SIGN},
+    # matching: match: next_step asks who plays with whom, and servers answer. The sweep deletes what is old.
+    "s3:GetObject _match": {NEXT, SIGN},
+    "s3:PutObject _match": {NEXT},
+    "s3:GetObject lobby/groups": {NEXT},
+    "s3:PutObject lobby/groups": {SIGN},
+    "s3:DeleteObject _match": {SWEEP},
+    "s3:DeleteObject lobby/groups": {SWEEP},
     # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
     # an upgrade.
     "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},

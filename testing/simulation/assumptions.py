@@ -17,7 +17,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
     """One line for each thing that decides the figures."""
     median, sigma, longest = conditions.starts
     rate = ", ".join(f"{name} {quota[0]:g}/s (burst {quota[1]:g})" for name, quota in QUOTAS.items())
-    delays = ", ".join(f"{name} {_span(span)}" for name, span in LATENCY.items())
+    delays = ", ".join(f"{name} {_span(span)}" for name, span in {**LATENCY, "s3": conditions.s3}.items())
     queues = ", ".join(f"{name} {wire.concurrency} at once, batches of {wire.batch}" for name, wire in WIRES.items())
     return {
         "start of a task": f"log-normal, median {median:g} s, sigma {sigma:g}, at most {longest:g} s ({OURS})",
@@ -28,6 +28,8 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "changes of the zone in a call": f"{MAX_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
+        "S3": f"a read or listing shows every write answered before it; a listing is a call for {ports.PAGE:,} keys (S3 User "
+        "Guide, data consistency model); LastModified has whole seconds (minio/minio-go pull request 1638)",
         "Spot": _spot(conditions),
         "events": f"{conditions.late:.0%} come 1 to 20 s late, {conditions.repeated:.0%} come twice ({OURS})",
         "events lost": f"{conditions.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",

@@ -10,7 +10,7 @@ their slow spans, and the busy zone remain.
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from testing.simulation.cloud import QUOTAS
 from testing.simulation.ports import MAX_CHANGES, Conditions, address_lag, draws, propagation, start_time
@@ -24,6 +24,28 @@ def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None =
     Interruptions are left out: they only add to what participants wait. Where Spot is sold out, on demand has the same
     quotas and start times.
     """
+    return [ready - came for came, ready in _served(asked, seed, conditions)]
+
+
+def aws_alone_together(
+    under_way: Sequence[float], lobby: Sequence[float], players: int, seed: int, conditions: Conditions | None = None
+) -> list[float]:
+    """Seconds from the lobby until the server is ready, of those who come there at these seconds to play together.
+
+    One server is asked for as soon as the first of each `players` is under way. The first `players` who come to the
+    lobby are a session at the moment at which the last of them comes, and get the server that is ready first. Those who
+    are left over are left out.
+    """
+    asked = sorted(under_way)[::players]
+    ready = sorted(ready for _, ready in _served(asked, seed, conditions))
+    came = sorted(lobby)
+    sessions = [came[at : at + players] for at in range(0, len(came) - players + 1, players)]
+    pairs = zip(sessions, ready, strict=False)
+    return [max(members[-1], server) - one for members, server in pairs for one in members]
+
+
+def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> Iterator[tuple[float, float]]:
+    """For each server that is asked for at these seconds: this second, and that at which it is ready."""
     conditions, starts, spreads = conditions or Conditions(), draws(seed, "starts"), draws(seed, "propagation")
     chance, lags = random.Random(seed), draws(seed, "addresses")
     arrivals = sorted(asked)
@@ -31,7 +53,7 @@ def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None =
         (launched + start_time(starts, conditions.starts) + address_lag(lags, conditions), came)
         for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
     )
-    waits, free, change = list[float](), 0.0, QUOTAS["route53"]
+    free, change = 0.0, QUOTAS["route53"]
     most, gap = MAX_CHANGES // 2, 1 / change[0]
     while runs:
         begins = max(free, runs[0][0])
@@ -39,8 +61,7 @@ def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None =
         runs = runs[len(batch) :]
         free = begins + max(gap, chance.uniform(*conditions.busy_zone))
         in_sync = begins + propagation(spreads, conditions, seed, begins)
-        waits += [in_sync - came for _, came in batch]
-    return waits
+        yield from ((came, in_sync) for _, came in batch)
 
 
 def _admitted(arrivals: Sequence[float]) -> list[float]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TypeVar
 
 from testing import template
@@ -81,12 +82,21 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
 class Cloud:
     """The account's APIs. Functions' calls are numbered; those of participants and trials are not, and cost nothing."""
 
-    def __init__(self, clock: GreenletClock, concurrency: int = CONCURRENCY) -> None:
+    def __init__(
+        self,
+        clock: GreenletClock,
+        concurrency: int = CONCURRENCY,
+        latency: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    ) -> None:
+        """`latency`: what differs from `LATENCY`."""
         self.clock = clock
+        self._latency = {**LATENCY, **latency}
         self.concurrency = concurrency
         self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
         self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
+        self.lobby_calls: Counter[str] = Counter()  # of S3 alone: about the lobby, sessions and memberships
         self.throttled: Counter[str] = Counter()
+        self.conflicts: Counter[str] = Counter()  # conditional writes that met another version, by key
         self.number = 0  # of the functions' calls so far
         self.fault: FaultAt | None = None
         self.timeline: list[tuple[float, str]] = []
@@ -144,5 +154,5 @@ class Cloud:
             raise Throttled(action)
 
     def _wait(self, action: str) -> None:
-        low, high = LATENCY.get(action) or LATENCY[action.partition(":")[0]]
+        low, high = self._latency.get(action) or self._latency[action.partition(":")[0]]
         self.clock.sleep(self.clock.random.uniform(low, high))

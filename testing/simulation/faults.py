@@ -7,13 +7,15 @@ answered must be there, and nothing may be left running.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
 
 from protocol.keys import answer_key
 from testing.port_faults import Fault, FaultAt
+from testing.simulation import lobby
+from testing.simulation.members import Habits, Member
 from testing.simulation.people import Person, Visit
 from testing.simulation.ports import Conditions
 from testing.simulation.world import PROJECT, World
@@ -35,6 +37,16 @@ class Journey:
     others: int = 0  # participants who come at the same time
     comes: float = 0.0  # seconds until they come
     closes: float | None = None  # when the study is closed; else it stays open
+    group: Sequence[Habits] = ()  # instead of `person` and `others`: participants who play together
+    to_the_end: int = 0  # how many of them come to the last page where nothing goes wrong
+    play: float = 60.0  # seconds that a session plays
+    project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
+
+    def people(self, world: World) -> list[Person]:
+        """All who take part. Those of a session come at the same time, but for their reading."""
+        if self.group:
+            return [Member(world, number, habits=habits, play=self.play) for number, habits in enumerate(self.group)]
+        return [self.person(world), *(Person(world, number) for number in range(1, 1 + self.others))]
 
 
 JOURNEYS = (
@@ -70,6 +82,76 @@ JOURNEYS = (
     ),
     Journey("play beyond maxRuntime", person=lambda world: Person(world, 0, play=7200), finishes=False, minutes=6),
 )
+USUAL = Habits()
+PAIR: Mapping[str, object] = {"players": 2, "patience": 120.0}
+JOURNEYS_OF_GROUPS = (
+    Journey("a pair plays and finishes", to_the_end=2, group=(USUAL, USUAL), project=PAIR),
+    Journey(
+        "Spot takes a pair's server back",
+        conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0)),
+        to_the_end=2,
+        group=(USUAL, USUAL),
+        project=PAIR,
+    ),
+    Journey("of three who come for pairs, one is unmatched", to_the_end=3, group=(USUAL,) * 3, project=PAIR),
+    Journey("one who comes alone is unmatched", to_the_end=1, group=(USUAL,), project=PAIR),
+    Journey(
+        "one who comes alone plays with a policy",
+        to_the_end=1,
+        group=(USUAL,),
+        project={**PAIR, "after_patience": "policies"},
+    ),
+    Journey(
+        "they reload, have two tabs, and lose the network in the lobby",
+        to_the_end=4,
+        group=(Habits(leaves=3.0, beacon=0.4, back=0.0), Habits(tabs=2), Habits(offline=(1.0, 25.0)), USUAL),
+        project=PAIR,
+    ),
+    Journey(
+        "some close the lobby's page, with a beacon and without one, and one comes back",
+        to_the_end=2,
+        group=(Habits(leaves=1.0), Habits(leaves=2.5, beacon=None), Habits(leaves=4.0, back=20.0), USUAL),
+        project=PAIR,
+    ),
+    Journey("all close the lobby's page", group=(Habits(leaves=1.0), Habits(leaves=1.0, beacon=None)), project=PAIR),
+    Journey(
+        "one drops out of the game and is back in time",
+        to_the_end=2,
+        group=(USUAL, Habits(drops=(20.0, 12.0))),
+        project=PAIR,
+    ),
+    Journey(
+        "one drops out of the game for too long", to_the_end=2, group=(USUAL, Habits(drops=(20.0, 80.0))), project=PAIR
+    ),
+    Journey("one leaves the game for good", to_the_end=1, group=(USUAL, Habits(quits=20.0)), project=PAIR),
+    Journey("both leave the game for good", group=(Habits(quits=20.0), Habits(quits=25.0)), project=PAIR),
+    Journey(
+        "a group of four, and AWS is slow",
+        conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0, s3=(0.1, 0.2)),
+        to_the_end=4,
+        group=(USUAL,) * 4,
+        project={**PAIR, "players": 4},
+    ),
+    Journey(
+        "two pairs, and one warm server",
+        to_the_end=4,
+        group=(USUAL,) * 4,
+        project=PAIR,
+        limits={"warm_servers": 1},
+        comes=150.0,
+        closes=600.0,
+    ),
+    Journey(
+        "two pairs, and room for one server", to_the_end=2, group=(USUAL,) * 4, project=PAIR, limits={"max_servers": 1}
+    ),
+    Journey(
+        "a pair plays beyond maxRuntime",
+        group=(Habits(drops=(30.0, 15.0)), USUAL),
+        project=PAIR,
+        minutes=6,
+        play=7200.0,
+    ),
+)
 
 
 @dataclass
@@ -84,17 +166,24 @@ class Outcome:
     story: str = field(repr=False)
     seed: int = 0
     others: tuple[Visit, ...] = ()
+    wrong: tuple[str, ...] = ()  # sessions that are split or merged, and ghosts
 
     @property
     def well(self) -> bool:
-        """Nothing left, nothing lost, and no participant stranded."""
+        """Nothing left, nothing lost, no participant stranded, and no session split or merged."""
         everybody = all(served_or_told(visit) for visit in (self.visit, *self.others))
-        return not any(self.left.values()) and not self.lost and everybody
+        return not any(self.left.values()) and not self.lost and everybody and not self.wrong
 
     def __str__(self) -> str:
         what = f"{self.fault.fault} at call {self.fault.call}" if self.fault else "no fault"
-        ended = "finished" if self.visit.finished is not None else self.visit.told or "stranded"
-        return f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}\n{self.story}"
+        ended = [how_it_ended(visit) for visit in (self.visit, *self.others)]
+        about = f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}; {self.wrong}"
+        return f"{about}\n{self.story}"
+
+
+def how_it_ended(visit: Visit) -> str:
+    """How it ended for one participant."""
+    return "finished" if visit.finished is not None else visit.told or "stranded"
 
 
 def served_or_told(visit: Visit) -> bool:
@@ -105,7 +194,7 @@ def served_or_told(visit: Visit) -> bool:
 
 def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
     """One run of a journey. With `watched` (`World.watch`) it takes four times as long; nothing else changes."""
-    project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits)
+    project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits, **journey.project)
     world = World(seed, journey.conditions(), project)
     world.cloud.fault = fault
     if watched:
@@ -113,14 +202,17 @@ def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: b
     world.open()
     if journey.closes is not None:
         world.clock.after(journey.closes, world.close)
-    people = [journey.person(world), *(Person(world, number) for number in range(1, 1 + journey.others))]
+    people = journey.people(world)
     for person in people:
         world.clock.spawn(person.walk, delay=journey.comes)
     world.settle(HORIZON)
     kept = world.platform.documents.kept
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
     first, *others = [person.visit for person in people]
-    return world, Outcome(journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others))
+    members = [person for person in people if isinstance(person, Member)]
+    wrong = tuple(lobby.wrong(kept, world.project, members))
+    outcome = Outcome(journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong)
+    return world, outcome
 
 
 def calls(journey: Journey, seed: int) -> int:

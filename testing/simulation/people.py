@@ -11,14 +11,13 @@ from urllib.parse import urlencode
 from hippodrome.ports import Conflict
 from protocol.keys import answer_key
 from testing.port_faults import Crash
+from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import World
-from testing.tasks import Life
 
 MAX_TRIES = 4  # of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
 RELOADS = 75.0  # seconds at the waiting page after which people load it again
-LINGER = 3.0  # seconds from a trial's stored answer to its end
 
 
 POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # of web/game/, in seconds; a test compares
@@ -125,10 +124,14 @@ class Person:
     def _poll(self, step: str) -> dict[str, Any] | None:
         """What the waiting page is told; None if nothing comes for a while."""
         for tries in range(MAX_TRIES):
-            if (answer := self._request("GET", f"{self._query}&poll={step}", "")) is not None:
+            if (answer := self._request("GET", self._poll_query(step), "")) is not None:
                 return answer
             self.clock.sleep(retry_delay(tries))
         return None
+
+    def _poll_query(self, step: str) -> str:
+        """What follows the question mark in the page's poll address."""
+        return f"{self._query}&poll={step}"
 
     def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
         self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
@@ -156,6 +159,8 @@ class Person:
                 self.visit.interruptions += outcome == "lost"
                 since = self.clock.seconds if outcome == "lost" else since
             elif state.get("state") in ("failed", "ended"):
+                if self._is_over():
+                    return True
                 if not state.get("again") or restarts == 2:
                     self.visit.told = f"{state['state']}: {state.get('reason')}"
                     return False
@@ -175,6 +180,10 @@ class Person:
                     return True
                 state = fresh or state
 
+    def _is_over(self) -> bool:
+        """Whether the server has ended because the game is over. Alone, a participant hears that from the server."""
+        return False
+
     def _play_on(self, state: dict[str, Any]) -> str:
         """Connect and play; `done`, or `lost` when the connection ended before the game did, or `unreachable`."""
         tasks, names = self.world.platform.tasks, self.world.platform.dns
@@ -188,12 +197,12 @@ class Person:
         until = self.clock.seconds + self._play
         while self.clock.seconds < until:
             self.clock.sleep(min(max(1.0, self._play / 60), until - self.clock.seconds))
-            if task.last is not Life.RUNNING or (task.desired is Life.STOPPED and task.stop_code != "SpotInterruption"):
+            if is_lost(task):
                 return "lost"
         key = answer_key(self.world.project.id, self.visit.user, str(state["step"]))
         try:
             record = {"step": state["step"], "page": "game", "answers": {"score": 10}, "schema": 1}
-            self.world.platform.documents.put(key, json.dumps(record).encode())
+            self.world.platform.documents.keep(key, json.dumps(record).encode())
         except Conflict:
             pass
         self.answered.append(str(state["step"]))

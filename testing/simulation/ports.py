@@ -11,11 +11,12 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeVar
 
 from hippodrome.aws.dns import BATCH
 from hippodrome.aws.retry import retry_while_busy
+from hippodrome.lobby import decisions, entries
 from hippodrome.model import ids
 from hippodrome.ports import (
     Address,
@@ -35,7 +36,7 @@ from hippodrome.ports import (
 from testing import template
 from testing.clock import EPOCH
 from testing.simulation.clock import GreenletClock
-from testing.simulation.cloud import ATTEMPTS, Cloud, Throttled
+from testing.simulation.cloud import ATTEMPTS, LATENCY, Cloud, Throttled
 from testing.simulation.functions import Lineage, lineage
 from testing.tasks import Life, Task
 
@@ -51,54 +52,82 @@ ADDRESSES = sum(
     - 5  # of which AWS keeps five: VPC User Guide, "Subnet CIDR blocks"
     for subnet in template.resources("AWS::EC2::Subnet").values()
 )
+PAGE = 1000  # keys of one page of a listing: S3 API Reference, ListObjectsV2
 MAX_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
+LOBBY = (entries.FOLDER, decisions.LOBBIES)  # where who waits, and what is decided, lies
 T = TypeVar("T")
 
 
 class SimDocuments:
-    """S3: conditional writes, strongly consistent. `kept` is for people and trials, who pay elsewhere."""
+    """S3: conditional writes, strongly consistent. `kept` and `keep` are for people and trials, who pay elsewhere.
+
+    A read, and a listing, show every write that was answered before they began (S3 User Guide, "What is Amazon S3?",
+    data consistency model); a write without a condition takes the place of what there is, and the last one stays.
+    `LastModified` has whole seconds, cut (minio/minio-go issue 1632 and pull request 1638, tried on AWS). A listing is a
+    call for every 1,000 keys (S3 API Reference, ListObjectsV2), and no snapshot: what is written between its pages
+    may be seen in the later ones. Removing what is not there succeeds (the same, DeleteObject).
+    """
 
     def __init__(self, cloud: Cloud) -> None:
         self._cloud = cloud
         self.kept: dict[str, tuple[bytes, str, datetime]] = {}
         self._keys: list[str] = []  # sorted
-        self._versions = 0
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        return self._cloud.call("s3:GetObject", lambda: self._get(key, known))
+        return self._call("s3:GetObject", key, lambda: self._get(key, known))
 
     def create(self, key: str, body: bytes) -> str:
-        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, None))
+        return self._call("s3:PutObject", key, lambda: self.keep(key, body, None))
 
     def replace(self, key: str, body: bytes, etag: str) -> str:
-        return self._cloud.call("s3:PutObject", lambda: self.put(key, body, etag))
+        return self._call("s3:PutObject", key, lambda: self.keep(key, body, etag))
+
+    def put(self, key: str, body: bytes) -> None:
+        def effect() -> None:
+            found = self.kept.get(key)
+            self.keep(key, body, found[1] if found else None)
+
+        self._call("s3:PutObject", key, effect)
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        def effect() -> list[Entry]:
-            start = bisect.bisect_left(self._keys, prefix)
-            found = itertools.takewhile(lambda key: key.startswith(prefix), itertools.islice(self._keys, start, None))
-            return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in found]
-
-        yield from self._cloud.call("s3:ListObjectsV2", effect)
+        after = ""
+        while True:
+            page = self._call("s3:ListObjectsV2", prefix, partial(self._page, prefix, after))
+            yield from page[:PAGE]
+            if len(page) <= PAGE:
+                return
+            after = page[PAGE - 1].key
 
     def delete(self, key: str) -> None:
         def effect() -> None:
             if self.kept.pop(key, None):
                 del self._keys[bisect.bisect_left(self._keys, key)]
 
-        self._cloud.call("s3:DeleteObject", effect)
+        self._call("s3:DeleteObject", key, effect)
 
-    def put(self, key: str, body: bytes, etag: str | None = None) -> str:
+    def _call(self, action: str, key: str, effect: Callable[[], T]) -> T:
+        """One call, which is counted by what it is about, too."""
+        if key.startswith(LOBBY) or key.endswith("/session.json"):
+            self._cloud.lobby_calls[action] += 1
+        return self._cloud.call(action, effect)
+
+    def keep(self, key: str, body: bytes, etag: str | None = None) -> str:
         """A conditional write, made at once: `etag` None means that there must be nothing yet. Raises `Conflict`."""
         found = self.kept.get(key)
         if (found[1] if found else None) != etag:
+            self._cloud.conflicts[key] += 1
             raise Conflict(key)
         if not found:
             bisect.insort(self._keys, key)
-        self._versions += 1
-        made = f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}-{self._versions}"'
-        self.kept[key] = (body, made, self._cloud.clock.now())
+        made = f'"{hashlib.md5(body, usedforsecurity=False).hexdigest()}"'
+        self.kept[key] = (body, made, self._cloud.clock.now().replace(microsecond=0))
         return made
+
+    def _page(self, prefix: str, after: str) -> Sequence[Entry]:
+        """The keys with this prefix that come after that one, up to one more than a page holds."""
+        start = max(bisect.bisect_left(self._keys, prefix), bisect.bisect_right(self._keys, after))
+        found = itertools.takewhile(lambda key: key.startswith(prefix), itertools.islice(self._keys, start, None))
+        return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in itertools.islice(found, PAGE + 1)]
 
     def _get(self, key: str, known: Document | None) -> Document | None:
         found = self.kept.get(key)
@@ -179,6 +208,7 @@ class Conditions:
     slow_zone: float = SLOW_ZONE
     slow_propagation: tuple[float, float] = SLOW_PROPAGATION
     busy_zone: tuple[float, float] = BUSY_ZONE
+    s3: tuple[float, float] = LATENCY["s3"]  # seconds of a call of S3
     idle: float = 600.0  # seconds a trial waits for its participant
 
 
@@ -199,7 +229,7 @@ class SimTasks:
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
         self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
         self.most_interfaces = 0
-        # Whose a warm server has become; empty until it is told.
+        # Whose a warm server has become, or one of a session that is formed; empty until it can be told.
         self.owner: Callable[[TimedTask], str] = lambda task: ""
 
     def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
@@ -314,8 +344,8 @@ class SimTasks:
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
 
     def _wait_for_guests(self, task: TimedTask) -> None:
-        """A warm server does not count as idle until it is assigned, for which it looks from time to time."""
-        if task.is_warm_server and not self.owner(task):
+        """A warm server, or one of a session, is not idle until it knows who plays: it looks from time to time."""
+        if (task.is_warm_server or task.session) and not self.owner(task):
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -20,14 +21,17 @@ from hippodrome.ports import Message, Settings, Topic
 from hippodrome.servers.causes import Cause
 from hippodrome.storage.secret import KEY, Secret
 from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
-from protocol.keys import handover_key, handovers_folder
+from protocol.keys import handover_key, handovers_folder, session_key
+from protocol.session import is_session_id
 from testing import aws_events, template
 from testing.port_faults import Crash
-from testing.simulation import functions
+from testing.simulation import functions, lobby
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import CONCURRENCY, Cloud, NoRoom
 from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
+from testing.simulation.matching import SimMatching
 from testing.simulation.ports import Conditions, SimBus, SimPlatform, SimTimers, TimedTask
+from testing.simulation.trials import SimTrials
 from testing.tasks import Life
 
 SWEEP_EVERY = 300.0  # seconds
@@ -48,6 +52,7 @@ LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get
 WATCH_EVERY = 10.0  # seconds
 HOP = (0.05, 0.4)  # seconds from a topic to its queue
 
+SECRET = Secret("0" * 64)
 PROJECT = Project(
     id="study",
     steps=[
@@ -82,7 +87,7 @@ class World:
         self.project = project
         self.clock = GreenletClock(seed)
         self.clock.resumed, self.clock.ends = functions.enter, functions.ends
-        self.cloud = Cloud(self.clock, concurrency)
+        self.cloud = Cloud(self.clock, concurrency, {"s3": self.conditions.s3})
         settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
         self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.conditions)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
@@ -103,6 +108,9 @@ class World:
         platform.tasks.changed = self.task_queue.send
         platform.tasks.owner = self._owner
         self._store_project()
+        self.trials = SimTrials(self)
+        self.matching = SimMatching(self) if project.matching == "match" else None
+        self.played: defaultdict[str, float] = defaultdict(float)  # seconds that each session's recordings hold
         self.people = 0  # participants who will come or are there
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)
@@ -176,6 +184,7 @@ class World:
                 len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVER_SLOTS)
             ),
             "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
+            "lobby": len(lobby.left_over(kept, self.project)),
             "handovers": sum(key.startswith(handovers_folder(self.project.id)) for key in kept),
             "open records": sum(record["state"] != "closed" for record in records),
             "dead letters": sum(len(queue.dead) for queue in self.queues),
@@ -206,22 +215,28 @@ class World:
         """Register the project as closed."""
         self.project = msgspec.structs.replace(self.project, live=False)
         documents = self.platform.documents
-        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
+        documents.keep(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
         self.open()
 
     def _owner(self, task: TimedTask) -> str:
-        """The participant to whom this warm server was assigned, by its handover; empty if there is none."""
-        found = self.platform.documents.kept.get(handover_key(self.project.id, task.name))
-        return str(json.loads(found[0])["userId"]) if found else ""
+        """To whom this warm server was assigned, by its handover, or the session that plays on this server.
+
+        Empty if it is not assigned yet, or if the session is not formed.
+        """
+        kept, owner = self.platform.documents.kept, task.session
+        if task.is_warm_server and (found := kept.get(handover_key(self.project.id, task.name))):
+            owner = str(json.loads(found[0])["userId"])
+        formed = not is_session_id(owner) or session_key(self.project.id, owner) in kept
+        return owner if formed else ""
 
     def _store_project(self) -> None:
         documents = self.platform.documents
-        documents.put(KEY, to_json(Secret("0" * 64)))
-        documents.put(MASTER_LIST, to_json(MasterList(projects=[self.project])))
+        documents.keep(KEY, to_json(SECRET))
+        documents.keep(MASTER_LIST, to_json(MasterList(projects=[self.project])))
         for step in self.project.steps:
             if not step.type.on_server:
                 page = f"<h1>{step.page}</h1><input name=answer>"
-                documents.put(f"{self.project.id}/steps/{step.page}.html", page.encode())
+                documents.keep(f"{self.project.id}/steps/{step.page}.html", page.encode())
 
     def watch(self) -> None:
         """Note from time to time, in `calls_until_quiet`, whether anything is left. Costly where many take part."""

@@ -9,6 +9,7 @@ import dataclasses
 import io
 import json
 import os
+import platform
 import sys
 import types
 from collections.abc import Iterator
@@ -19,12 +20,29 @@ import pytest
 from rich.console import Console
 
 from bench import __main__ as command
-from bench import control, data, gym, load, memory, pages, pictures, scale, scenes, seen, table, trial, warm
+from bench import (
+    control,
+    data,
+    gym,
+    load,
+    memory,
+    pages,
+    pictures,
+    scale,
+    scenes,
+    seen,
+    sessions,
+    table,
+    together,
+    trial,
+    warm,
+)
 from bench.bill import bill
 from deploy.cost import estimate
 from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
+from testing.quiet_log import quiet
 from testing.simulation import aws_bound, hippo, ports, world
 from testing.simulation.ports import Conditions
 from testing.tasks import Life
@@ -89,7 +107,7 @@ def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
 
 def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
     arrivals = [warm.OPENS + 90.0 * number for number in range(5)]
-    with scale.quiet():
+    with quiet():
         came, without = (warm.simulated(servers, arrivals, 900, 2400) for servers in (2, 0))
     assert (came.took_warm_server, without.took_warm_server) == (1, 0)
     assert max(came.to_shown) < 10 < min(without.to_shown)
@@ -105,7 +123,7 @@ def test_a_server_in_local_mode_comes_to_its_first_picture(tmp_path: Path) -> No
 
 def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> None:
     prices = Prices()
-    with scale.quiet():
+    with quiet():
         world = warm.simulated(0, [0.0, 30.0], 900, 2400).world
     tasks = list(world.platform.tasks.tasks.values())
     assert [task.last for task in tasks] == [Life.STOPPED] * 2
@@ -120,7 +138,7 @@ def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> No
 
 def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "MANY", 3)
-    with scale.quiet():
+    with quiet():
         served, sweep, cost = scale.many_at_once()
     assert_well_formed([served, sweep, cost])
     assert served["value"] == 100
@@ -219,12 +237,12 @@ def test_memory_is_that_of_the_command_and_not_of_who_starts_it(tmp_path: Path) 
 
 @pytest.fixture(scope="module")
 def crowd() -> scale.Crowd:
-    with scale.quiet():
+    with quiet():
         return scale.crowd(7, 100, 10.0)
 
 
 def test_waiting_counts_from_asking_to_the_page(crowd: scale.Crowd) -> None:
-    with scale.quiet():  # slow spans come and go, and would decide the p95 of so few
+    with quiet():  # slow spans come and go, and would decide the p95 of so few
         row = scale.waiting([scale.crowd(seed, 250, 25.0, Conditions(slow_zone=0.0)) for seed in scale.SEEDS[1:3]])
     assert row["met"], row
     assert row["yardstick"] < row["value"]
@@ -237,7 +255,7 @@ def test_waiting_counts_from_asking_to_the_page(crowd: scale.Crowd) -> None:
 def test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting() -> None:
     """What waits in the topic, the queue and the function is in the row."""
     few = {**world.WIRES, "start_server": world.WIRES["start_server"]._replace(concurrency=2)}
-    with scale.quiet():
+    with quiet():
         row = scale.waiting([scale.crowd(7, 100, 10.0, wires=few)])
     assert row["ratio"] > 1.2
     assert row["met"] is False
@@ -278,7 +296,7 @@ def test_pages_that_find_no_room_miss_their_goal(
     monkeypatch.setattr(scale, "FEW", 15)
     monkeypatch.setattr(scale, "FEW_EXECUTIONS", executions)
     monkeypatch.setattr(scale, "FEW_WITHIN", within)
-    with scale.quiet():
+    with quiet():
         _, first_try = scale.small_account()
     assert first_try["met"] is met
 
@@ -303,7 +321,7 @@ def test_what_is_assumed_is_told_from_the_constants_and_of_worse_conditions_what
 def test_ten_thousand_servers_fit_the_network_of_the_template(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ports.ADDRESSES > 2 * scale.MANY
     monkeypatch.setattr(ports, "ADDRESSES", 60)
-    with scale.quiet():
+    with quiet():
         full = scale.crowd(7, 80, 10.0)
     assert full.world.platform.tasks.most_interfaces > 60
     assert any("TaskFailedToStart" in text for _, text in full.world.cloud.timeline), "the network is full"
@@ -509,8 +527,75 @@ def test_warm_servers_that_do_not_help_or_stay_miss_their_goals(monkeypatch: pyt
     monkeypatch.setattr(warm, "hour_of_arrivals", lambda: [warm.OPENS, warm.OPENS + 10])
     usual = warm.simulated
     monkeypatch.setattr(warm, "simulated", lambda servers, arrivals: usual(0, arrivals, 1e9, 460.0))
-    with scale.quiet():
+    with quiet():
         rows = {row["name"].partition(": ")[2]: row["met"] for row in warm.an_hour()}
     assert rows["asked for a server until the page shows it, p50, against none warm"] is False
     assert rows["wait at the game page, p50, against none warm"] is False
     assert rows["left when the study is closed"] is False
+
+
+# Several participants
+
+
+def test_games_of_several_that_deliver_too_little_miss_their_goals() -> None:
+    def all_rows(share: float) -> list[table.Row]:
+        found = together.Played([1.0, share], 40.0, 0.7, 30.0)
+        return [*together.judged_game(2, found), *together.judged_core([found] * 3)]
+
+    assert_well_formed(all_rows(1.0))
+    assert [row["met"] for row in all_rows(1.0)] == [True, None, True, None]
+    assert [row["met"] for row in all_rows(0.9)] == [False, None, False, None]
+
+
+def test_processor_times_say_of_which_python_they_are() -> None:
+    alone = load.Played(1.0, 1.0, 40.0, 50.0)
+    several = together.Played([1.0, 1.0], 40.0, 0.7, 30.0)
+    on_a_core = next(load.judged_core([alone])), next(together.judged_core([several]))
+    for found in (load.judged_cpu(alone, 0.5), *on_a_core):
+        assert found["detail"]["Python"] == platform.python_version()
+        assert found["detail"]["a turn of a plain loop of it, ns"] > 0
+
+
+def test_views_that_are_late_or_apart_miss_their_goals() -> None:
+    good = together.Seen([1.0, 1.0], [[30.0] * 9, [31.0] * 9], [0, 1, 1, 0])
+    assert_well_formed(list(together.judged_views(good)))
+    assert [row["met"] for row in together.judged_views(good)] == [True] * 4
+    bad = together.Seen([1.0, 0.9], [[39.0] * 9, [40.0] * 9], [0, 2])
+    assert [row["met"] for row in together.judged_views(bad)] == [False] * 4
+
+
+def test_how_far_two_views_are_apart_is_judged_at_each_draw_of_either() -> None:
+    assert together.apart([[0, 7], [33, 8], [66, 9]], [[1, 7], [34, 8], [67, 9]]) == [0, 1, 0, 1, 0]
+    assert max(together.apart([[0, 7], [33, 8], [66, 9]], [[1, 7], [100, 9]])) == 2
+    assert together.apart([[0, 7]], []) == []
+
+
+def test_a_game_of_two_is_measured_at_a_real_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(load, "SETTLE", 0.1)
+    monkeypatch.setattr(load, "SECONDS", 1.0)
+    with together.server(2) as one:
+        (found,) = asyncio.run(together.played([one], 2))
+    assert len(found.shares) == 2
+    assert min(found.shares) > 0.5
+    assert found.cpu > 0
+    assert 10 < found.bytes_a_tick < 500
+
+
+def test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal() -> None:
+    with quiet():
+        found = sessions.crowd(sessions.PAIRS, people=12, within=6.0)
+        rows = [*sessions.judged("in pairs", found), *sessions.costs(found)]
+        assert_well_formed(rows)
+        assert [row["met"] for row in rows] == [True, None, None, None]
+        assert rows[3]["value"] < 0.01
+        assert_well_formed([sessions.waits_of([found, found])])
+        assert len(found.at_best) == len(found.waits) == 12
+        assert sum(found.at_best) < sum(found.waits), "nobody is served before a server is ready"
+        found.came[0].visit.finished = None
+        assert next(sessions.judged("in pairs", found))["met"] is False
+        found.came[0].visit.told = "left by themselves"
+        assert next(sessions.judged("in pairs", found))["met"] is True
+        found.came[0].asked_at.clear()
+        assert next(sessions.judged("in pairs", found))["met"] is False
+    assert sessions.judged_faults(0)["met"] is True
+    assert sessions.judged_faults(1)["met"] is False

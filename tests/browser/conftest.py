@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -39,6 +40,64 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
+@contextlib.contextmanager
+def own_page(context: Any) -> Iterator[Any]:
+    """A new page in this context. When it is closed, what its addresses have stored in the browser is deleted."""
+    page, origins = context.new_page(), set()
+    page.on("framenavigated", lambda shown: origins.add("/".join(shown.url.split("/", 3)[:3])))
+    try:
+        yield page
+    finally:
+        devtools = context.new_cdp_session(page)
+        for origin in origins:
+            if origin.startswith("http"):  # ports are given again
+                devtools.send("Storage.clearDataForOrigin", {"origin": origin, "storageTypes": "all"})
+        page.close()
+
+
+@contextlib.contextmanager
+def without_errors(page: Any) -> Iterator[Any]:
+    """Errors in the page's scripts, and what the policy refuses, fail the test."""
+    wrong: list[str] = []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+
+    def listen(said: Any) -> None:
+        if "Content Security Policy" in said.text:
+            wrong.append(said.text)
+
+    page.on("console", listen)
+    yield page
+    assert not wrong
+
+
+NARROW = {"viewport": {"width": 360, "height": 640}}
+
+
+@pytest.fixture(scope="module")
+def narrow(chromium: Any) -> Iterator[Any]:
+    """What the tabs of a file share."""
+    context = chromium.new_context(**NARROW)
+    context.new_page()  # its window stays: to make one for each tab takes Chromium longer than some tests
+    yield context
+    context.close()
+
+
+@pytest.fixture
+def tab(narrow: Any) -> Iterator[Any]:
+    """A page. A test that sets the context's clock, network or permissions takes `lone_tab`."""
+    with own_page(narrow) as page, without_errors(page):
+        yield page
+
+
+@pytest.fixture
+def lone_tab(chromium: Any) -> Iterator[Any]:
+    """A page in a context of its own."""
+    context = chromium.new_context(**NARROW)
+    with without_errors(context.new_page()) as page:
+        yield page
+        context.close()
+
+
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     """The example study, in a copy whose game can be ended with a button."""
@@ -52,6 +111,34 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     finally:
         left = held.clear()
     assert left == 0
+
+
+Hold = Callable[..., StudyProcess]
+
+
+@pytest.fixture(scope="module")
+def hold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hold]:
+    """An example, held once for all tests of the file, in a copy whose game can be ended with a button.
+
+    `hold("gridworld")`. `changes` are lines of config.yml with what stands there instead.
+    """
+    studies: dict[str, HeldStudy] = {}
+
+    def start(name: str, changes: Mapping[str, str] | None = None) -> StudyProcess:
+        if name not in studies:
+            folder = tmp_path_factory.mktemp(name)
+            copy_of(ROOT / "examples" / name, folder / "project")
+            config = folder / "project" / "config.yml"
+            for line, instead in (changes or {}).items():
+                assert config.read_text().count(line) == 1, line
+                config.write_text(config.read_text().replace(line, instead))
+            studies[name] = HeldStudy(folder / "project", folder / "data")
+            studies[name].start()
+        return studies[name]
+
+    yield start
+    for study in studies.values():
+        study.clear()
 
 
 class Visitor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,7 @@ import pytest
 from PIL import Image
 
 from bots.links import with_user
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
-from testing.held_study import HeldStudy
-from tests.browser.conftest import SHOTS
+from tests.browser.conftest import SHOTS, Hold
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
@@ -24,25 +21,6 @@ pytest.importorskip("cogrid")
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SIZES = [(1280, 800), (360, 740)]
 STATE = "wanted => document.getElementById('mode').dataset.state === wanted"
-Held = Callable[[str], StudyProcess]
-
-
-@pytest.fixture(scope="module")
-def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
-    """An example, held once for all tests of the file, in a copy whose game can be ended with a button."""
-    studies: dict[str, HeldStudy] = {}
-
-    def hold(name: str) -> StudyProcess:
-        if name not in studies:
-            folder = tmp_path_factory.mktemp(name)
-            copy_of(ROOT / "examples" / name, folder / "project")
-            studies[name] = HeldStudy(folder / "project", folder / "data")
-            studies[name].start()
-        return studies[name]
-
-    yield hold
-    for study in studies.values():
-        study.clear()
 
 
 def come_to_the_game(page: Any, link: str) -> None:
@@ -80,9 +58,9 @@ def press(page: Any, key: str, button: str, *, narrow: bool, milliseconds: int) 
     ],
 )
 def test_a_participant_plays(
-    chromium: Any, held: Held, example: str, presses: list[Any], wanted: set[str], width: int, height: int
+    chromium: Any, hold: Hold, example: str, presses: list[Any], wanted: set[str], width: int, height: int
 ) -> None:
-    study, narrow, name = held(example), width < 600, f"ada-{width}"
+    study, narrow, name = hold(example), width < 600, f"ada-{width}"
     context = chromium.new_context(viewport={"width": width, "height": height}, has_touch=narrow, is_mobile=narrow)
     context.set_default_timeout(45_000)
     page, complaints = context.new_page(), []

@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 
 from testing.browser import game_page
-from tests.browser.test_pages_browser import World, play, reconnected, tab, world
+from tests.browser.test_pages_browser import World, play, reconnected, world
 from tests.trial.conftest import launch
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 
-__all__ = ["launch", "tab", "world"]  # fixtures
+__all__ = ["launch", "world"]  # fixtures
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 AGENT = """

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bots.links import with_user
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
-from testing.held_study import HeldStudy
+from local.rehearsal.study_process import StudyProcess
+from tests.browser.conftest import Hold
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
@@ -20,16 +19,8 @@ HUD = "text => document.querySelector('.hud').textContent.includes(text)"
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
-    """examples/gridworld, in a copy whose game can be ended with a button."""
-    folder = tmp_path_factory.mktemp("gridworld")
-    copy_of(ROOT / "examples" / "gridworld", folder / "project")
-    held = HeldStudy(folder / "project", folder / "data")
-    try:
-        held.start()
-        yield held
-    finally:
-        held.clear()
+def study(hold: Hold) -> StudyProcess:
+    return hold("gridworld")
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (360, 740)])

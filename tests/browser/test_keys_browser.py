@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from tests.browser.test_pages_browser import FLAWS, World, play, shot, tab, tell, world
+from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
 from tests.trial.conftest import Running, grid_agent
 
-__all__ = ["tab", "world"]  # fixtures
+__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 KEYS = {

@@ -63,6 +63,12 @@ class World:
     """Whether the game page carries its script, or loads the modules of it."""
     trial: dict[str, Any] = field(default_factory=dict)
     """The section of the study."""
+    more: dict[str, Any] = field(default_factory=dict)
+    """Other fields of the project."""
+    closed: bool = False
+    """The study is not live any more."""
+    polled: list[float] = field(default_factory=list)
+    """When the page has asked for the state."""
     texts: dict[str, str] = field(default_factory=dict)
     """The pages that the game page shows, by the key that names each."""
     controls: dict[str, Any] = field(default_factory=dict)
@@ -71,13 +77,15 @@ class World:
     """The subprotocol of the trial server."""
     stands: dict[str, Any] = field(default_factory=lambda: PLAYING)
     """Where the trial stands: what its server answers to a page that has heard nothing for some time."""
+    started: dict[str, Any] = field(default_factory=lambda: PLAYING)
+    """What the trial server answers to `start`."""
     url: str = ""
     game_url: str = ""
 
     def page(self) -> frame.Page:
         step = PROJECT.steps[self.step]
         if step.type.on_server:
-            study = msgspec.structs.replace(PROJECT, trial=self.trial)
+            study = msgspec.structs.replace(PROJECT, trial=self.trial, **self.more)
             texts: dict[str, tuple[str, dict[str, Any]]] = {key: (text, {}) for key, text in self.texts.items()}
             view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*", texts)
             page = pages.game_page(view)
@@ -117,8 +125,8 @@ class World:
             elif message.get("command") == "requestUI":
                 connection.send(json.dumps(self.stands))
             elif message.get("command") == "start":
-                self.stands = PLAYING
-                connection.send(json.dumps(PLAYING))
+                self.stands = self.started
+                connection.send(json.dumps(self.started))
             elif message.get("command") == "pause":
                 connection.send(json.dumps({"state": "paused", "episode": 1, "score": 70, "frameRate": 30}))
 
@@ -141,7 +149,11 @@ def world() -> Iterator[World]:
 
         def do_GET(self) -> None:
             if "poll" in self.path:
-                self.reply(200, "application/json", json.dumps(here.state), {})
+                here.polled.append(time.monotonic())
+                time.sleep(here.slow)
+                self.reply(400 if here.closed else 200, "application/json", json.dumps(here.state), {})
+            elif here.closed:
+                self.reply(404, "text/html; charset=utf-8", "<h1>There is no such study</h1>", {})
             else:
                 page = here.page()
                 self.reply(200, "text/html; charset=utf-8", page.html, page.headers)
@@ -152,7 +164,10 @@ def world() -> Iterator[World]:
             body = self.rfile.read(int(self.headers["Content-Length"])).decode()
             time.sleep(here.slow)
             here.posts.append(dict(parse_qsl(body, keep_blank_values=True)))
-            here.step += here.posts[-1].get("hippodrome-action") != "restart"
+            action = here.posts[-1].get("hippodrome-action")
+            if action == "leave":
+                return self.reply(204, "text/plain", "", {})
+            here.step += action != "restart"
             self.reply(303, "text/plain", "", {"Location": "/"})
 
     web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
@@ -171,24 +186,6 @@ def world() -> Iterator[World]:
     web.shutdown()
     web.server_close()
     game.shutdown()
-
-
-@pytest.fixture
-def tab(chromium: Any) -> Iterator[Any]:
-    """A page in a browser of its own. Errors in scripts, and what the policy refuses, fail the test."""
-    context = chromium.new_context(viewport={"width": 360, "height": 640})
-    page = context.new_page()
-    wrong: list[str] = []
-    page.on("pageerror", lambda error: wrong.append(str(error)))
-
-    def listen(said: Any) -> None:
-        if "Content Security Policy" in said.text:
-            wrong.append(said.text)
-
-    page.on("console", listen)
-    yield page
-    context.close()
-    assert not wrong
 
 
 def shot(tab: Any, name: str) -> None:
@@ -285,14 +282,14 @@ def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
     assert tab.evaluate("document.activeElement.name") == "r"
 
 
-def test_offline_the_first_click_only_warns(world: World, tab: Any) -> None:
-    tab.goto(world.url)
-    tab.context.set_offline(True)
-    tab.click("text=Continue")
-    assert "You seem to be offline" in tab.inner_text(".status")
-    tab.context.set_offline(False)
-    tab.click("text=Continue")
-    tab.wait_for_selector("text=Step 2 of 4")
+def test_offline_the_first_click_only_warns(world: World, lone_tab: Any) -> None:
+    lone_tab.goto(world.url)
+    lone_tab.context.set_offline(True)
+    lone_tab.click("text=Continue")
+    assert "You seem to be offline" in lone_tab.inner_text(".status")
+    lone_tab.context.set_offline(False)
+    lone_tab.click("text=Continue")
+    lone_tab.wait_for_selector("text=Step 2 of 4")
 
 
 BARE = """<h1>Bare</h1>
@@ -335,17 +332,17 @@ def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
     assert tab.inner_text("output") == "4"
 
 
-def test_a_completion_code_is_copied(world: World, tab: Any) -> None:
+def test_a_completion_code_is_copied(world: World, lone_tab: Any) -> None:
     world.step, world.source = 3, "<h1>Bye</h1><p class=code>ABC</p>"
-    tab.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    tab.goto(world.url)
-    tab.click(".code")
-    assert tab.evaluate("getSelection().toString().trim()") == "ABC"
-    before = tab.locator(".copy").bounding_box()
-    tab.click("text=Copy")
-    tab.wait_for_selector("text=Copied")
-    assert tab.locator(".copy").bounding_box() == before
-    assert tab.evaluate("navigator.clipboard.readText()") == "ABC"
+    lone_tab.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    lone_tab.goto(world.url)
+    lone_tab.click(".code")
+    assert lone_tab.evaluate("getSelection().toString().trim()") == "ABC"
+    before = lone_tab.locator(".copy").bounding_box()
+    lone_tab.click("text=Copy")
+    lone_tab.wait_for_selector("text=Copied")
+    assert lone_tab.locator(".copy").bounding_box() == before
+    assert lone_tab.evaluate("navigator.clipboard.readText()") == "ABC"
 
 
 def test_the_researchers_scripts_run_and_inline_handlers_do_not(world: World, chromium: Any) -> None:
@@ -761,38 +758,38 @@ def test_a_first_server_is_not_said_to_be_another(world: World, tab: Any) -> Non
     assert tab.locator("h1:visible").all_inner_texts() == ["Your game is getting ready"]
 
 
-def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World, tab: Any) -> None:
+def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World, lone_tab: Any) -> None:
     world.step = 2
     world.ready()
     world.state["url"] = NOWHERE
-    tab.clock.install()
-    tab.goto(world.url)
-    tab.wait_for_selector("#overlay-title:text('Connection lost')")
+    lone_tab.clock.install()
+    lone_tab.goto(world.url)
+    lone_tab.wait_for_selector("#overlay-title:text('Connection lost')")
     for _ in range(8):
-        tab.clock.run_for(5_000)
-        tab.wait_for_timeout(100)
-    tab.wait_for_selector("#overlay-title:text('Your game cannot be reached')")
-    assert "try another network" in tab.inner_text("#overlay-hint")
+        lone_tab.clock.run_for(5_000)
+        lone_tab.wait_for_timeout(100)
+    lone_tab.wait_for_selector("#overlay-title:text('Your game cannot be reached')")
+    assert "try another network" in lone_tab.inner_text("#overlay-hint")
     world.ready()
-    tab.clock.run_for(10_000)
-    tab.wait_for_selector("#overlay-button:visible")
+    lone_tab.clock.run_for(10_000)
+    lone_tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_asked_for_once_more(
-    world: World, tab: Any
+    world: World, lone_tab: Any
 ) -> None:
     world.step = 2
     loads: list[str] = []
-    tab.on("request", lambda request: request.url == world.url and loads.append(request.url))
-    tab.clock.install()
-    tab.goto(world.url)
+    lone_tab.on("request", lambda request: request.url == world.url and loads.append(request.url))
+    lone_tab.clock.install()
+    lone_tab.goto(world.url)
     assert len(loads) == 1
     for _ in range(200):
-        tab.clock.run_for(4_000)
-        tab.wait_for_timeout(5)
+        lone_tab.clock.run_for(4_000)
+        lone_tab.wait_for_timeout(5)
         if len(loads) > 1:
             break
-    tab.wait_for_selector("h1:visible:text('Your game is getting ready')")
+    lone_tab.wait_for_selector("h1:visible:text('Your game is getting ready')")
     assert len(loads) == 2
 
 
@@ -946,5 +943,5 @@ def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, ta
     tab.wait_for_selector("#overlay-title:text('Ready?')")
     world.connections[1].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
     tab.wait_for_selector("#overlay-title:text('The game is over')")
-    modules = {path.name for path in (frame.WEB / "game").glob("*.js")} - game_modules.MODULES.keys()
+    modules = {path.name for path in (frame.WEB / "game").glob("*.js")} - set(game_modules.OF_SOME)
     assert set(loaded) == {f"/game/{name}" for name in modules}

@@ -10,18 +10,27 @@ from typing import Any
 
 import pytest
 
+from tests.browser.conftest import own_page
 from tests.browser.test_pages_browser import World, shot, tell, world  # noqa: F401
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}
 
 
-@pytest.fixture
-def phone(chromium: Any) -> Iterator[Any]:
-    """A page on a phone of 360 by 640 pixels."""
+@pytest.fixture(scope="module")
+def pocket(chromium: Any) -> Iterator[Any]:
+    """What the phones of all tests share."""
     context = chromium.new_context(viewport={"width": 360, "height": 640}, has_touch=True, is_mobile=True)
-    yield context.new_page()
+    context.new_page()  # its window stays, as in `narrow`
+    yield context
     context.close()
+
+
+@pytest.fixture
+def phone(pocket: Any) -> Iterator[Any]:
+    """A page on a phone of 360 by 640 pixels."""
+    with own_page(pocket) as page:
+        yield page
 
 
 def play(world: World, phone: Any, size: tuple[int, int], trial: dict[str, Any], ui: list[str]) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from bots.links import with_user
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
-from testing.held_study import HeldStudy
+from local.rehearsal.study_process import StudyProcess
+from tests.browser.conftest import Hold
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
@@ -32,16 +31,8 @@ WORDS = ("good", "bad")
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
-    """examples/tamer, in a copy whose game can be ended with a button."""
-    folder = tmp_path_factory.mktemp("tamer")
-    copy_of(ROOT / "examples" / "tamer", folder / "project")
-    held = HeldStudy(folder / "project", folder / "data")
-    try:
-        held.start()
-        yield held
-    finally:
-        held.clear()
+def study(hold: Hold) -> StudyProcess:
+    return hold("tamer")
 
 
 def come_to_the_game(page: Any, link: str) -> None:

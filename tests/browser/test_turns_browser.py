@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from tests.browser.test_pages_browser import FLAWS, World, play, shot, tab, tell, world
+from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
 
-__all__ = ["tab", "world"]  # fixtures
+__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 
@@ -34,7 +34,7 @@ def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, tab: Any, width:
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-other-turn")
     tell(in_turns, state="paused", toAct=False)
-    tab.wait_for_function("document.getElementById('turn').textContent === ''")
+    tab.wait_for_function("() => document.getElementById('turn').textContent === ''")
 
 
 def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
@@ -95,6 +96,47 @@ def test_replace_of_a_document_that_is_not_there(documents: Documents) -> None:
     with pytest.raises(Conflict):
         documents.replace(KEY, b"two", etag)
     assert documents.get(KEY) is None
+
+
+def test_put_writes_whatever_is_there(documents: Documents) -> None:
+    documents.put(KEY, b"one")
+    first = documents.get(KEY)
+    assert first is not None
+    assert first.body == b"one"
+    documents.put(KEY, b"two")
+    with pytest.raises(Conflict):
+        documents.replace(KEY, b"three", first.etag)
+    with pytest.raises(Conflict):
+        documents.create(KEY, b"four")
+    documents.delete(KEY)
+    documents.put(KEY, b"five")
+    found = documents.get(KEY)
+    assert found is not None
+    assert found.body == b"five"
+
+
+def test_put_again_is_a_newer_time_in_a_listing(documents: Documents, platform: Platform) -> None:
+    """What is put again is there now, though its bytes are the same: so a participant who waits is seen."""
+    clock = getattr(platform, "wait", None)
+    documents.put(KEY, b"here")
+    [before] = documents.list(KEY)
+    end = time.monotonic() + 10
+    while time.monotonic() < end:  # a listing of S3 has whole seconds
+        clock(seconds=0.3) if clock else time.sleep(0.3)
+        documents.put(KEY, b"here")
+        [after] = documents.list(KEY)
+        if after.modified > before.modified:
+            return
+    raise AssertionError("its time stays")
+
+
+@concurrent
+def test_of_many_who_put_at_once_one_is_whole(documents: Documents) -> None:
+    bodies = [b"%d" % n * 100_000 for n in range(8)]
+    assert len(_at_once(8, lambda n: documents.put(KEY, bodies[n]))) == 8
+    found = documents.get(KEY)
+    assert found is not None
+    assert found.body in bodies
 
 
 def test_delete_twice_and_begin_anew(documents: Documents) -> None:

@@ -215,7 +215,8 @@ class Living(Installed):
     def _run(self, task: Any) -> Process:
         (container,) = task.overrides["containerOverrides"]
         told = {one["name"]: one["value"] for one in container["environment"]}
-        self.secrets |= {told["TOKEN"], told["CREDENTIAL"], told["USER_ID"], told["SERVER"], told["PROJECT_ID"]}
+        plays = told["SESSION"] if "SESSION" in told else told["USER_ID"]
+        self.secrets |= {told["TOKEN"], told["CREDENTIAL"], plays, told["SERVER"], told["PROJECT_ID"]}
         inherited = {name: value for name, value in self._served.items() if not name.startswith(("AWS_", "PYTHONUTF8"))}
         sign = f"http://127.0.0.1:{self._signer.server_address[1]}/sign"
         env = {**inherited, **told, "STORE": sign, "HOST": "127.0.0.1", "PORT": "0", "AGENT_DIR": str(self._agent)}

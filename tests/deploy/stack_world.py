@@ -16,7 +16,7 @@ from deploy.aws import caa, quotas
 from deploy.aws.account import Account
 from deploy.aws.hosted_zone import Delegation
 from deploy.code import build
-from deploy.code.packages import Member
+from deploy.code.packages import ZipMember
 from deploy.code.template import Template
 from deploy.lifecycle import preflight
 from deploy.stack import changes, stack
@@ -67,7 +67,7 @@ Resources:
 
 
 def function(name: str, body: bytes = b"pass\n") -> build.Function:
-    member = Member(f"lambdas/{name}.py", hashlib.sha256(body).hexdigest(), lambda: body)
+    member = ZipMember(f"lambdas/{name}.py", hashlib.sha256(body).hexdigest(), lambda: body)
     return build.Function(name, (member,), ())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from tests.deploy.installation import ROOT, Installed, environment, installed, p
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 MAZE = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
+PAIRS = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15, players=2)
 HOUR = 0.04048 + 2 * 0.004445
 
 
@@ -468,3 +470,53 @@ def test_as_a_process(installed: Installed) -> None:  # noqa: F811
         plain = process(env, "cost", "--project", "maze")
     assert (ran.code, ran.json["projects"]["maze"]["servers"]) == (Exit.DONE, 1)
     assert "Servers, from their own records" in plain.out
+
+
+def test_participants_who_play_together_share_a_server_and_wait_in_a_lobby() -> None:
+    alone, pairs = ({line.what: line for line in study_lines(one, Prices())} for one in (MAZE, PAIRS))
+    servers = "Servers (Fargate Spot, 1 vCPU, 2 GB)"
+    assert pairs[servers].usd.likely == pytest.approx(alone[servers].usd.likely / 2)
+    assert pairs["S3 requests"].usd.likely > alone["S3 requests"].usd.likely
+    assert pairs["HTTP API"].usd.likely > alone["HTTP API"].usd.likely
+    assert any("A server for each 2: 15 minutes likely" in line for line in assumptions(PAIRS))
+    assert not any("lobby" in line for line in assumptions(MAZE))
+    assert Study(participants=5, steps=5, cpu=1, memory=2, max_runtime=30, players=2).servers == 3
+
+
+def test_the_longest_wait_in_a_lobby_is_the_patience_of_the_study() -> None:
+    hour = replace(PAIRS, patience=3600)
+    assert hour.lobby_polls.high == 100 * 1800
+    assert hour.lobby_polls.likely == PAIRS.lobby_polls.likely
+    assert any("3600 at most" in line for line in assumptions(hour))
+    assert replace(PAIRS, patience=10).lobby_polls.likely == 100 * 5  # no one waits longer than that
+
+
+def test_a_lobby_of_thirty_for_an_hour_costs_less_than_a_dollar() -> None:
+    """Each look lists and writes (as dear as two PUTs), reads the decisions and the membership, and is one request."""
+    prices = Prices()
+    study = replace(PAIRS, participants=30, patience=3600)
+    looks = study.lobby_polls.high
+    assert looks == 54_000
+    each = 2 * prices.s3_write.usd + 2 * prices.s3_read.usd
+    none = replace(study, patience=0)
+    (s3,) = (line.usd.high for line in study_lines(study, prices) if line.what == "S3 requests")
+    (without,) = (line.usd.high for line in study_lines(none, prices) if line.what == "S3 requests")
+    assert s3 - without == pytest.approx(looks * each)
+    assert 0.5 < s3 - without < 1
+
+
+def test_the_patience_of_the_configuration_counts(tmp_path: Path) -> None:
+    (tmp_path / "steps").mkdir()
+    (tmp_path / "steps" / "consent.html").write_text("x")
+    (tmp_path / "steps" / "thanks.html").write_text("x")
+    text = (
+        "project: {id: maze, players: 2, patience: 900, steps: {1: consent, 2: game, 3: thanks}}\n"
+        "trial: {game: maze, players: {player_0: human, player_1: human}}\n"
+    )
+    (tmp_path / "config.yml").write_text(text)
+    assert _study(read_project(tmp_path), 1, None, spot=True).patience == 900
+
+
+def test_a_link_that_starts_servers_ahead_costs_half_an_hour_for_each_group_that_does_not_come() -> None:
+    lines = assumptions(replace(PAIRS, at_link=True))
+    assert any("2 people who look and leave" in line and "35 minutes" in line for line in lines)

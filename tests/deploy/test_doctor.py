@@ -27,6 +27,7 @@ from deploy.operate.doctor.rehearsal import Rehearsal
 from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
 from hippodrome.servers.causes import Cause
+from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import SecretCache
 from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study
@@ -355,6 +356,21 @@ def test_pages_need_what_the_functions_behind_queues_leave(
     assert only(capacity.functions(context(account, at_once=20))).mark is mark
 
 
+def test_pages_of_a_lobby_need_more_of_the_account_than_one_page_for_each_server(
+    world: Installed, account: Account
+) -> None:
+    fresh(world)
+    quotas(world, functions=20)  # ten of them for the functions behind queues
+    alone = context(account, at_once=20, projects=[study()])
+    assert only(capacity.functions(alone)).mark is Mark.GOOD
+    fresh(world)
+    quotas(world, functions=20)
+    together = context(account, at_once=20, projects=[study(players=4)])
+    found = only(capacity.functions(together))
+    assert found.mark is Mark.LOOK
+    assert "80 participants" in found.text
+
+
 def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
     fresh(world)
     for action in ("GetServiceQuota", "GetAWSDefaultServiceQuota"):
@@ -599,6 +615,28 @@ def test_a_rehearsal_may_be_given_a_warm_server_and_says_so(world: Installed) ->
     assert name not in [task.name for task in world.platform.tasks.list()]
     assert not any("rehearsal" in key for key in world.keys("ms-pacman/"))
     assert world.keys("ms-pacman/spares/") == []
+
+
+def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_one(world: Installed) -> None:
+    """A start message of a participant would start none; and the sweep must not take it for one too many."""
+    whose = msgspec.structs.replace(study(players=2), id="ms-pacman")
+    town = StudyOnMoto(world)
+    world.register(whose)
+    SecretCache(world.platform.documents).get_or_create()
+    before, swept = world.keys(), []
+    clock = Clock(world, town)
+
+    def sleep(seconds: float) -> None:
+        clock.sleep(seconds)
+        swept.append(Sweep(world.platform).run().sessions)
+
+    found = Rehearsal(world.platform, whose, clock=clock, sleep=sleep).run()
+    assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
+    assert set(swept) == {0}
+    assert_nothing_left(world)
+    town.deliver()
+    after = world.keys()
+    assert [key for key in after if not key.startswith("_lobb")] == before
 
 
 def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None:

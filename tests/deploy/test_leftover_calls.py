@@ -55,7 +55,8 @@ def erase(world: Installed) -> None:
             {"ListTasks": 6, "DescribeTasks": 3, "ListClusters": 6, "ListResourceRecordSets": 2}
             | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 2, "DescribeStacks": 1, "GetCallerIdentity": 1}
             | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1}
-            | {"ListObjectVersions": 6, "ListMultipartUploads": 3, "DeleteObjects": 1},
+            # their documents, their sessions' documents, and what the lobby has of them
+            | {"ListObjectVersions": 20, "ListMultipartUploads": 3, "DeleteObjects": 1},
         ),
     ],
 )

@@ -7,9 +7,10 @@ import math
 import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
@@ -24,9 +25,14 @@ from deploy.operate.doctor.play import upkeep, walk
 from deploy.operate.doctor.play.copy import Copy, changed, left_behind, page_files, remove, unregister
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import LINES, Transcript
+from hippodrome.lobby import decisions
+from hippodrome.lobby.decisions import Ahead, Decisions
 from hippodrome.model.project import MASTER_LIST, MasterList, Step, UnreadableEntry, read_list, write_list
+from hippodrome.model.records import to_json
 from hippodrome.model.server import State
 from hippodrome.storage.project_cache import FRESH
+from protocol.keys import session_key
+from protocol.session import Member, Session
 from testing.aws_events import ACCOUNT
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
@@ -35,16 +41,24 @@ from testing.studies import study
 from tests.deploy.installation import ROOT, Ran
 from tests.deploy.living import Living, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
+from tests.trial.two_players import two_players
 
 STUDY = "tiny"
 
 
-def write_study(folder: Path) -> Path:
+def write_study(
+    folder: Path,
+    *,
+    agent: str = AGENT.format(start="pass", length=100_000),
+    project: Mapping[str, Any] = MappingProxyType({}),
+    trial: Mapping[str, Any] = MappingProxyType({}),
+) -> Path:
     """A study for AWS whose game lasts longer than any bot plays."""
     (folder / "steps").mkdir(parents=True)
-    config = {**CONFIG, "project": {**CONFIG["project"], "useAWS": True, "awsSetup": {"cpu": 0.5, "memory": 1}}}
+    on_aws = {"useAWS": True, "awsSetup": {"cpu": 0.5, "memory": 1}}
+    config = {"project": {**CONFIG["project"], **on_aws, **project}, "trial": {**CONFIG["trial"], **trial}}
     (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
-    (folder / "agent.py").write_text(AGENT.format(start="pass", length=100_000))
+    (folder / "agent.py").write_text(agent)
     for name, text in PAGES.items():
         (folder / "steps" / f"{name}.html").write_text(text)
     return folder
@@ -55,6 +69,21 @@ def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
     """An installation that lives, with one live study."""
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
     with held(write_study(tmp_path / "study"), monkeypatch, play=1.5, email="admin@example.org") as world:
+        yield world
+
+
+@pytest.fixture
+def living_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
+    """An installation that lives, with one live study in which two participants play together."""
+    monkeypatch.setattr(whole, "FRESH", timedelta(0))
+    both = {"players": {"left": "human", "right": "human"}, "countdown": 0, "actionSpace": ["noop", "up", "down"]}
+    study = write_study(
+        tmp_path / "study",
+        agent=two_players(length=100_000),
+        project={"players": 2},
+        trial={**both, "ui": {"up": True, "down": True, "start": True}},
+    )
+    with held(study, monkeypatch, play=1.5, email="admin@example.org") as world:
         yield world
 
 
@@ -115,6 +144,20 @@ def test_a_rehearsal_proves_everything_and_leaves_nothing(
     assert_nothing_left(living)
 
 
+def test_a_rehearsal_of_a_study_for_two_counts_their_session_once(living_pair: Living, capsys: Any) -> None:
+    ran = play(living_pair, capsys, "--json")
+    told = ran.json["transcript"]
+    assert {line["key"]: line["text"] for line in told["lines"] if line["mark"] != "good"} == {}, ran.out
+    assert list(told["proven"]) == list(LINES)
+    texts = {line["key"]: line["text"] for line in told["lines"]}
+    assert texts["pages"].startswith("2 of 2 bots finished")
+    assert texts["servers"].startswith("1 ran, 1 of them on Spot")
+    assert texts["killed"].startswith("The server counted as lost (spot); another was ready")
+    assert texts["end"].startswith("1 server ended")
+    assert " for 3 servers with " in texts["cost"], "the session's two attempts, and the one that its timer ends"
+    assert_nothing_left(living_pair)
+
+
 def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
     living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +212,24 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, caps
     assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
     assert remove(account, installation, platform, copy.id) > 5
     assert_nothing_left(living)
+
+
+def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(living: Living) -> None:
+    account = open_account()
+    installation = find_installation(account)
+    platform = account.platform(installation)
+    copy = Copy(account, installation, platform)
+    copy.make(registered_projects(platform.documents)[0])
+    walked, sid, ahead = copy.user("1"), f"s.{1:020x}", f"s.{2:020x}"
+    living.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
+    living.put(session_key(copy.id, sid), Session(sid, 2, (Member(walked, None, 0),)).to_json())
+    living.record(sid, State.CLOSED, copy.project)
+    living.record(ahead, State.READY, copy.project)
+    living.put(f"_lobby/{copy.id}/slabel.way", b"{}")
+    living.put(decisions.key(copy.id), to_json(Decisions(1, open=(Ahead(ahead, datetime.now(UTC)),))))
+    remove(account, installation, platform, copy.id, users=copy.users)
+    assert_nothing_left(living)
+    assert living.keys("_lob") == []
 
 
 @pytest.mark.parametrize("name", ["rehearsal-20261122", "rehearsal-deadbeef", "rehearsal-1"])

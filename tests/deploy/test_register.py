@@ -18,6 +18,7 @@ import pytest
 from console.problem import Exit
 from deploy.aws.account import find_installation, open_account
 from deploy.study import pages, register
+from hippodrome import registry
 from hippodrome.model import ids
 from hippodrome.registry import NotRegistered
 from lambdas import next_step, start_server
@@ -626,6 +627,24 @@ def test_the_functions_objections_are_told(
     assert ran.code == Exit.FAILED
     assert "project.maxRuntime is too long" in ran.err
     assert "consent.html has not been uploaded" in ran.err
+    assert LINK not in ran.out
+
+
+def test_a_function_that_is_older_than_a_key_of_the_study_is_to_be_brought_up_to_date(
+    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the study has a key more; what the function says of it is the same."""
+    known = registry.register
+
+    def older(platform: Any, registration: dict[str, Any]) -> Any:
+        return known(platform, {**registration, "keyOfTomorrow": 2})
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hippodrome.registry.register", older)
+        ran = town.run(capsys, "register", str(folder))
+    assert ran.code == Exit.FAILED
+    assert "keyOfTomorrow: unknown key" in ran.err
+    assert "The installation is older than this study: bring it up to date with `make deploy`" in ran.err
     assert LINK not in ran.out
 
 

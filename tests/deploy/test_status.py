@@ -17,6 +17,8 @@ from deploy.operate import status
 from hippodrome.model import server
 from hippodrome.model.server import Reason, State
 from hippodrome.servers.causes import Cause
+from protocol.keys import session_key
+from protocol.session import Member, Session
 from testing.studies import study
 from tests.deploy.certificates import chain
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
@@ -161,6 +163,29 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
     assert "~" not in text
 
 
+def test_servers_of_sessions_are_told_with_the_number_of_their_members(world: Installed, capsys: Any) -> None:
+    formed, ahead = ("s." + "0" * 19 + digit for digit in "12")
+    pairs = study(players=2)
+    world.register(pairs)
+    for session in (formed, ahead):
+        world.record(session, project=pairs)
+    members = (Member("person-1", None, 0), Member("person-2", None, 1))
+    world.put(session_key("maze", formed), Session(formed, 2, members).to_json())
+    found = look(world, capsys)["servers"]["open"]
+    assert sorted((one["session"], one["members"]) for one in found) == [(True, 0), (True, 2)]
+    text = world.run(capsys, "status").out
+    assert "2 ready, 2 of sessions with 2 members" in text
+    assert "Spot, session of 2" in text
+    assert "Spot, started ahead" in text
+    assert not any(part in text for part in ("person-", formed, ahead))
+
+
+def test_servers_of_single_participants_are_told_as_ever(world: Installed, capsys: Any) -> None:
+    world.record("alice")
+    (one,) = look(world, capsys)["servers"]["open"]
+    assert one.keys().isdisjoint({"session", "members"})
+
+
 def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4, live=False))
     world.record(WARM_SERVERS[0], State.DRAINING)
@@ -172,7 +197,10 @@ def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
     assert look(world, capsys)["spentToday"]["likely"] == 0
     world.record("alice", State.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
     spent = look(world, capsys)["spentToday"]
-    minutes = min(10.0, (datetime.now(UTC) - datetime.now(UTC).replace(hour=0, minute=0)).total_seconds() / 60)
+    minutes = min(
+        10.0,
+        (datetime.now(UTC) - datetime.now(UTC).replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds() / 60,
+    )
     assert spent["likely"] == pytest.approx(minutes / 60 * (0.04048 + 2 * 0.004445 + 0.005), rel=0.05)
 
 

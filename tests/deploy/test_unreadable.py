@@ -18,6 +18,8 @@ from hippodrome.model import ids, server
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, Project, step_key
 from hippodrome.storage.secret import SecretCache
+from protocol.keys import session_key
+from protocol.session import Member, Session
 from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
 from tests.deploy.test_doctor import account, context  # noqa: F401
@@ -98,6 +100,21 @@ def test_doctor_names_a_servers_record(world: Installed, account: Account) -> No
     (line,) = found(account)
     assert (line.mark, line.check) == (Mark.BAD, "servers")
     assert server.key(label) in line.text
+
+
+def test_doctor_names_a_lobbys_document_and_counts_those_of_sessions(installed: Installed, account: Account) -> None:
+    pairs = study(players=2)
+    prepare(installed, pairs)
+    SecretCache(installed.platform.documents).get_or_create()
+    good = Session("s." + "0" * 20, 2, (Member(USER, None, 0),))
+    installed.put(session_key("maze", good.id), good.to_json())
+    assert found(account) == []
+    installed.put("_lobbies/maze.json", b"{")
+    installed.put(session_key("maze", "s." + "1" * 20), b'{"members": 7}')
+    lobby, session = found(account)
+    assert (lobby.mark, lobby.text[:23]) == (Mark.LOOK, "_lobbies/maze.json cann")
+    assert (session.mark, session.check) == (Mark.BAD, "project maze")
+    assert session.text.startswith("The documents of 1 of the latest 2 sessions cannot be read")
 
 
 def test_doctor_counts_participants_records(world: Installed, account: Account) -> None:

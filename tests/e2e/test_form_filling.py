@@ -13,14 +13,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bots import form_filling
+from bots import form_filling, forms
 
 SEEDS = st.integers(0, 2**32)
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1, max_size=12)
 
 
-def one(page: str) -> form_filling.Form:
-    form = form_filling.to_answer(page)
+def one(page: str) -> forms.Form:
+    form = forms.to_answer(page)
     assert form is not None
     return form
 

@@ -8,6 +8,7 @@ import ctypes
 import os
 import platform
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from bots.addresses import THIS_MACHINE, AddressRefused
 from bots.bot import Bot
 from bots.game import Hands
 from bots.links import with_project, with_user
+from local.new import LEFT_OUT
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
 from testing import preloaded
 from trial.recordings.recording import read
@@ -59,6 +61,23 @@ def test_the_example_project(tmp_path: Path) -> None:
     assert len([*(tmp_path / "data").glob("ms-pacman/users/*/trials/*/*.gz")]) == 2
     made = [tmp_path / "data", *(tmp_path / "data").rglob("*")]
     assert [path.name for path in made if path.stat().st_mode & 0o077] == [], "they are their owner's alone"
+
+
+def test_bots_play_in_pairs_and_one_of_an_odd_number_finds_no_other(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    shutil.copytree(ROOT / "examples" / "two-players", folder, ignore=LEFT_OUT)
+    config = (folder / "config.yml").read_text()
+    (folder / "config.yml").write_text(config.replace("patience: 120", "patience: 10"))
+    process = rehearsal(folder, "--bots", "3", "--at-once", "1", "--play", "2", "--data", tmp_path / "data")
+    text = said(process)
+    assert process.returncode == 0, text
+    rows = {row[1].strip(): row[2].strip() for row in (line.split("│") for line in text.splitlines()) if len(row) == 4}
+    assert rows["games played together"] == "1 of 2 participants"
+    assert re.fullmatch(r"1: bot-[0-9a-f]{6}-\d", rows["unmatched"])
+    assert re.fullmatch(r"p50 \d+\.\d s, .*max 1[0-9]\.\d s", rows["wait in the lobby"])
+    assert [rows[name] for name in ("bots finished", "games found", "completion codes shown")] == ["3 of 3"] * 3
+    assert rows["recordings"].startswith("1, with ")
+    assert (rows["servers left over"], rows["errors"]) == ("0", "none")
 
 
 def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Path) -> None:

@@ -195,7 +195,7 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
 
 
 def _hidden(page: Any) -> list[tuple[str, str]]:
-    from bots.form_filling import hidden
+    from bots.forms import hidden
 
     return list(hidden(page.form))
 

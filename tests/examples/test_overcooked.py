@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -166,13 +167,13 @@ def agent(load_module: Callable[[str, str], ModuleType]) -> Any:
 def test_the_scene_has_no_flaw_and_all_its_pictures_are_there(agent: Any, cook: Any) -> None:
     frames = set(as_frames(EXAMPLE / "assets" / "kitchen.json"))
     agent.env.reset(seed=1)
-    scene, shown = as_scene(agent.render()), set()
+    scene, shown = as_scene(agent.render("0")), set()
     for _ in range(200):
         assert scene.problems == ()
         shown |= {each["frame"] for each in scene.objects.values() if each["type"] == "sprite"}
         stands = agent.env.kitchen()
         agent.env.step({number: cook.act(stands, number) for number in (0, 1)})
-        scene = as_scene(agent.render(), scene)
+        scene = as_scene(agent.render("0"), scene)
     assert images_of(scene) == {"kitchen"}
     assert shown <= frames
     assert {"pot-0", "pot-1", "pot-2", "pot-3", "pot-ready", "onion", "plate", "onion_soup", "chef-blue-up"} <= shown
@@ -203,3 +204,19 @@ def test_the_kitchen_fills_the_scene(agent: Any, load_module: Callable[[str, str
     assert (section["scene"]["width"], section["scene"]["height"]) == (columns * tile, rows * tile)
     assert section["startingFrameRate"] == load_module("overcooked", "agent").STEPS_PER_SECOND
     assert section["actionSpace"] == list(load_module("overcooked", "kitchen").ACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("plays", "said"),
+    [
+        ({"0": "human", "1": "policies/cook.onnx"}, ["Soups", "Soups"]),
+        ({"0": "human", "1": "human"}, ["You are blue", "You are green"]),
+    ],
+)
+def test_two_people_read_who_they_are(
+    load_module: Any, monkeypatch: pytest.MonkeyPatch, plays: dict[str, str], said: list[str]
+) -> None:
+    monkeypatch.setenv("TRIAL", json.dumps({"players": plays}))
+    agent = load_module("overcooked", "agent").Agent()
+    agent.start("overcooked").reset(seed=1)
+    assert [agent.render(player)["hud"].partition(": ")[0].partition(" · ")[0] for player in ("0", "1")] == said

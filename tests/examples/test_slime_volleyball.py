@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -189,7 +190,7 @@ def agent(load_module: Callable[[str, str], ModuleType]) -> Any:
 
 def test_the_scene_has_no_flaw_and_shows_what_there_is(agent: Any) -> None:
     agent.env.reset(seed=1)
-    scene = as_scene(agent.render())
+    scene = as_scene(agent.render(LEFT))
     chance = np.random.default_rng(1)
     for _ in range(300):
         assert scene.problems == ()
@@ -198,7 +199,7 @@ def test_the_scene_has_no_flaw_and_shows_what_there_is(agent: Any) -> None:
         if not agent.env.agents:
             break
         agent.env.step({LEFT: int(chance.integers(6)), RIGHT: int(chance.integers(6))})
-        scene = as_scene(agent.render(), scene)
+        scene = as_scene(agent.render(LEFT), scene)
     assert all((EXAMPLE / "assets" / f"{image}.png").is_file() for image in images_of(scene))
     assert scene.permanent == {"court", "net", "net top"}
 
@@ -207,9 +208,23 @@ def test_ready_is_asked_before_each_point_but_the_first_where_the_page_asks(agen
     agent.env.reset(seed=1)
     scored = False
     while not scored:
-        assert "serve" not in {each["id"] for each in agent.render()["objects"]}
+        assert "serve" not in {each["id"] for each in agent.render(LEFT)["objects"]}
         scored = any(agent.env.step({LEFT: 0, RIGHT: 0})[1].values())
-    assert "serve" in {each["id"] for each in agent.render()["objects"]}
+    assert "serve" in {each["id"] for each in agent.render(LEFT)["objects"]}
+
+
+@pytest.mark.parametrize(
+    ("right", "said"),
+    [("policies/right.onnx", ["Red 0", "Red 0"]), ("human", ["You are red", "You are blue"])],
+)
+def test_two_people_read_who_they_are(
+    load_module: Any, monkeypatch: pytest.MonkeyPatch, right: str, said: list[str]
+) -> None:
+    monkeypatch.setenv("TRIAL", json.dumps({"players": {LEFT: "human", RIGHT: right}}))
+    agent = load_module("slime-volleyball", "agent").Agent()
+    agent.start("slime-volleyball").reset(seed=1)
+    huds = [agent.render(player)["hud"] for player in (LEFT, RIGHT)]
+    assert [hud.partition(" · ")[0].partition(" : ")[0] for hud in huds] == said
 
 
 def test_the_picture_of_the_court_is_as_large_as_the_scene(load_module: Callable[[str, str], ModuleType]) -> None:
@@ -221,6 +236,6 @@ def test_the_picture_of_the_court_is_as_large_as_the_scene(load_module: Callable
 
 def test_the_picture_is_made_without_opencv() -> None:
     """`slimevb` brings it for its own drawing; a server has no libGL."""
-    code = "import agent, sys; a = agent.Agent(); a.start(''); a.env.reset(); a.render(); print('cv2' in sys.modules)"
+    code = "import agent, sys; a = agent.Agent(); a.start(''); a.env.reset(); a.render('agent_left'); print('cv2' in sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], cwd=EXAMPLE, capture_output=True, text=True, check=True)
     assert ran.stdout == "False\n"

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from console.problem import Exit
 from deploy.__main__ import main
 from export import recording as converted
+from export import recording_columns
 from export.scrub import Scrub, nothing
 from testing.exploration import examples
 from tests.export import data_world as made_of
@@ -109,7 +110,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=5,
 )
-NAMES = st.sampled_from([*converted.schema().names, "kind", "v", "x"])
+NAMES = st.sampled_from([*recording_columns.schema().names, "kind", "v", "x"])
 
 
 @settings(max_examples=examples(80))
@@ -158,7 +159,7 @@ def test_a_bomb_and_a_lie_about_an_observation(tmp_path: Path) -> None:
 
 
 def test_long_recordings_are_written_in_groups(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(converted, "GROUP_ROWS", 100)
+    monkeypatch.setattr(recording_columns, "GROUP_ROWS", 100)
     body = record(tmp_path, "ann", frames=950)
     done, found = convert(tmp_path, body)
     assert pq.read_metadata(tmp_path / "out.parquet").num_row_groups == 10
@@ -319,7 +320,9 @@ def test_without_observations_the_steps_number_stands_there_and_that_is_said(
 ) -> None:
     crowd(into_folder(tmp_path / "data"), tmp_path, 3)
     assert main(["data", str(tmp_path / "out"), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0  # fmt: skip
-    assert "observations were not recorded" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "observations were not recorded" in told
+    assert "`recordObservations: true`" in told
     dataset = load(tmp_path / "out", "maze-3-v0", monkeypatch)
     assert len(dataset) == 2
     assert dataset[1].observations.tolist() == [[0], [1], [2], [3], [4], [5]]

@@ -374,13 +374,13 @@ def test_cut_off_while_writing_tables(place: Place, monkeypatch: Any, what: str)
     before = {name: (place.out / name).read_bytes() for name in ("answers.csv", "answers.parquet", "manifest.json")}
     arrive(place.put, users[2], {"3": GAME})
     with pytest.MonkeyPatch.context() as patch:
-        from export import tables
+        from export import table_files, tables
 
         def stop(*args: Any) -> Any:
             raise KeyboardInterrupt
 
         patch.setattr(manifest if what == "write" else tables, what, stop) if what != "answers" else patch.setattr(
-            tables, "_batches", stop
+            table_files, "_batches", stop
         )
         assert place.run().code == Exit.INTERRUPTED
     if what == "answers":  # a table is replaced whole or not at all

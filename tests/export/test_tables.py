@@ -16,10 +16,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from export import tables
+from export import table_files, tables
+from export.answers import MAX_LINK, Answers
 from export.keys import Kind, Listed, read
 from export.scrub import Scrub, clean, identities
-from export.state import File, State
+from export.state import File, Person, State
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
 from trial.recordings.recording import line
@@ -66,8 +67,8 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
 
 def written(state: State, folder: Path, apart: bool = False, **style: Any) -> tuple[list[dict[str, str]], list[Any]]:
     """The answers as CSV and as Parquet give them back."""
-    answers = tables.Answers(state, PROJECT, apart)
-    sheet, parquet = tables.write(folder / "answers", answers.columns, answers.rows(), tables.Style(**style))
+    answers = Answers(state, PROJECT, apart)
+    sheet, parquet = table_files.write(folder / "answers", answers.columns, answers.rows(), table_files.Style(**style))
     with sheet.open(encoding="utf-8-sig", newline="") as file:
         found = list(csv.DictReader(file))
     return found, pq.read_table(parquet).to_pylist()
@@ -128,11 +129,11 @@ def test_answers_of_any_type_make_a_table(steps: dict[str, Any], link: Any) -> N
             sheet, parquet = written(filled(people, apart, link=link), Path(folder), apart)
             assert len(sheet) == len(parquet) == 2
         state = filled(people)
-        answers = tables.Answers(state, PROJECT, False)
+        answers = Answers(state, PROJECT, False)
         long = list(answers.long_rows())
-        tables.write(Path(folder) / "long", answers.LONG, long, tables.Style())
+        table_files.write(Path(folder) / "long", answers.LONG, long, table_files.Style())
         columns, rows = tables.identities(state, answers.links)
-        tables.write(Path(folder) / "who", columns, rows, tables.Style())
+        table_files.write(Path(folder) / "who", columns, rows, table_files.Style())
     sent = sum(len(v) if isinstance(v, list) and all(isinstance(i, str) for i in v) else v is not None
                for given_ in steps.values() for v in given_.values())  # fmt: skip
     assert len(long) == sent + 1
@@ -204,13 +205,13 @@ def test_for_a_spreadsheet_nothing_is_a_formula_and_otherwise_everything_is_true
 
 
 def test_a_flood_of_fields_does_not_become_a_flood_of_columns(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(tables, "MAX_FIELDS", 10)
-    monkeypatch.setattr(tables, "_MAX_COUNTED", 60)
+    monkeypatch.setattr("export.answers.MAX_FIELDS", 10)
+    monkeypatch.setattr("export.answers._MAX_COUNTED", 60)
     people = {f"u{n}": {"2": {"age": "3", "pet": "cat"}} for n in range(5)}
     people |= {f"x{n}": {"2": {f"junk-{n}-{m}": "x" for m in range(50)} | {"age": "9"}} for n in range(5)}
     link = {f"l{n}": "v" for n in range(80)}
     rows, _ = written(filled(people, link=link), tmp_path)
-    assert len(rows[0]) < 10 + tables.MAX_LINK + 15
+    assert len(rows[0]) < 10 + MAX_LINK + 15
     assert [row["2.age"] for row in rows] == ["3"] * 5 + ["9"] * 5
     assert [row["2.pet"] for row in rows] == ["cat"] * 5 + [""] * 5
     for number, row in enumerate(rows[5:]):
@@ -218,7 +219,7 @@ def test_a_flood_of_fields_does_not_become_a_flood_of_columns(tmp_path: Path, mo
         shown = {name: row[name] for name in row if name.startswith("2.junk") and row[name]}
         junk = {name: value for name, value in {**rest, **shown}.items() if name.startswith("2.junk")}
         assert junk == {f"2.junk-{number}-{m}": "x" for m in range(50)}
-        assert sum(name.startswith("link.") for name in rest) == 80 - tables.MAX_LINK
+        assert sum(name.startswith("link.") for name in rest) == 80 - MAX_LINK
 
 
 def test_finished_needs_every_step_but_the_last(tmp_path: Path) -> None:
@@ -276,7 +277,8 @@ def test_an_identity_leaves_every_text_and_every_json(identity: str, before: str
 
 
 def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
-    known = identities("user-0001", "p1", participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"}))
+    document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
+    known = identities(Person("user-0001", "p1", "p1", document))
     hide = Scrub(known)
     code = participant("user-0001")["completionCode"]
     assert (
@@ -291,13 +293,13 @@ def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
 
 def test_csv_is_what_the_standard_says(tmp_path: Path) -> None:
     columns = [
-        tables.Column("a"),
-        tables.Column("b", "texts"),
-        tables.Column("c", "truth"),
-        tables.Column("d", "number"),
+        table_files.Column("a"),
+        table_files.Column("b", "texts"),
+        table_files.Column("c", "truth"),
+        table_files.Column("d", "number"),
     ]
-    (sheet,) = tables.write(
-        tmp_path / "t", columns, [['x "y"\n', ["1", "2"], True, math.inf], [None] * 4], tables.Style(parquet=False)
+    (sheet,) = table_files.write(
+        tmp_path / "t", columns, [['x "y"\n', ["1", "2"], True, math.inf], [None] * 4], table_files.Style(parquet=False)
     )
     assert sheet.read_bytes() == b'a,b,c,d\r\n"x ""y""\n",1; 2,true,inf\r\n,,,\r\n'
     assert next(csv.reader(io.StringIO(sheet.read_text()))) == ["a", "b", "c", "d"]
@@ -310,7 +312,7 @@ def test_nothing_half_written_stands_under_a_name(tmp_path: Path) -> None:
 
     (tmp_path / "t.csv").write_text("before")
     with pytest.raises(KeyboardInterrupt):
-        tables.write(tmp_path / "t", [tables.Column("a")], rows(), tables.Style())
+        table_files.write(tmp_path / "t", [table_files.Column("a")], rows(), table_files.Style())
     assert (tmp_path / "t.csv").read_text() == "before"
     assert not (tmp_path / "t.parquet").exists()
 

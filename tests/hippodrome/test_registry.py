@@ -171,3 +171,20 @@ def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:
     platform.documents.put(MASTER_LIST, json.dumps(hippo).encode())
     register(registration())
     assert {p.id for p in listed(platform).projects} == {"old", "maze"}
+
+
+def test_a_study_of_several_participants_does_not_become_one_for_each_alone(platform: FakePlatform) -> None:
+    steps = [
+        {"key": "1", "page": "consent", "variants": 2},
+        {"key": "2", "page": "game", "variants": 0},
+        {"key": "finalStep", "page": "bye", "variants": 0},
+    ]
+    trial = {"game": "lanterns", "players": {"red": "human", "blue": "human"}}
+    together = registration(players=2, steps=steps, trial=trial)
+    assert register(together)["registered"] == "maze"
+    alone = registration(steps=steps, trial={"game": "lanterns"})
+    (problem,) = register(alone)["problems"]
+    assert "players: 2" in problem
+    assert "another project.id" in problem
+    assert register(together)["registered"] == "maze"
+    assert ProjectCache(platform, SecretCache(platform.documents)).project("maze").players == 2  # type: ignore[union-attr]

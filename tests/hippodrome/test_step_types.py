@@ -28,7 +28,8 @@ def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
     assert set(steps.HANDLERS) == {kind.name for kind in TYPES}
     for name, handler in steps.HANDLERS.items():
         assert handler.__module__ == f"hippodrome.participants.steps.{name}"
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, "services", "sources", "visit", "__init__"}
+    shared = {"services", "sources", "visit", "shared_game"}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, *shared, "__init__"}
 
 
 class BreakStep(PageStep):

@@ -13,10 +13,12 @@ import os
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
+from unittest import mock
 from urllib.parse import urlencode, urlsplit
 
 import pytest
 
+from hippodrome.lobby import matcher
 from hippodrome.model import ids, server
 from hippodrome.storage.project_cache import ProjectCache
 from lambdas import (
@@ -28,12 +30,13 @@ from lambdas import (
     stop_server,
     sweep,
 )
+from protocol.keys import groups_key, waiting_key
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
 from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, Call, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
-from testing.moto_study import GAME, PROJECT, Person, StudyOnMoto
+from testing.moto_study import GAME, PAIRS, PROJECT, Member, Person, StudyOnMoto, come, meet
 from testing.moto_world import MotoWorld
 from tests.hippodrome.test_moto_journey import run
 
@@ -267,7 +270,73 @@ def waiting(world: MotoWorld) -> None:
     assert study.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
 
 
+def together(world: MotoWorld) -> None:
+    """A study of pairs: matched, lost, replaced, recorded, left one by one; one who waits alone, and who leaves."""
+    study = StudyOnMoto(world, **PAIRS)
+    alice, bob = Member(study, "R_alice"), Member(study, "R_bob")
+    come(study, alice, bob)
+    meet(alice, bob)
+    session = alice.membership["session"]
+    folder = f"{PROJECT}/sessions/{session}"
+    recording = f"{folder}/trials/{{label}}-1/{GAME}-trial.jsonl.gz"
+    answer = f"{PROJECT}/users/{alice.user}/answers/{GAME}.json"
+    served(world, session, ("GET", f"{folder}/session.json"), ("PUT", recording), ("PUT", answer))
+    study.lose(study.living()[0])
+    study.deliver()
+    served(world, session, ("GET", recording))
+    token = alice.poll()["token"]
+    assert relay(send_stop_server_message.handler, alice.user, {"token": token}) == 202
+    assert relay(send_start_server_message.handler, bob.user, bob.hidden) == 202
+    study.deliver()
+    assert len(study.living()) == 1
+    alice.play()
+    study.deliver()
+    assert len(study.living()) == 1
+    bob.play()
+    study.deliver()
+    study.assert_nothing_left()
+
+    carol, dave = Member(study, "R_carol"), Member(study, "R_dave")
+    come(study, carol)
+    assert carol.poll()["state"] == "lobby"
+    carol.leave()
+    come(study, dave)
+    dave.poll()
+    swept = sweep.handler({}, None)
+    assert swept["failed"] == 0, swept
+    stop_server.handler(aws_events.queue_event([{"userId": person.user} for person in (carol, dave)]), None)
+    swept = sweep.handler({}, None)
+    assert swept["failed"] == 0, swept
+    study.deliver()
+    study.assert_nothing_left()
+
+
+def matched_by_a_function(world: MotoWorld) -> None:
+    """A study whose function `match` says who plays with whom, on a server that was started ahead."""
+    study = StudyOnMoto(world, **PAIRS, matching="match")
+    alice, bob = Member(study, "R_alice"), Member(study, "R_bob")
+    come(study, alice, bob)
+    assert [alice.poll()["state"], bob.poll()["state"]] == ["lobby", "lobby"]
+    question = study.stored(waiting_key(PROJECT))
+    (ahead, *_) = study.stored(f"_lobbies/{PROJECT}.json")["open"]
+    answer = groups_key(PROJECT, question["id"])
+    served(world, ahead["id"], ("GET", waiting_key(PROJECT)), ("PUT", answer))
+    study.put(answer, json.dumps({"groups": [[one["id"] for one in question["waiting"]]]}).encode())
+    meet(alice, bob)
+    assert alice.membership["session"] == bob.membership["session"] == ahead["id"]
+    with mock.patch.object(matcher, "FORGOTTEN", timedelta(minutes=-1)):
+        assert sweep.handler({}, None)["failed"] == 0
+    assert study.stored(waiting_key(PROJECT)) is None
+    assert study.stored(answer) is None
+    alice.play()
+    bob.play()
+    study.deliver()
+    study.assert_nothing_left()
+
+
 WALKS: dict[str, Callable[[MotoWorld], None]] = {
+    "a study of pairs": together,
+    "a study with a function that matches": matched_by_a_function,
     "a study with warm servers": waiting,
     "a study with limits": limited,
     "everything, in the installation's cluster": lambda world: walk(world, "installation"),
@@ -442,6 +511,46 @@ def test_answers_are_never_written_over(judge: Judge) -> None:
             assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
 
 
+def test_who_is_a_member_is_written_once_by_the_control_plane(judge: Judge) -> None:
+    """And no server of a session may change it, nor what is decided in the lobby."""
+    theirs = {
+        f"{PROJECT}/users/R_alice/session.json": {"next_step", "sweep"},
+        f"{PROJECT}/sessions/s.00000000000000000001/session.json": {"next_step", "sweep"},
+        f"{PROJECT}/sessions/s.00000000000000000001/trials/a-1/3-trial.jsonl.gz": {SIGN},
+    }
+    for key, who in theirs.items():
+        assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", {"s3:if-none-match": "*"})) == who
+        for context in ({}, {"s3:if-match": '"e"'}):
+            assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == frozenset()
+        assert judge.who_may(Ask("s3:DeleteObject", f"{BUCKET}/{key}")) == frozenset()
+    lobby = f"{BUCKET}/_lobbies/{PROJECT}.json"
+    for context in ({"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}):
+        assert judge.who_may(Ask("s3:PutObject", lobby, context)) == {"next_step", "start_server", "sweep"}
+    for action in ("s3:PutObject", "s3:DeleteObject"):
+        assert judge.who_may(Ask(action, lobby)) == frozenset()
+
+
+def test_who_plays_with_whom_is_asked_by_the_control_plane_and_answered_once_by_a_server(judge: Judge) -> None:
+    new, again = {"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}
+    question, answer = (f"{BUCKET}/{key}" for key in (waiting_key(PROJECT), groups_key(PROJECT, "0" * 20)))
+    for context in (new, again):
+        assert judge.who_may(Ask("s3:PutObject", question, context)) == {"next_step"}
+    assert judge.who_may(Ask("s3:PutObject", answer, new)) == {SIGN}
+    for context in ({}, again):
+        assert judge.who_may(Ask("s3:PutObject", answer, context)) == frozenset()
+    assert judge.who_may(Ask("s3:PutObject", question)) == frozenset()
+    for key in (question, answer):
+        assert judge.who_may(Ask("s3:DeleteObject", key)) == {"sweep"}
+
+
+@pytest.mark.parametrize("key", ["participant.json", "answers/3.json", "trials/a-1/3-trial.jsonl.gz", "session.json"])
+def test_a_participant_who_is_called_lobby_is_a_participant(judge: Judge, key: str) -> None:
+    theirs = f"{BUCKET}/{PROJECT}/users/lobby/{key}"
+    assert judge.who_may(Ask("s3:DeleteObject", theirs)) == frozenset()
+    alices = judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{PROJECT}/users/R_alice/{key}", {"s3:if-none-match": "*"}))
+    assert judge.who_may(Ask("s3:PutObject", theirs, {"s3:if-none-match": "*"})) == alices
+
+
 def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
     theirs = {
         f"{PROJECT}/places/3.json": {"next_step", "update_project_master_list"},
@@ -487,7 +596,7 @@ BUILDERS = [
                 *(
                     ("s3:PutObject", f"{BUCKET}/{project}/users/{user}/{name}", {"s3:if-none-match": "*"})
                     for project in ("p", "places", "spares", "steps", "SSL-study")
-                    for user in ("u", "users", "places", "spares", "steps", "_places")
+                    for user in ("u", "users", "places", "spares", "steps", "lobby", "_places")
                     for name in ("answers/3.json", "trials/a-0001.jsonl.gz")
                 ),
             ],
@@ -512,7 +621,11 @@ BUILDERS = [
                     )
                     for name in ("answers/y.json", "trials/y.json")
                 ),
-                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_places", "_spares")),
+                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_places", "_spares", "_lobby", "_lobbies")),
+                ("s3:PutObject", f"{BUCKET}/p/sessions/s.1/session.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/_match/p/waiting.json", {"s3:if-none-match": "*"}),
+                *(("s3:PutObject", f"{BUCKET}/{folder}/lobby/groups/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/places", "p/spares")),
+                *(("s3:PutObject", f"{BUCKET}/{folder}/sessions/s.1/trials/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/places", "p/spares")),
                 ("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/1", {}),
             ],
         ),

@@ -257,7 +257,8 @@ def test_data_are_private_encrypted_versioned_and_outlive_the_stack() -> None:
     rules = {rule["Id"]: rule for rule in properties["LifecycleConfiguration"]["Rules"]}
     assert rules["OldVersions"]["NoncurrentVersionExpiration"]
     assert rules["IncompleteUploads"]["AbortIncompleteMultipartUpload"]
-    assert [rule["Prefix"] for rule in rules.values() if "ExpirationInDays" in rule] == ["_builds/"], "no data expire"
+    expiring = [rule["Prefix"] for rule in rules.values() if "ExpirationInDays" in rule]
+    assert sorted(expiring) == ["_builds/", "_lobby/", "_match/"], "no data expire"
     (policy,) = cfn.resources("AWS::S3::BucketPolicy").values()
     (statement,) = policy["PolicyDocument"]["Statement"]
     assert (statement["Effect"], statement["Condition"]) == ("Deny", {"Bool": {"aws:SecureTransport": "false"}})

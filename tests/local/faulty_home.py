@@ -26,7 +26,7 @@ from hippodrome.ports import Topic
 from hippodrome.servers import dns
 from hippodrome.storage.secret import KEY
 from lambdas import installed, next_step, send_start_server_message, sweep
-from local.backend import bus, platform, retry, tasks, timers
+from local.backend import bus, platform, retry, task_process, timers
 from local.backend.bus import Handler
 from local.backend.platform import LocalPlatform
 from local.backend.processes import end_everything, marked
@@ -117,7 +117,7 @@ class Home:
         if dead:
             self.injector.dead.set()
             dead._closed.set()
-            dead.tasks._closed.set()
+            dead.tasks._shared.closed.set()
             for queue in dead.bus._queues.values():
                 with queue._changed:
                     queue._open = False
@@ -333,7 +333,7 @@ def hurried() -> Iterator[None]:
             (retry, "LONGEST", 0.1),
             (timers, "AGAIN", 0.05),
             (dns, "RETRY_PAUSE", 0.05),  # a server that ends while it starts has no address: it is asked for again
-            (tasks, "RESCUE_TIMEOUT", 0.2),
+            (task_process, "RESCUE_TIMEOUT", 0.2),
             (platform, "SWEEP_FIRST", 0.5),
             (platform, "LOOK", 0.1),
             (platform, "START_RETRY_SECONDS", 0.2),

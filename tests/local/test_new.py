@@ -105,12 +105,12 @@ def test_only_the_id_changes_in_the_file(root: Path, tmp_path: Path) -> None:
 def test_commands_and_links_of_the_copy_lead_where_they_should(root: Path, tmp_path: Path) -> None:
     (root / "docs").mkdir()
     (root / "docs" / "objects.md").write_text("# Objects")
-    readme = "make run PROJECT=examples/maze\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
+    readme = "make run PROJECT=examples/maze, or (examples/maze).\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
     (root / "examples" / "maze" / "README.md").write_text(readme)
     folder = tmp_path / "deep" / "mine"
     new.make_study(new.templates(root)["maze"], folder)
     command, rest = (folder / "README.md").read_text().split("\n")
-    assert command == f"make run PROJECT={folder}"
+    assert command == f"make run PROJECT={folder}, or ({folder})."
     assert rest == f"`python {folder}/draw.py` tests/examples/maze [objects](../../clone/docs/objects.md#types)"
 
 

@@ -128,6 +128,17 @@ class Person:
         return told if told["state"] == state else None
 
 
+class Member(Person):
+    """A participant of the study when it is played in pairs."""
+
+    def poll(self) -> Any:
+        """What the lobby's page is told: it asks with its ticket."""
+        link = f"{self.link}&poll={GAME}&ticket={self.proof['hippodrome-ticket']}"
+        found = self.browser.get(link, headers={"Accept": "application/json"})
+        assert found.status_code == 200, found.text
+        return found.json()
+
+
 class Trial:
     """A participant's server, as far as it stores things: it knows its environment, and has no rights on AWS."""
 

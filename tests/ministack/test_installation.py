@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
+import time
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,10 +21,12 @@ import botocore.exceptions
 import pytest
 
 from hippodrome.model import ids, server
+from hippodrome.storage.project_cache import FRESH
 from hippodrome.storage.secret import KEY
+from protocol.session import member_token
 from testing import derived
 from testing.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
-from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Person, Trial, trial_done, write_project
+from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Member, Person, Trial, trial_done, write_project
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
 
@@ -551,9 +554,14 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
 
 def keep_warm(installed: Installation, number: int) -> None:
     """Register the study once more, with so many warm servers."""
+    register_again(installed, warmServers=number)
+
+
+def register_again(installed: Installation, **changes: Any) -> None:
+    """Register the study once more, with changes."""
     (entry,) = installed.stored("project_master_list.json")["projects"]
     registration = {key: value for key, value in entry.items() if key not in {"salt", "version"}}
-    answer = installed.invoke("update_project_master_list", {"project": {**registration, "warmServers": number}})
+    answer = installed.invoke("update_project_master_list", {"project": {**registration, **changes}})
     assert answer.get("registered") == PROJECT, answer
 
 
@@ -589,6 +597,50 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: I
     assert name not in installed.timers()
     assert installed.stored(handover) is None
     assert "spares" not in installed.stored(pool)
+
+
+def test_a_pair_has_one_server_and_each_an_answer(installed: Installation, people: People) -> None:
+    registration = installed.stored("project_master_list.json")["projects"][0]
+    trial_of_two = {**registration["trial"], "players": {"first_0": "human", "second_0": "human"}}
+    register_again(installed, players=2, trial=trial_of_two)
+    time.sleep(FRESH.total_seconds() + 1)  # until then functions may see the project as it was
+    erin, frank = pair = [Member(people.alice.browser, f"R_{name}") for name in ("erin", "frank")]
+    for member in pair:
+        member.look()
+        member.answer(consent="yes")
+    (name, task) = until(lambda: [*installed.tasks().items()], "a server is started ahead of them")[0]
+    environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
+    session = environment["SESSION"]
+    assert environment.keys().isdisjoint({"USER_ID", "GROUP"})
+    installed.runs(task)
+    for member in pair:
+        member.answer(age="33")
+
+    until(lambda: {member.poll()["state"] for member in pair}.isdisjoint({"lobby"}), "they are matched")
+    told = [until(lambda m=member: m.is_told("ready"), "both are told where", 75) for member in pair]  # type: ignore[misc]
+    assert {one["url"] for one in told} == {f"wss://{name}.servers.{DOMAIN}:443/"}
+    assert [one["token"] for one in told] == [member_token(environment["TOKEN"], member.user) for member in pair]
+
+    trial = Trial(erin.browser, task)
+    document = trial.does("GET", f"{PROJECT}/sessions/{session}/session.json").json()
+    assert sorted(one["userId"] for one in document["members"]) == [erin.user, frank.user]
+    assert trial.asks("PUT", f"{PROJECT}/users/R_alice/answers/{GAME}.json").status_code == 403
+    assert trial.asks("PUT", f"{PROJECT}/sessions/{session}/session.json").status_code == 403
+    recording = f"{PROJECT}/sessions/{session}/trials/{name}/{GAME}-trial.jsonl.gz"
+    assert trial.does("PUT", recording, b"{}").status_code == 200
+    for member in pair:
+        key = f"{PROJECT}/users/{member.user}/answers/{GAME}.json"
+        assert trial.does("PUT", key, trial_done(7)).status_code == 200
+        member.look()
+        assert member.at == AFTER
+    until(lambda: installed.stored(server.key(label(session)))["state"] == "closed", "the server is stopped")
+    assert (installed.tasks(), installed.names()) == ({}, {})
+    assert name not in installed.timers()
+    swept = installed.invoke("sweep", {})
+    assert swept["failed"] == 0, swept
+    # What was registered for several is not registered for one: the entry itself is put back, for the tests after this.
+    listed = json.dumps({"projects": [registration]}).encode()
+    installed.world.client("s3").put_object(Bucket=installed.bucket, Key="project_master_list.json", Body=listed)
 
 
 def test_the_researcher_can_look_at_everything_of_the_study(

@@ -13,6 +13,12 @@ SERVICES = (
     "hippodrome/servers/test_causes",
     "hippodrome/test_metrics",
 )
+SESSIONS = (
+    "trial/test_session",
+    "trial/test_session_hidden",
+    "trial/test_session_flapping",
+    "trial/test_presence",
+)
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
         "hippodrome/servers/test_causes",
@@ -56,6 +62,22 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/limits/test_rules",
         "hippodrome/limits/test_limits",
         "hippodrome/servers/warm/test_warm_servers",
+    ),
+    "hippodrome/lobby/decisions.py": (
+        "hippodrome/lobby/test_rules",
+        "hippodrome/lobby/test_rules_machine",
+    ),
+    "hippodrome/lobby/rules.py": (
+        "hippodrome/lobby/test_rules",
+        "hippodrome/lobby/test_rules_machine",
+    ),
+    "hippodrome/lobby/matchmaking.py": (
+        "hippodrome/lobby/test_rules",
+        "hippodrome/lobby/test_rules_machine",
+    ),
+    "hippodrome/lobby/servers_ahead.py": (
+        "hippodrome/lobby/test_rules",
+        "hippodrome/lobby/test_rules_machine",
     ),
     "hippodrome/model/messages.py": ("hippodrome/model/test_messages", "hippodrome/participants/test_relays"),
     "hippodrome/servers/dns.py": ("hippodrome/servers/test_dns", *SERVICES),
@@ -106,6 +128,10 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_waiting",
         "hippodrome/participants/test_journey",
     ),
+    "hippodrome/model/matching.py": ("hippodrome/lobby/test_lobby", "hippodrome/config/test_sessions"),
+    "hippodrome/model/memberships.py": ("hippodrome/model/test_memberships", "hippodrome/lobby/test_lobby"),
+    "hippodrome/model/sessions.py": ("hippodrome/servers/test_sessions",),
+    "protocol/session.py": ("protocol/test_session", "hippodrome/servers/test_sessions"),
     "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo",),
     "protocol/trial.py": (
         "hippodrome/config/test_trial_section",
@@ -131,12 +157,23 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "trial/core/clients.py": ("trial/test_trial_decisions",),
     "trial/core/trial.py": ("trial/test_trial_decisions",),
     "trial/core/records.py": ("trial/test_trial_decisions",),
+    "trial/core/recording.py": ("trial/test_trial_decisions",),
+    "trial/core/alone.py": ("trial/test_trial_decisions",),
+    "trial/core/beginning.py": ("trial/test_trial_decisions",),
+    "trial/core/steps.py": ("trial/test_trial_decisions",),
+    "trial/core/ending.py": ("trial/test_trial_decisions",),
+    "trial/core/commands.py": ("trial/test_trial_decisions",),
+    "trial/core/choices.py": ("trial/test_trial_turns", "trial/test_trial_progress", "trial/test_trial_core"),
+    "trial/core/presence.py": SESSIONS,
+    "trial/core/session.py": SESSIONS,
     "trial/core/message_log.py": ("trial/test_trial_decisions",),
     "trial/core/timing.py": ("trial/test_trial_decisions", "trial/test_trial_progress", "trial/test_trial_core"),
     "trial/core/progress.py": ("trial/test_trial_progress", "trial/test_trial_core"),
     "trial/core/messages.py": ("trial/test_trial_wire", "trial/test_trial_core"),
     "trial/recordings/resume.py": ("trial/test_trial_recorded",),
     "trial/recordings/recording.py": ("trial/test_trial_disk", "trial/test_trial_recorded", "trial/test_trial_core"),
+    "trial/wire/reconnects.py": ("trial/test_reconnects",),
+    "trial/wire/round_trips.py": ("trial/test_trial_round_trips",),
     "trial/server/watchdog.py": ("trial/test_trial_wire", "trial/test_trial_core"),
 }
 

@@ -121,14 +121,13 @@ def _changes(node: ast.AST) -> Iterator[Change]:
 
 def _is_wording(node: ast.AST) -> bool:
     """Docstrings, what is logged, and what only readers and type checkers look at."""
-    if isinstance(node, ast.Assign) and ast.unparse(node).startswith(
-        ("__all__ =", f"{ast.unparse(node.targets[0])} = TypeVar(")
-    ):
-        return True
+    if isinstance(node, ast.Assign):
+        name = ast.unparse(node.targets[0])
+        return ast.unparse(node).startswith(("__all__ =", f"{name} = TypeVar(", f"{name} = Literal["))
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
     call = node.value
-    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log("))
+    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log(", "self._emit(Log("))
     return logs or isinstance(call, ast.Constant)
 
 

@@ -77,7 +77,25 @@ class Runner:
             gc.freeze()
 
     def judge(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mutant, bool]]:
-        """Each mutant, and whether its module's tests have killed it. One that hangs or eats the memory is killed too."""
+        """Each mutant, and whether its module's tests have killed it. One that hangs or eats the memory is killed too.
+
+        Raises Fails if a module's tests kill the module as it is: they would kill each of its mutants.
+        """
+        for unchanged, code in self._run_each(self._unchanged(mutants, tests), tests):
+            if code == EMPTY:
+                raise Fails(f"there is no test of {unchanged.module}")
+            if code:
+                raise Fails(f"the tests of {unchanged.module} cannot judge it: without a mutation they end with {code}")
+        for mutant, code in self._run_each(mutants, tests):
+            yield mutant, code != 0
+
+    def _unchanged(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Sequence[Mutant]:
+        """A module as it is for each selection of tests that these mutants need."""
+        modules = {tuple(tests[mutant.module]): mutant.module for mutant in mutants}
+        return [Mutant(module, 0, "", "", (self._root / module).read_text()) for module in modules.values()]
+
+    def _run_each(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mutant, int]]:
+        """Each mutant, and with which exit code its module's tests have ended."""
         with tempfile.TemporaryDirectory(prefix="mutants-") as name:
             free = [self._copy(f"{name}/{number}") for number in range(self._at_once)]
             sources = {module: (free[0] / module).read_text() for module in tests}
@@ -99,16 +117,10 @@ class Runner:
                             os.killpg(process, signal.SIGKILL)
                         _write(run.folder / run.mutant.module, sources[run.mutant.module])
                         free.append(run.folder)
-                        yield run.mutant, _killed(run.mutant, os.waitstatus_to_exitcode(status))
+                        yield run.mutant, os.waitstatus_to_exitcode(status)
 
     def _copy(self, folder: str) -> Path:
         return Path(shutil.copytree(self._root, Path(folder, "copy"), ignore=LEFT_OUT))
-
-
-def _killed(mutant: Mutant, code: int) -> bool:
-    if code == EMPTY:
-        raise Fails(f"there is no test of {mutant.module}")
-    return code != 0
 
 
 def _write(path: Path, source: str) -> None:
@@ -124,6 +136,7 @@ def _fork(folder: Path, tests: Sequence[str], seconds: float, loaded: Path | Non
     if process:
         return process
     code = 1
+    gc.freeze()  # to look for garbage in what the parent has would take seconds, and copy all of its memory
     try:
         os.setsid()
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
@@ -149,6 +162,7 @@ def _run(folder: Path, tests: Sequence[str], loaded: Path | None) -> int:
     groups = [group for group in (tests[:1], tests[1:]) if group]
     code = next((code for group in groups if (code := int(pytest.main([*options, *group])))), 0)
     if loaded:
-        new = {name for name in set(sys.modules) - before if name.partition(".")[0] not in ours}
-        loaded.write_text("\n".join(sorted(new)))
+        # In the order of their imports: asyncio is two halves if _asyncio is imported before it.
+        new = [name for name in sys.modules if name not in before and name.partition(".")[0] not in ours]
+        loaded.write_text("\n".join(new))
     return code

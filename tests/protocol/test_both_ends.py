@@ -36,7 +36,7 @@ from testing.studies import installed, study
 from trial.recordings.recorder import Recorder
 from trial.recordings.spool import Spool
 from trial.recordings.store import FolderStore
-from trial.server import warm
+from trial.server import assignment
 from trial.settings import Settings, SettingsError, trial_section
 
 ROOT = Path(__file__).parents[2]
@@ -154,7 +154,7 @@ def test_a_warm_server_reads_the_handover_that_was_written_for_it() -> None:
         assert parse(written.to_json()) == written
     env = {"PROJECT_ID": "maze", "SERVER": "s-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
     waiting = Settings.from_env({**env, "SPARE": "on", "TRIAL": "{}"})
-    own = warm.assigned(waiting, parse(Handover("P1", 3, "a-2").to_json()))
+    own = assignment.assigned(waiting, parse(Handover("P1", 3, "a-2").to_json()))
     assert own == Settings.from_env({**env, "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2", "TRIAL": "{}"})
 
 

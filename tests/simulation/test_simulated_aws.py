@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
+from datetime import timedelta
 
 import pytest
 
 from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
-from hippodrome.ports import DnsRecord, TaskRequest
+from hippodrome.ports import Conflict, DnsRecord, TaskRequest
 from lambdas import installed
 from testing.clock import EPOCH
 from testing.simulation.assumptions import assumptions
-from testing.simulation.aws_bound import aws_alone
+from testing.simulation.aws_bound import aws_alone, aws_alone_together
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from testing.simulation.people import Person
-from testing.simulation.ports import SLOW_FOR, Conditions, propagation
+from testing.simulation.ports import PAGE, SLOW_FOR, Conditions, propagation
 from testing.simulation.world import LOOPS, World
 from testing.tasks import Life
 
@@ -254,6 +255,15 @@ def test_the_bound_meets_the_same_slow_zone_and_late_addresses():
     assert 25 < mean(late) - mean(usual) < 35
 
 
+def test_the_bound_of_groups_is_that_of_their_servers_and_of_the_last_who_comes():
+    """One server for each two who are under way; a group is there when its last member is."""
+    usual = Conditions(slow_zone=0.0, late_addresses=0.0)
+    server = min(aws_alone([0.0, 0.0], 7, usual))
+    waits = aws_alone_together([0.0] * 4, [1.0, 2.0, 3.0, 500.0], 2, 7, usual)
+    assert waits == pytest.approx([server - 1.0, server - 2.0, 497.0, 0.0])
+    assert aws_alone_together([0.0] * 3, [1.0, 2.0, 3.0], 2, 7, usual) == pytest.approx(waits[:2])
+
+
 def mean(values):
     return sum(values) / len(values)
 
@@ -269,6 +279,86 @@ def test_a_change_takes_as_long_as_its_second_says():
     world.run(10)
     (begun, number), *_ = made
     assert 60 <= world.platform.dns.in_sync_at(number) - begun <= 122
+
+
+# S3
+
+
+def of_s3(act):
+    """What `act(world, documents)` returns, run as a function would."""
+    world, found = World(1), []
+    world.clock.spawn(lambda: found.append(act(world, world.platform.documents)))
+    world.run(60)
+    return found[0]
+
+
+def test_a_write_without_a_condition_takes_the_place_of_what_there_is():
+    def act(world, documents):
+        documents.create("a", b"first")
+        documents.put("a", b"second")
+        documents.put("b", b"new")
+        return [documents.get(key).body for key in "ab"], world.cloud.calls["s3:PutObject"]
+
+    assert of_s3(act) == ([b"second", b"new"], 3)
+
+
+def test_an_etag_is_of_the_content_so_a_document_that_is_as_it_was_before_is_the_same_version():
+    """S3 API Reference, "Object": an ETag is an MD5 of what was put. So compare-and-swap does not see A, B, A."""
+
+    def act(world, documents):
+        etag = documents.create("a", b"A")
+        assert documents.replace("a", b"B", etag) != etag
+        documents.put("a", b"A")
+        return documents.replace("a", b"C", etag), documents.get("a").body
+
+    assert of_s3(act)[1] == b"C"
+
+
+def test_a_version_that_was_replaced_is_no_version_any_more():
+    def act(world, documents):
+        etag = documents.create("a", b"first")
+        documents.put("a", b"second")
+        with pytest.raises(Conflict):
+            documents.replace("a", b"second", etag)
+        return world.cloud.conflicts["a"]
+
+    assert of_s3(act) == 1
+
+
+def test_a_listing_shows_every_write_and_deletion_that_was_answered_before():
+    def act(world, documents):
+        for name in ("in/b", "in/a", "in/c", "out/a"):
+            documents.put(name, b"")
+        documents.delete("in/b")
+        documents.delete("in/b")
+        return [entry.key for entry in documents.list("in/")]
+
+    assert of_s3(act) == ["in/a", "in/c"]
+
+
+def test_the_time_of_a_document_has_whole_seconds_that_are_cut():
+    def act(world, documents):
+        world.clock.sleep(7.9 - world.clock.seconds - 0.06)
+        documents.put("a", b"")
+        return next(documents.list("a")).modified, world.clock.seconds
+
+    modified, seconds = of_s3(act)
+    assert 7.8 < seconds < 8
+    assert modified == EPOCH + timedelta(seconds=7)
+
+
+def test_a_listing_is_a_call_for_every_thousand_keys_and_sees_what_is_written_between_its_pages():
+    def act(world, documents):
+        for number in range(PAGE):
+            documents.keep(f"in/{number:04d}", b"")
+        before = len(list(documents.list("in/"))), world.cloud.calls["s3:ListObjectsV2"]
+        documents.keep("in/one-more", b"")
+        found = documents.list("in/")
+        first = next(found).key
+        documents.keep("in/x-between", b"")
+        return before, first, len(list(found)), world.cloud.calls["s3:ListObjectsV2"]
+
+    assert of_s3(act) == ((1000, 1), "in/0000", 1001, 3)
 
 
 # What is printed

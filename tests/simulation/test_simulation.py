@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
 import pytest
 
 from deploy.aws.concurrency import starts
-from hippodrome.log import logger
 from hippodrome.participants import scripts
 from testing import template
-from testing.exploration import sample
 from testing.port_faults import Fault, FaultAt
 from testing.simulation import faults
 from testing.simulation.aws_bound import aws_alone
@@ -20,16 +17,9 @@ from testing.simulation.clock import GreenletClock
 from testing.simulation.people import POLLS, Person, retry_delay
 from testing.simulation.ports import Conditions
 from testing.simulation.world import TIMEOUTS, WIRES, World
+from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
 
 SEED = 7
-
-
-@pytest.fixture(autouse=True)
-def _quiet():
-    level = logger.log_level
-    logger.setLevel(logging.CRITICAL)
-    yield
-    logger.setLevel(level)
 
 
 def crowd(seed, people, seconds, conditions=None, **account):
@@ -62,19 +52,11 @@ def test_a_journey_without_faults_ends_as_it_should(journey):
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
 def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
-    points = faults.points(journey, SEED)
-    assert len(points) > 100
-    outcomes = [faults.run(journey, SEED, point)[1] for point in sample(points, 8 * len(faults.FAULTS))]
-    assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
-    bad = [outcome for outcome in outcomes if not outcome.well]
-    assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
+    assert_no_fault_does_harm(journey, SEED, tried=8 * len(faults.FAULTS))
 
 
 def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(monkeypatch):
-    """The exploration sees what it should: the same faults, without what repairs them."""
-    monkeypatch.setattr(World, "_sweep", lambda world: None)
-    monkeypatch.setattr(World, "RECEIVES", 1)
-    assert any(not outcome.well for outcome in faults.explore(faults.JOURNEYS[0], SEED))
+    assert_faults_do_harm_without_repair(faults.JOURNEYS[0], SEED, monkeypatch)
 
 
 def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():

@@ -9,9 +9,7 @@ from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.model import ids
 from hippodrome.model.messages import STOP_REASON_PREFIX
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Server, State
-from hippodrome.servers.replacement import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS
-from hippodrome.storage.repository import Repository
+from hippodrome.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, State
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 
@@ -236,13 +234,17 @@ def walk(world: World, user: str) -> None:
 
 def play(world: World, user: str, page: dict[str, object]) -> None:
     """Connect and play, if a server answers at that address."""
-    host = world.account.zone.records.get(str(page["url"]).split("/")[2].split(":")[0])
-    for task in world.tasks:
-        if task.host == host and task.last == "RUNNING" and task.alive:
-            assert task.request.environment["TOKEN"] == page["token"]
-            assert world.player(task) == user
-            world.played(task)
-            world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
+    for task in running_at(world, str(page["url"])):
+        assert task.request.environment["TOKEN"] == page["token"]
+        assert world.player(task) == user
+        world.played(task)
+        world.account.fleet.end(task, "EssentialContainerExited", "done", 0)
+
+
+def running_at(world: World, url: str) -> list[Task]:
+    """The tasks that run at this address."""
+    host = world.account.zone.records.get(url.split("/")[2].split(":", maxsplit=1)[0])
+    return [task for task in world.tasks if task.host == host and task.last == "RUNNING" and task.alive]
 
 
 def told(world: World, user: str, page: dict[str, object]) -> bool:
@@ -253,8 +255,7 @@ def told(world: World, user: str, page: dict[str, object]) -> bool:
         closed, full = not world.project.live, world.project.max_participants is not None
         return (closed and "no such study" in str(page["message"])) or (full and "full" in str(page["message"]))
     if page.get("state") in ("ended", "failed"):
-        record = Repository(world.account.documents).server_of(world.project.id, user)
+        record = world.record_of(user)
         assert record is not None
-        spent = record.attempt >= MAX_ATTEMPTS
-        return bool(page["again"]) or spent
+        return bool(page["again"]) or record.attempt >= MAX_ATTEMPTS
     return False

@@ -246,6 +246,9 @@ class Machine(RuleBasedStateMachine):
     def all_is_as_it_should_be(self) -> None:
         checks.always(self.world)
 
+    def ends_well(self) -> None:
+        checks.ends_well(self.world)
+
     def teardown(self) -> None:
         if not hasattr(self, "world"):
             return
@@ -253,7 +256,7 @@ class Machine(RuleBasedStateMachine):
             event(f"{record.state} {record.reason or ''}, attempt {record.attempt}")
         try:
             self.world.tell("nothing goes wrong any more")
-            checks.ends_well(self.world)
+            self.ends_well()
         finally:
             for invocation in [*self.world.functions.waiting]:
                 self.world.functions.kill(invocation)

@@ -6,17 +6,11 @@ time; `make hunt` plays others, and more of them. A run that fails prints its st
 
 from __future__ import annotations
 
-import logging
-import re
-from collections.abc import Callable, Iterator
-from typing import Any
-
 import pytest
 from hypothesis import Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
 from hippodrome.limits.rules import ServerSlots, server_slots_key
-from hippodrome.log import logger
 from hippodrome.model.records import from_json
 from hippodrome.model.server import State
 from hippodrome.servers import leftovers
@@ -28,6 +22,7 @@ from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
 from testing.port_faults import Fault, FaultAt
 from testing.studies import study
+from tests.stateful.mutations import Mutation, assert_seen, written_unread
 from tests.stateful.state_machine import Machine
 from tests.stateful.world import World
 
@@ -42,14 +37,6 @@ MUTATED = settings(PROFILE, max_examples=600, derandomize=True, phases=[Phase.ge
 @seed(3)
 class SeededMachine(Machine):
     """With a seed that sees every mutation within the first examples."""
-
-
-@pytest.fixture(autouse=True)
-def _quiet() -> Iterator[None]:
-    level = logger.log_level
-    logger.setLevel(logging.CRITICAL)
-    yield
-    logger.setLevel(level)
 
 
 @pytest.mark.explores
@@ -75,34 +62,29 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     assert (bob.state, bob.label in held) == (State.READY, True)
 
 
-def _written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = "") -> str:
-    return documents._write(key, body)
-
-
-# What is changed, and what the machine must say of it: another failure is not this fault seen.
-MUTATIONS: dict[str, tuple[object, str, Callable[..., Any], str]] = {
-    "a record that was written over": (
+MUTATIONS = {
+    "a record that was written over": Mutation(
         FakeDocuments,
         "replace",
-        _written_unread,
+        written_unread,
         r"its task is gone, and nobody will tell|two tasks run for|runs without a (place|timer)|is given twice|told to be",
     ),
-    "an answer that was written over": (FakeDocuments, "create", _written_unread, r"an answer changed"),
-    "a sweep that takes what is starting": (
+    "an answer that was written over": Mutation(FakeDocuments, "create", written_unread, r"an answer changed"),
+    "a sweep that takes what is starting": Mutation(
         leftovers,
         "why_left_over",
         lambda name, owner, scope, *, ours=False: owner and Why.CLOSED,
         r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
         r"|sweep: \S+ of \S+, which is (starting|naming)",
     ),
-    "a sweep that does nothing": (Sweep, "run", lambda sweep: SweepResult(), r"left behind: "),
-    "names that stay": (
+    "a sweep that does nothing": Mutation(Sweep, "run", lambda sweep: SweepResult(), r"left behind: "),
+    "names that stay": Mutation(
         Termination,
         "_delete_dns_records",
         lambda ending, going: None,
         r"there are names that were left over|left behind: .*'names'",
     ),
-    "a warm server that is taken without asking its record": (
+    "a warm server that is taken without asking its record": Mutation(
         Handovers,
         "_take_over",
         lambda giving, record: giving._repository.server(record.warm_server_label).server,
@@ -111,17 +93,6 @@ MUTATIONS: dict[str, tuple[object, str, Callable[..., Any], str]] = {
 }
 
 
-def said(error: BaseException) -> list[str]:
-    """The texts of all assertions that failed, of one example or of several."""
-    if isinstance(error, BaseExceptionGroup):
-        return [text for one in error.exceptions for text in said(one)]
-    return [str(error)] if isinstance(error, AssertionError) else []
-
-
 @pytest.mark.parametrize("what", MUTATIONS)
 def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    kind, name, mutant, sentence = MUTATIONS[what]
-    monkeypatch.setattr(kind, name, mutant)
-    with pytest.raises((AssertionError, ExceptionGroup)) as seen:
-        run_state_machine_as_test(SeededMachine, settings=MUTATED)
-    assert any(re.search(sentence, text) for text in said(seen.value)), said(seen.value)
+    assert_seen(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)

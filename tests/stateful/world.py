@@ -171,6 +171,10 @@ class World:
         found = self.account.kept.get(server.key(label))
         return from_json(found[0], Server) if found else None
 
+    def record_of(self, user: str) -> Server | None:
+        """The record of the server on which the participant plays."""
+        return self.record(ids.server_label(self.project.id, user))
+
     def owner(self, name: str) -> Server | None:
         """The record that owns this resource name: the server's own, or after a handover the participant's."""
         record = self.record((ids.parse_server_name(name) or ("", 0))[0])

@@ -280,6 +280,78 @@ def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
     ]
 
 
+def test_an_info_that_is_too_large_is_said_once_and_the_rest_of_it_is_recorded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    info = '{"small": 1, "large": "x" * 2_000_000, "last": [2]}'
+    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    with caplog.at_level(logging.WARNING, "trial"):
+        lines = [json.loads(calls.run(call).line) for call in (step, step)]
+    assert [line["info"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": [2]}] * 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "'large' in info is too large for the recording (2000002 bytes); its size is recorded instead"
+    ]
+
+
+def test_an_info_of_many_values_leaves_no_more_than_a_mark_of_what_is_too_much(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    info = "{str(number): 'x' * 100 for number in range(50_000)}"
+    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    with caplog.at_level(logging.WARNING, "trial"):
+        lines = [calls.run(call).line for call in (step, step)]
+    assert max(map(len, lines)) < 1.2 * recording.MAX_EXTRA_BYTES
+    kept = json.loads(lines[1])["info"]
+    assert json.loads(lines[0])["info"] == kept
+    assert kept["0"] == "x" * 100
+    assert len(kept) - 1 + kept["<cut off>"] == 50_000
+    assert len(caplog.records) == 20
+
+
+@pytest.mark.timeout(60)
+def test_an_info_of_fifty_megabytes_is_written_as_fast_as_another(tmp_path: Path) -> None:
+    info = '{"text": "x" * 50_000_000, "array": numpy.zeros((10, 1_000_000)), "last": 1}'
+    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    first, *others = [json.loads(calls.run(step).line)["info"] for _ in range(30)]
+    assert first["text"] == {"tooLarge": 50_000_002}
+    assert first["array"].keys() == {"tooLarge"}
+    assert first["last"] == 1
+    assert others == [first] * 29
+
+
+def test_a_small_info_after_a_large_one_is_recorded_as_ever(tmp_path: Path) -> None:
+    info = '{"a": ["x" * 2_000_000, 1][game.steps > 1], "on": {True: [1]}, "deep": deep}'
+    more = """
+class game: steps = 0
+deep = []
+for _ in range(25): deep = [deep]
+"""
+    player = started(
+        tmp_path, "return 0, 1.0, False, {}", f"game.steps += 1; return 0, 1.0, False, False, {info}", AGENT + more
+    )
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    calls = AgentCalls(player, dict, record_observations=False)
+    _, after, later = [json.loads(calls.run(step).line)["info"] for _ in range(3)]
+    assert after == later
+    assert later["on"] == {"true": [1]}
+
+
+def test_an_info_stays_as_it_is_beside_something_large(tmp_path: Path) -> None:
+    info, observation = '{"many": numpy.arange(200)}', "numpy.random.default_rng(1).bytes(3_000_000).hex()"
+    player = started(tmp_path, "return 0, 1.0, False, {}", f"return {observation}, 1.0, False, False, {info}")
+    calls = AgentCalls(player, dict, record_observations=True)
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    line = json.loads(calls.run(step).line)
+    assert line["info"] == {"many": list(range(200))}
+    assert len(line["observation"]) == 6_000_000
+
+
 def test_a_circle_in_the_dict_ends_somewhere(tmp_path: Path) -> None:
     returned = '(lambda c: c.update(me=c) or {"done": False, "circle": c})({})'
     assert "circle" in line_of(tmp_path, returned)["extra"]

@@ -15,13 +15,15 @@ from trial.agent.agent import AgentAdapter
 from trial.agent.callbacks import MOST_VALUES, NAMES, About, Callbacks, Session, listening
 from trial.recordings import recording
 
+ABOUT = About("trial-1", "3", 1)
 
-def made(agent, seconds=5.0, **more):
+
+def made(agent, seconds=5.0, about=ABOUT, **more):
     """The callbacks of an agent, and a list of what raised."""
     raised = []
     callbacks = Callbacks(
         listening(agent),
-        About("trial-1", "3", 1),
+        about,
         lambda: "the environment",
         seconds=seconds,
         stamp=dict,
@@ -109,6 +111,23 @@ def test_what_they_return_and_record_becomes_lines():
     callbacks.close()
 
 
+def test_the_lines_of_later_calls_stay_behind_until_their_turn():
+    """The agent's thread may be at the next step when the event loop writes the lines of the last one."""
+
+    class Agent:
+        def on_tick(self, session):
+            session.record("t", session.ticks)
+
+    callbacks, _ = made(Agent())
+    callbacks.episode_began(1, {}, {})
+    callbacks.stepped(*[{"player_0": 0}] * 4)
+    recorded = callbacks.recorded
+    callbacks.stepped(*[{"player_0": 0}] * 4)
+    values = [[json.loads(line)["value"] for line in callbacks.take(*until)] for until in ([recorded], [recorded], [])]
+    assert values == [[1], [], [2]]
+    callbacks.close()
+
+
 def test_what_a_callback_changes_of_its_session_changes_no_record():
     class Agent:
         def on_tick(self, session):
@@ -144,11 +163,36 @@ def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
     callbacks.fed_back("player_0", "good")
     for name in ("on_join", "on_leave", "on_return"):
         callbacks.player_moved(name, "player_0")
-    assert [(line["name"], line["value"]) for line in lines(callbacks)] == [
+    found = lines(callbacks)
+    assert [(line["name"], line["value"]) for line in found] == [
         ("on_feedback", ["player_0", "good"]),
         ("on_join", "player_0"),
         ("on_leave", "player_0"),
         ("on_return", "player_0"),
+    ]
+    assert not [line for line in found if "player" in line]
+    callbacks.close()
+
+
+def test_where_several_take_part_a_line_says_who_did_what_it_is_about():
+    class Agent:
+        def on_feedback(self, session, player, word):
+            session.record("heard", word)
+            raise ValueError(word)
+
+        on_join = on_leave = lambda self, session, player: None
+
+        def on_tick(self, session):
+            return "tick"
+
+    callbacks, _ = made(Agent(), about=About("t-1", "3", players=("left", "right"), humans=("left", "right")))
+    callbacks.fed_back("right", "good")
+    callbacks.stepped({}, {}, {}, {})
+    found = [(line["callback"], line["name"], line.get("player")) for line in lines(callbacks)]
+    assert found == [
+        ("on_feedback", "heard", "right"),
+        ("on_feedback", "on_feedback", "right"),
+        ("on_tick", "on_tick", None),
     ]
     callbacks.close()
 
@@ -187,7 +231,7 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
                 go.wait(20)
             return session.ticks
 
-    callbacks, _ = made(Agent(), seconds=0.05, late=came.set)
+    callbacks, _ = made(Agent(), seconds=0.05, late=lambda recorded: came.set())
     callbacks.episode_began(1, {}, {})
     with caplog.at_level(logging.WARNING, "trial"):
         began = time.monotonic()
@@ -281,7 +325,7 @@ def values(found):
 
 
 def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
-    server = launch(grid(30) + CALLBACKS, TRIAL)
+    server = launch(grid(30) + CALLBACKS, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
 
     async def journey():
         async with open_client(server.address) as client:

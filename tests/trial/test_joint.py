@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.joint import Joint, JointAdapter
+from trial.agent.joint_calls import snapshot
 from trial.agent.starting import start
 
 PONG = "pettingzoo.butterfly.cooperative_pong_v6"
@@ -476,3 +477,14 @@ def test_whatever_step_returns_is_read_or_refused_with_a_sentence(results: list[
         assert all(len(mask) == 2 and any(mask) for mask in now.masks.values())
         assert now.over == all(now.terminated[name] or now.truncated[name] for name in ("0", "1"))
         assert not (now.over and now.to_act)
+
+
+def test_what_a_policy_acted_upon_is_kept_as_it_was_unless_it_holds_itself() -> None:
+    seen = {"grid": np.zeros(2), "order": (1, [2])}
+    kept = snapshot(seen)
+    seen["grid"][0] = 5
+    assert kept["grid"].tolist() == [0, 0]
+    assert kept["order"] == (1, [2])
+    loop: dict[str, Any] = {}
+    loop["in"] = loop
+    assert snapshot(loop) is loop

@@ -10,7 +10,7 @@ import pytest
 
 from protocol import trial, trial_check
 from trial.core import messages
-from trial.core.message_log import MessageLog
+from trial.core.message_log import MessageLog, Word
 from trial.core.messages import BadMessage
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
@@ -91,12 +91,12 @@ def test_words_are_heard_and_repeated_like_other_feedback() -> None:
     log = MessageLog()
     for command in ("wait", "start", "good"):
         log.add(messages.parse(json.dumps({"command": command}), ("wait",)), 1)
-    assert log.feedback == ("wait", "good")
+    assert log.feedback == (Word("wait"), Word("good"))
     recorded = RecordedTrial()
     step = {"kind": "step", "episode": 1, "human": 0, "action": 0, "reward": 1.0, "messages": log.messages}
     add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 3}, step])
     assert recorded.unfinished is not None
-    assert recorded.unfinished.steps[0].feedback == ("wait", "good")
+    assert recorded.unfinished.steps[0].feedback == (Word("wait"), Word("good"))
 
 
 # ---- a real server

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from onnx import TensorProto, helper
 
 from protocol.players import ONNXRUNTIME
@@ -298,6 +298,56 @@ def test_observations_of_another_size(tmp_path: Path) -> None:
         "p.onnx takes observations of 2 numbers (its input 'obs'); the environment gives 16 numbers"
     )
     assert refusal("p.onnx", tmp_path, space=Box(0, 255, (84, 84, 3), np.uint8)).endswith("gives 84 x 84 x 3")
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("space", "given"),
+    [
+        (Discrete(10**12), "one number"),
+        (Dict(a=Discrete(10**12), b=Discrete(2)), "2 numbers"),
+        (MultiDiscrete([10**12, 2, 2]), "3 numbers"),
+    ],
+)
+def test_a_one_hot_observation_that_is_far_too_large_is_not_made(tmp_path: Path, space: Any, given: str) -> None:
+    onnx_files.linear(tmp_path / "p.onnx", np.ones((12, 3)))
+    said = refusal("p.onnx", tmp_path, space=space)
+    assert said == f"p.onnx takes observations of 12 numbers (its input 'obs'); the environment gives {given}"
+
+
+@pytest.mark.timeout(60)
+def test_several_discrete_numbers_are_one_hot_one_after_the_other(tmp_path: Path) -> None:
+    weights = np.zeros((1_000_003, 3))
+    weights[999_999, 2] = weights[1_000_001, 1] = 1
+    onnx_files.linear(tmp_path / "p.onnx", weights)
+    policy = made("p.onnx", tmp_path, space=MultiDiscrete([1_000_000, 3]))
+    assert policy.act(np.array([999_999, 0]), {}, None) == 2
+    assert policy.act(np.array([0, 1]), {}, None) == 1
+
+
+def test_an_observation_that_needs_more_memory_than_there_is(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "p.onnx", np.ones((12, 3)))
+    endless = types.SimpleNamespace(shape=(10**15,), dtype=np.float32)
+    assert refusal("p.onnx", tmp_path, space=endless) == (
+        "p.onnx cannot be tried: an observation of the environment needs more memory"
+    )
+
+
+def test_an_observation_that_holds_itself_is_a_sentence(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
+    loop: dict[str, Any] = {}
+    loop["in"] = loop
+    with pytest.raises(PolicyError, match=r"^p\.onnx takes no observation that holds itself$"):
+        made("p.onnx", tmp_path).act(loop, {}, None)
+
+
+def test_an_observation_that_is_no_numbers_is_a_sentence(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
+    around: list[Any] = []
+    around.append(around)
+    for seen in ({"in": around}, {"in": "left"}, {"in": object()}):
+        with pytest.raises(PolicyError, match=r"^p\.onnx takes an observation of numbers, and this is none: "):
+            made("p.onnx", tmp_path).act(seen, {}, None)
 
 
 def test_a_file_of_a_fixed_batch_says_how_to_export_it(tmp_path: Path) -> None:

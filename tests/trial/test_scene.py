@@ -11,7 +11,8 @@ import pytest
 
 from trial.pictures.frames import FrameError
 from trial.pictures.picture import as_picture
-from trial.pictures.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, as_scene, images_of
+from trial.pictures.scene import MOST_OBJECTS, MOST_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
+from trial.pictures.scene_object import MOST_POINTS
 
 BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}
 
@@ -118,6 +119,16 @@ def test_permanent_objects_do_not_pile_up_without_end() -> None:
     assert as_scene([{"id": "0-0", "remove": True}, BALL], scene).objects.keys() >= {"ball"}, "there is room again"
 
 
+def test_an_object_for_which_there_was_no_room_is_drawn_once_there_is() -> None:
+    drops = [BALL | {"id": str(index), "permanent": True} for index in range(MOST_OBJECTS - 1)]
+    full = as_scene([*drops, BALL])
+    crowded = as_scene([BALL | {"id": "last", "permanent": True}, BALL], full)
+    assert "ball" not in crowded.objects
+    scene = as_scene([{"id": "0", "remove": True}, BALL], crowded)
+    assert "ball" in scene.objects
+    assert scene.problems == ()
+
+
 def test_points_of_permanent_objects_do_not_pile_up_without_end() -> None:
     path = {"type": "line", "points": [(0, 0)] * (MOST_POINTS - 1), "color": "red", "permanent": True}
     scene: Scene | None = None
@@ -134,6 +145,12 @@ def test_a_permanent_object_can_be_changed_and_removed() -> None:
     changed = as_scene([BALL | {"permanent": True, "x": 1}], first)
     assert (changed.objects["ball"]["x"], changed.problems) == (1, ())
     assert not as_scene([{"id": "ball", "remove": True}], changed).objects
+
+
+def test_a_permanent_object_that_is_removed_and_comes_again_in_one_picture_stays() -> None:
+    ball = BALL | {"permanent": True}
+    again = as_scene([{"id": "ball", "remove": True}, ball], as_scene([ball]))
+    assert again.permanent == {"ball"}
 
 
 def test_an_object_that_did_not_change_is_the_same_one() -> None:
@@ -271,6 +288,50 @@ def test_all_points_of_a_scene_are_bounded() -> None:
     scene = as_scene(lines)
     assert len(scene.objects) == 4
     assert scene.problems == ("the scene has more than 20000 points; some objects are left out",)
+
+
+def texts(count: int, letter: str = "x", length: int = 1_000, **more: Any) -> list[dict[str, Any]]:
+    return [{"id": f"t{n}", "type": "text", "x": 0.5, "y": 0.5, "text": letter * length, **more} for n in range(count)]
+
+
+TOO_MUCH_TEXT = ("the scene's texts have more than 100000 characters; some are left out",)
+
+
+def test_a_scene_has_so_many_characters_in_all_and_goes_on_without_the_others() -> None:
+    most = MOST_TEXT_IN_ALL // 1_000
+    scene = as_scene([*texts(2_000 - 1), BALL])
+    assert list(scene.objects) == [*(f"t{n}" for n in range(most)), "ball"]
+    assert scene.problems == TOO_MUCH_TEXT
+    again = as_scene([*texts(2_000 - 1), BALL], scene)
+    assert (again.objects, again.problems) == (scene.objects, TOO_MUCH_TEXT)
+    other = as_scene([*texts(2_000 - 1, "y"), BALL], again)
+    assert list(other.objects) == list(scene.objects)
+    assert other.objects["t0"]["text"] == "y" * 1_000
+
+
+def test_texts_that_change_all_the_time_are_not_too_many() -> None:
+    scene = as_scene(texts(90))
+    for letter in "yzabcdefgh":
+        scene = as_scene(texts(90, letter), scene)
+        assert (len(scene.objects), scene.problems) == (90, ())
+    fewer = as_scene(texts(10), scene)
+    assert as_scene([*texts(100), BALL], fewer).problems == ()
+
+
+def test_texts_that_grow_are_too_many_at_last() -> None:
+    scene = as_scene(texts(150, length=10))
+    assert scene.problems == ()
+    grown = as_scene(texts(150, "y"), scene)
+    assert (len(grown.objects), grown.problems) == (100, TOO_MUCH_TEXT)
+
+
+def test_texts_that_stay_count_too() -> None:
+    scene = as_scene(texts(90, permanent=True))
+    shown = as_scene([{**each, "id": f"more {each['id']}"} for each in texts(20)], scene)
+    assert len(shown.objects) == 100
+    assert shown.permanent == scene.permanent
+    assert shown.problems == TOO_MUCH_TEXT
+    assert len(as_scene([], shown).objects) == 90
 
 
 @pytest.mark.parametrize(

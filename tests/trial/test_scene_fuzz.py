@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import random
 from typing import Any
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.trial import Scene as SceneSection
+from protocol.trial_sections import Scene as SceneSection
+from testing.exploration import examples
 from trial.pictures.assets import Assets
 from trial.pictures.raster import Raster
-from trial.pictures.scene import TYPES, Scene, SceneError, as_scene
+from trial.pictures.scene import Scene, SceneError, as_scene, images_of
 from trial.pictures.scene_encoder import SceneDecoder, SceneEncoder
+from trial.pictures.scene_object import TYPES
 
 RASTER = Raster(SceneSection(width=40, height=30), Assets())
 
@@ -64,3 +67,46 @@ def test_whatever_render_returns_is_a_scene_or_an_error_with_a_sentence(pictures
         decoder.decode(encoder.encode(scene, number))
         assert RASTER.draw(scene).shape == (30, 40, 3)
         before = scene
+
+
+_SPRITE = {"type": "sprite", "x": 0.5, "y": 0, "image": "a"}
+_CIRCLE = {"type": "circle", "x": 0.5, "y": 0, "radius": 2, "color": "#ffffff", "depth": 1}
+_TEXT = {"type": "text", "x": 0.5, "y": 0, "text": "1", "tween": 30}
+_ODDER = {"type": "circle", "x": 0.5, "y": 0, "radius": 2, "alpha": 0.5, "opacity": 0.25}
+_VALUES = {
+    **{key: [0, 0.5, 0.25, "left", float("nan"), None] for key in ("x", "y", "alpha", "opacity", "depth", "tween")},
+    **{"color": ["#ffffff", "#000000", "no"], "text": ["1", 1, 2, ""], "image": ["a", "b.png"], "radius": [2, [2]]},
+    **{"id": ["a", "b", 3], "type": ["circle", "sprite"], "points": [[(0, 0), (1, 1)]]},
+}
+
+
+def test_without_permanent_objects_the_scene_before_makes_no_difference() -> None:
+    for seed in range(examples(200)):
+        _play(random.Random(seed))
+
+
+def _play(chance: random.Random) -> None:
+    """Show three objects, of which one field after the other gets another value."""
+    kinds = (_SPRITE, _CIRCLE, _TEXT, _ODDER)
+    objects: list[dict[str, Any]] = [{"id": name, **chance.choice(kinds)} for name in "abc"]
+    before = None
+    encoder, decoder = SceneEncoder(), SceneDecoder()
+    for number in range(30):
+        changed = dict(chance.choice(objects))
+        key = chance.choice([*changed] if chance.random() < 0.9 else [*_VALUES])
+        changed[key] = chance.choice(_VALUES[key])
+        picture = [changed if each["id"] == changed["id"] else dict(each) for each in objects]
+        scene, alone = as_scene(picture, before), as_scene(picture)
+        assert _written(scene.objects) == _written(alone.objects)
+        assert (sorted(scene.problems), images_of(scene)) == (sorted(alone.problems), images_of(alone))
+        decoder.decode(encoder.encode(scene, number))
+        assert decoder.objects == scene.objects
+        assert list(decoder.objects) == list(scene.objects)
+        before = scene
+        if not scene.problems:
+            objects = picture
+
+
+def _written(objects: Any) -> str:
+    """Also the order of the objects and of their fields is what it is."""
+    return json.dumps({name: dict(each) for name, each in objects.items()})

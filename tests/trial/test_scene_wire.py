@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trial.pictures import scene_encoder
 from trial.pictures.scene import Scene, as_scene
 from trial.pictures.scene_encoder import HEADER, PACKED_SCENE, SCENE, SceneDecoder, SceneEncoder, changes
 
@@ -84,3 +86,24 @@ def test_a_client_has_each_scene_after_its_message(given_scenes: list[tuple[list
         assert list(decoder.objects.items()) == list(scene.objects.items())
         assert decoder.hud == hud
         before = scene
+
+
+def test_two_who_are_shown_the_same_get_the_same_bytes_and_one_who_was_shown_something_else_gets_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    packed: list[Scene] = []
+
+    def counted(before: Scene | None, scene: Scene) -> dict[str, Any]:
+        packed.append(scene)
+        return changes(before, scene)
+
+    monkeypatch.setattr(scene_encoder, "changes", counted)
+    one, other, late = SceneEncoder(), SceneEncoder(), SceneEncoder()
+    first, second = as_scene([BALL]), as_scene([{**BALL, "x": 0.25}])
+    assert one.encode(first, 1) == other.encode(first, 1)
+    assert len(packed) == 1
+    seconds = one.encode(second, 2), late.encode(second, 2), other.encode(second, 2)
+    assert seconds[0] == seconds[2] != seconds[1]
+    decoder = SceneDecoder()
+    decoder.decode(seconds[1])
+    assert decoder.objects["ball"]["x"] == 0.25

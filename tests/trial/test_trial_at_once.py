@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.frames import Frame as RawFrame
+from websockets.frames import Opcode
 from websockets.typing import Subprotocol
 
 from trial.pictures.frames import Decoder, Frame
@@ -86,6 +89,9 @@ def test_a_message_of_the_same_event_goes_first() -> None:
 
 def test_of_pictures_for_a_socket_that_is_full_the_newest_is_sent() -> None:
     async def talk(connection: Connection, client: Any) -> None:
+        for end, option in ((connection.websocket, socket.SO_SNDBUF), (client, socket.SO_RCVBUF)):
+            # The kernel's own limits differ: some machines take 50 MB before a socket is full.
+            end.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, 1 << 16)
         noise = np.random.default_rng(7)
         for number in range(1, 200):  # the client reads none of them
             connection.put_picture(noise.integers(0, 256, (300, 400, 3), np.uint8), number)
@@ -124,6 +130,89 @@ def test_an_acknowledgement_is_heard_as_it_comes_and_the_rest_is_left() -> None:
         left = [json.loads(await connection.websocket.recv()) for _ in others]
         assert left == others
         assert connection.window.acknowledging
+
+    talked(talk)
+
+
+def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes:
+    """A message of a client, or a part of one, as it comes from the network."""
+    return RawFrame(opcode, said.encode(), fin=last).serialize(mask=True)
+
+
+def test_acknowledgements_are_heard_however_the_network_cuts_them() -> None:
+    said = [text('{"ack": 1}'), text('{"ack": 2}'), text("other"), text('{"ack": 3}')]
+    whole = b"".join(said)
+
+    async def talk(connection: Connection, _: Any) -> None:
+        heard: list[int] = []
+        connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
+        connection.hear_acknowledgements(Inbound(connection.window))
+        connection.window.sent(3, 0.0)
+        for cut in range(len(whole)):
+            for part in (whole[:cut], whole[cut:]):
+                if part:
+                    connection.websocket.data_received(part)
+            assert heard == [1, 2, 3], f"cut after {cut} bytes"
+            assert await connection.websocket.recv() == "other"
+            heard.clear()
+        for part in said:
+            connection.websocket.data_received(part)
+        assert (heard, await connection.websocket.recv()) == ([1, 2, 3], "other")
+
+    talked(talk)
+
+
+@pytest.mark.parametrize(
+    ("before", "code"),
+    [
+        (text("be", last=False), 1002),  # RFC 6455, 5.4: parts of different messages must not be mixed
+        (RawFrame(Opcode.CLOSE, b"\x03\xe8").serialize(mask=True), 1000),
+    ],
+    ids=["within a message of several parts", "after the close"],  # masks are random
+)
+def test_what_comes_where_no_message_may_come_is_not_heard(before: bytes, code: int) -> None:
+    async def talk(connection: Connection, client: Any) -> None:
+        heard: list[int] = []
+        connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
+        connection.hear_acknowledgements(Inbound(connection.window))
+        connection.window.sent(1, 0.0)
+        connection.websocket.data_received(before)
+        connection.websocket.data_received(text('{"ack": 1}'))
+        assert heard == []
+        await client.wait_closed()
+        assert client.close_code == code
+
+    talked(talk)
+
+
+def test_what_looks_like_an_acknowledgement_within_another_message_is_not_heard() -> None:
+    inner = text('{"ack": 1}')
+    header = bytes((0x82, 0x80 | len(inner), 0, 0, 0, 0))  # binary, masked by zeros
+
+    async def talk(connection: Connection, _: Any) -> None:
+        heard: list[int] = []
+        connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
+        connection.hear_acknowledgements(Inbound(connection.window))
+        connection.window.sent(1, 0.0)
+        for cut in range(1, len(header) + 1):
+            for part in (header[:cut], header[cut:], inner):
+                if part:
+                    connection.websocket.data_received(part)
+            assert (heard, await connection.websocket.recv()) == ([], inner)
+
+    talked(talk)
+
+
+def test_messages_of_all_lengths_are_sent() -> None:
+    async def talk(connection: Connection, client: Any) -> None:
+        socket = connection.websocket
+        assert isinstance(socket, PlayerSocket)
+        for length in (0, 1, 125, 126, 65_535, 65_536, 200_000):
+            data = bytes(number % 251 for number in range(length))
+            while not socket.free:
+                await asyncio.sleep(0)
+            socket.send_now(data)
+            assert await client.recv() == data
 
     talked(talk)
 

@@ -6,8 +6,9 @@ from itertools import groupby
 
 import pytest
 
+from trial.core.ended import Break, Episode
 from trial.core.players import PLAYER, alone
-from trial.core.progress import Break, Episode, PlayState, Progress
+from trial.core.progress import PlayState, Progress
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
 from trial.settings import trial_section

@@ -15,9 +15,11 @@ from testing.exploration import examples
 from trial.agent.agent import AgentError, read_step_result
 from trial.core import messages
 from trial.core.controls import Controls
+from trial.core.ended import Break, Episode
 from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.messages import CommandRefused
 from trial.core.players import PLAYER, alone
-from trial.core.progress import Break, CommandRefused, Episode, PlayState, Progress
+from trial.core.progress import PlayState, Progress
 from trial.core.timing import Pacer
 from trial.pictures.frames import Decoder
 from trial.recordings import recording

@@ -31,9 +31,10 @@ from trial.core.effects import (
     StepTaken,
     WriteLine,
 )
+from trial.core.ended import Episode
 from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
-from trial.core.progress import Episode
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
@@ -311,7 +312,7 @@ def test_feedback_goes_to_the_agent_with_the_next_step_once():
     driver.say(command="good")
     driver.step()
     driver.wait(0.1)
-    assert driver.call.feedback == ("good",)
+    assert driver.call.feedback == (Word("good"),)
     driver.step()
     driver.wait(0.1)
     assert driver.call.feedback == ()
@@ -392,7 +393,7 @@ def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
     driver.say(command="good")  # the step is under way
     driver.step(terminated=True)
     assert isinstance(driver.call, FeedbackCall)
-    assert driver.call.feedback == ("good",)
+    assert driver.call.feedback == (Word("good"),)
     assert driver.records("end") == []
     driver.returns()
     (end,) = driver.records("end")
@@ -452,7 +453,7 @@ def test_feedback_that_the_agent_has_heard_is_not_told_again_after_an_error():
     driver.call.heard = 1
     driver.fails(ValueError("of the first word"))
     assert isinstance(driver.call, FeedbackCall)
-    assert driver.call.feedback == ("bad",)
+    assert driver.call.feedback == (Word("bad"),)
 
 
 # ---- an earlier server
@@ -467,14 +468,14 @@ STEPS = [RecordedStep(1, 1, 1.0), RecordedStep(None, 0, 0.5)]
 
 
 def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
-    driver = Driver().begin(recorded(STEPS, unheard=["good"]))
+    driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
     assert isinstance(driver.call, ReplayCall)
     assert driver.call.unfinished.seed == 11
     driver.returns(Replayed(FRAME))
     assert driver.records("resume") == [{"episode": 2, "steps": 2}]
     driver.connect()
     driver.say(command="start")
-    assert driver.call.feedback == ("good",), "the earlier agent did not hear it"
+    assert driver.call.feedback == (Word("good"),), "the earlier agent did not hear it"
     assert driver.call.fields["step"] == 3
     assert driver.trial.progress.score == 4.5
 

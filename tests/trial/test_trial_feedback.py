@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from trial.core.message_log import Word
 from trial.core.unfinished import RecordedTrial
 from trial.recordings import recording
 from trial.recordings.resume import add_lines
@@ -227,8 +228,8 @@ def test_the_past_keeps_what_nobody_heard():
 
     happen("reset", seed=7)
     happen("end", why="shutdown", messages=[{"command": "good"}, {"command": "pause"}])
-    assert past.unfinished.unheard == ["good"]
+    assert past.unfinished.unheard == [Word("good")]
     happen("resume", steps=0)
-    assert past.unfinished.unheard == ["good"]
+    assert past.unfinished.unheard == [Word("good")]
     happen("step", human=None, action=0, reward=1.0)
     assert past.unfinished.unheard == []

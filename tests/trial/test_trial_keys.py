@@ -11,8 +11,8 @@ from tests.trial.test_trial_decisions import Driver
 from trial.core import messages
 from trial.core.controls import KEY, PRESSES, Controls
 from trial.core.effects import RecordLine, SendMessage, SendState, StepCall
+from trial.core.ended import Episode
 from trial.core.episode_time import EpisodeTime
-from trial.core.progress import Episode
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
 
@@ -259,6 +259,17 @@ def test_an_episode_is_truncated_after_its_seconds_of_play_and_pauses_do_not_cou
         (12, "truncated", "episodeSeconds")
     ]
     assert driver.trial.progress.episode == 2
+
+
+@pytest.mark.parametrize("between", [0, 5])
+def test_the_next_episode_begins_with_all_its_time(between):
+    driver = Driver(episodeSeconds=1, startingFrameRate=10, maxEpisodes=2, betweenEpisodes=between).playing()
+    played(driver, 10)
+    driver.step()
+    driver.wait(between)
+    driver.reset()
+    said = state(driver)
+    assert (said["state"], said["episode"], said["timeLeft"]) == ("playing", 2, 1)
 
 
 def test_an_end_of_the_environments_own_at_the_limit_is_not_the_limits():

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from protocol.trial import Ui, keys
+from protocol.trial_keys import keys
+from protocol.trial_sections import Ui
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
@@ -57,7 +58,9 @@ def test_plays_from_hello_to_answer(launch, open_client, grid):
     assert "P1" not in server.said()
 
 
-def test_recording_says_what_happened(launch, open_client, grid):
+def test_recording_says_what_happened(launch, open_client, grid, tmp_path):
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent/requirements.txt").write_text("pillow\n")
     server = launch(grid(None), {"ui": UI, "recordObservations": True, "startingFrameRate": 40})
 
     async def play():
@@ -80,7 +83,7 @@ def test_recording_says_what_happened(launch, open_client, grid):
     assert header["kind"] == "header"
     assert (header["project"], header["user"], header["server"], header["step"]) == ("study", "P1", "a1", "3")
     assert header["actionSpace"][3] == "left"
-    assert header["versions"]["trial"]
+    assert {"trial", "pillow"} <= header["versions"].keys()
     assert reset["kind"] == "reset"
     assert reset["seed"] == header["seed"]
     assert isinstance(reset["info"]["start"], int)

@@ -15,7 +15,7 @@ from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason
 from hippodrome.storage.secret import SecretCache
 from protocol.handover import Handover
-from protocol.keys import handover_key
+from protocol.keys import handover_key, waiting_key
 from testing.strict_s3 import StrictS3
 from testing.studies import study
 from trial.recordings import presigned, recording
@@ -37,12 +37,27 @@ class Town(StrictS3):
 
     def start(self, user=USER, attempt=1, before=None, **change):
         """Write the record of a server that starts; what it is told."""
-        token = f"token-{user}-{attempt}"
-        project = study(id="study")
-        made = server.new_attempt(
-            project, user, attempt, token=token, nonce=f"nonce-{attempt}", settings=self.settings, now=self.now()
-        )
+        made = self._new(user, attempt, token=f"token-{user}-{attempt}", nonce=f"nonce-{attempt}")
         return self.keep(server.replacing(before, made) if before else made, **change)
+
+    def start_warm(self, token):
+        """Write the record of a warm server, which is ready."""
+        owner = "~" + "0" * 20
+        return self.keep(server.ready(self._new(owner, token=token, nonce="n"), self.now()))
+
+    def hand_over(self, warm, user):
+        """Assign the warm server to the participant or session, as `start_server` does; the server's new name."""
+        label = ids.server_label("study", user)
+        self.keep(server.handed_over(warm, label, self.now()))
+        mine = server.reserving(self._new(user, token="t", nonce="m"), warm)
+        self.keep(server.assigned(mine, warm, self.now()))
+        own = ids.server_name(label, 1)
+        with self.lock:
+            self.documents.put(handover_key("study", warm.name), Handover(user, None, own).to_json())
+        return own
+
+    def _new(self, user, attempt=1, **secrets):
+        return server.new_attempt(study(id="study"), user, attempt, settings=self.settings, now=self.now(), **secrets)
 
     def keep(self, record):
         with self.lock:
@@ -160,25 +175,10 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
 
 
 def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
-    warm_server = town.keep(
-        server.new_attempt(
-            study(id="study"), "~" + "0" * 20, 1,
-            token="the-secret-token", nonce="n", settings=town.settings, now=town.now(),
-        )
-    )  # fmt: skip
-    ready = server.ready(warm_server, town.now())
-    town.keep(ready)
+    warm_server = town.start_warm("the-secret-token")
     running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(warm_server))
     time.sleep(0.5)
-    town.keep(server.handed_over(ready, LABEL, town.now()))
-    mine = server.reserving(
-        server.new_attempt(study(id="study"), USER, 1, token="t", nonce="m", settings=town.settings, now=town.now()),
-        ready,
-    )
-    town.keep(server.assigned(mine, ready, town.now()))
-    own = ids.server_name(LABEL, 1)
-    with town.lock:
-        town.documents.put(handover_key("study", warm_server.name), Handover(USER, None, own).to_json())
+    own = town.hand_over(warm_server, USER)
     played(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None
@@ -270,3 +270,23 @@ def test_of_two_servers_that_store_the_same_answer_one_wins(town):
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
     assert sorted(won) == [False] * 5 + [True]
+
+
+def test_a_presigned_request_is_used_again_until_it_is_refused(town):
+    """What is read every two seconds is not signed every two seconds."""
+    project = study(id="study", players=2, matching="match")
+    record = town.keep(
+        server.new_attempt(project, "s." + "0" * 20, 1, token="t", nonce="n", settings=town.settings, now=town.now())
+    )
+    store, key = town.store(record), waiting_key("study")
+    assert [store.look(key), store.look(key)] == [None, None]
+    town.documents.put(key, b"{}")
+    assert store.look(key) == b"{}"
+    assert [path for _, path, _ in town.seen].count("/sign") == 1
+    town.failing = [403]  # it has expired
+    assert store.look(key) == b"{}"
+    assert [path for _, path, _ in town.seen].count("/sign") == 2
+    town.failing = [403, 403]
+    with pytest.raises(StoreError):
+        store.look(key)
+    assert store.look(key) == b"{}"

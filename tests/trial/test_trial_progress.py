@@ -4,8 +4,10 @@ import pytest
 
 from trial.core.actions import Action
 from trial.core.controls import Controls
+from trial.core.ended import Episode
+from trial.core.messages import CommandRefused
 from trial.core.players import PLAYER, alone
-from trial.core.progress import CommandRefused, Episode, PlayState, Progress
+from trial.core.progress import PlayState, Progress
 from trial.core.timing import Pacer
 from trial.settings import trial_section
 

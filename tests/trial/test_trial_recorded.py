@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from trial.core.progress import Episode
+from trial.core.ended import Episode
+from trial.core.message_log import Word
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.recordings import recording
 from trial.recordings.resume import add_lines, load_recorded
@@ -78,8 +79,8 @@ def test_a_reset_begins_the_episode_anew():
 def test_feedback_is_kept_with_the_step_that_heard_it():
     said = [{"command": "good"}, {"command": "start"}, {"action": "up"}, {"command": "bad"}]
     past = folded(reset(), step(messages=said), end("shutdown", messages=said[:1]))
-    assert past.unfinished.steps == [RecordedStep(None, 2, 1.0, ("good", "bad"))]
-    assert past.unfinished.unheard == ["good"]
+    assert past.unfinished.steps == [RecordedStep(None, 2, 1.0, (Word("good"), Word("bad")))]
+    assert past.unfinished.unheard == [Word("good")]
     assert folded(step(), past=past).unfinished.unheard == [], "the next step's agent has heard it"
 
 
@@ -308,6 +309,20 @@ def test_an_observation_is_kept_with_its_shape():
     assert (kept["a"][0]["dtype"], kept["a"][0]["shape"]) == ("int16", [3, 2])
     assert np.array_equal(recording.read_observation(kept["a"][0]), array)
     assert (kept["a"][1], kept["b"]) == ("x", ["['y']"])
+
+
+def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_the_head(tmp_path, monkeypatch):
+    (tmp_path / "requirements.txt").write_text(
+        "# games\npillow>=9 # pictures\n  PyYAML ; python_version > '3'\n-r other.txt\nno-such-package-there-is==1\n"
+        "git+https://example.org/x\n"
+    )
+    names = recording.packages(tmp_path)
+    assert names == ("pillow", "PyYAML", "no-such-package-there-is", "git")
+    found = recording.versions(names)
+    assert found.keys() - recording.versions().keys() == {"pillow", "PyYAML"}
+    (tmp_path / "image").mkdir()
+    monkeypatch.setattr(recording, "REQUIRED", tmp_path / "requirements.txt")
+    assert recording.packages(tmp_path / "image") == names
 
 
 def test_the_versions_of_what_plays_are_told():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trial.core.message_log import Word
 from trial.core.unfinished import RecordedTrial
 from trial.recordings import recording
 from trial.recordings.resume import add_lines, load_recorded
@@ -202,7 +203,7 @@ def test_feedback_is_part_of_the_past():
     add_lines(past, [json.loads(recording.line("reset", episode=1, seed=7))])
     line = recording.line("step", episode=1, human=2, action=2, reward=1.0, messages=said)
     add_lines(past, [json.loads(line)])
-    assert past.unfinished.steps[0].feedback == ("good",)
+    assert past.unfinished.steps[0].feedback == (Word("good"),)
 
 
 def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():

@@ -30,9 +30,9 @@ from trial.core.effects import (
     StepTaken,
 )
 from trial.core.flow_control import Window
+from trial.core.messages import CommandRefused
 from trial.core.players import Player, PlayersError, View, who_plays
 from trial.core.policies import AskPolicy
-from trial.core.progress import CommandRefused
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings, trial_section
@@ -345,6 +345,61 @@ def test_a_policys_last_action_goes_on_on_the_next_server() -> None:
     game.event("connect", "P1", "tab", Window(), game.now)
     game.say(command="start")
     assert (game.asks, game.actions["it"]) == ([], (2, "policy")), "it is asked after four steps"
+
+
+def resumed(*its: RecordedAction) -> Game:
+    """A game that goes on after these steps of the policy on an earlier server; each of the human's was idle."""
+    game = Game()
+    steps = [RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0, None, "none"), "it": it}) for it in its]
+    recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))
+    game.event("start", who_plays(game.settings.trial, dict.fromkeys(PLAYS, SPACE), None), recorded, game.now)
+    game.returns(Replayed(FRAME, seen("me", "it"), {}))
+    game.event("connect", "P1", "tab", Window(), game.now)
+    game.say(command="start")
+    return game
+
+
+def failed(*looked_at: int) -> list[RecordedAction]:
+    return [RecordedAction(0, 0.0, step, "none") for step in looked_at]
+
+
+IDLED = RecordedAction(0, 0.0, None, "none")
+
+
+def test_a_policy_that_idled_for_the_episode_does_so_on_the_next_server() -> None:
+    game = resumed(*failed(0, 1, 2), IDLED)
+    assert (game.asks, game.actions["it"]) == ([], (0, "none"))
+    game.stepped(seen("me", "it"))
+    game.wait(0.1)
+    assert game.asks == []
+    game.stepped(seen(), over=True)
+    game.returns(Begun(b"reset", FRAME, seen("me", "it")))
+    assert len(game.asks) == 1, "it is asked again in the next episode"
+
+
+def test_a_policys_failures_are_counted_on_by_the_next_server() -> None:
+    game = resumed(*failed(0, 1, 2))
+    game.event("policy_failed", "it", game.asks[-1].ask_id, ValueError("no idea"), game.now)
+    game.stepped(seen("me", "it"))
+    game.wait(0.1)
+    assert len(game.asks) == 1, "that was its third failure in a row"
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        [RecordedAction(2, 0.0, 3, "policy")],
+        [RecordedAction(2, 0.0, None, "human"), IDLED],
+        [RecordedAction(1, 0.0, None, "policy"), RecordedAction(2, 0.0, 4, "policy"), IDLED],
+    ],
+)
+def test_a_policy_that_chose_again_is_asked_by_the_next_server(after: list[RecordedAction]) -> None:
+    game = resumed(*failed(0, 1, 2), *after)
+    for _ in range(2):
+        game.event("policy_failed", "it", game.asks[-1].ask_id, ValueError("no idea"), game.now)
+        game.stepped(seen("me", "it"))
+        game.wait(0.1)
+    assert len(game.asks) == 3
 
 
 def test_whoever_left_the_game_is_not_asked_and_does_not_act() -> None:

@@ -17,7 +17,7 @@ from protocol import handover
 from protocol.exits import NO_AGENT
 from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key
-from trial.server import warm
+from trial.server import assignment
 from trial.server.watchdog import Watchdog
 from trial.settings import Settings, SettingsError
 
@@ -243,10 +243,10 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
     async def run():
         store, given_to = SlowStore(), []
 
-        async def give(given):
+        async def give(settings, given):
             given_to.append(given)
 
-        search = warm.HandoverSearch(store, "key", 60)
+        search = assignment.Search(store, Settings.from_env({**ENV, "SPARE_SECONDS": "60"}))
         searching = asyncio.create_task(search.run(give))
         async with asyncio.timeout(10):
             while not store.looks:
@@ -402,7 +402,8 @@ def test_whatever_stands_there_is_read_or_refused(body):
         found = handover.parse(body)
     except BadHandover:
         return
-    assert Settings.from_env({**ENV, "SPARE": "", "USER_ID": found.user_id, "SERVER": found.server}).user_id
+    own = assignment.assigned(Settings.from_env(ENV), found)
+    assert own.user_id or own.session
 
 
 def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_client):
@@ -484,7 +485,7 @@ def test_a_warm_server_needs_no_participant_and_believes_in_none():
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
-    settings = warm.assigned(Settings.from_env(ENV), Handover("P1", 3, "a-2"))
+    settings = assignment.assigned(Settings.from_env(ENV), Handover("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == Settings.from_env(ordinary)
 

@@ -156,7 +156,7 @@ class AgentAdapter:
         self._returned: Any = None  # by start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
         self._unusual_step: Callable[[Any], Any] | None = None
-        self._unusual_render: Callable[[], Any] | None = None
+        self._unusual_render = False  # `render` takes something, or is the environment's
         self._of_env: dict[str, Callable[..., Any]] = {}  # methods that the agent leaves to the environment
         self._feedback: tuple[Callable[..., Any], bool] | None = None
         self._word = signatures.NO_WORD  # the newest since the last step
@@ -210,7 +210,7 @@ class AgentAdapter:
         elif "step" in self._of_env:
             self._unusual_step = self._of_env["step"]
         if self._signatures["render"] != signatures.usual("render") or "render" in self._of_env:
-            self._unusual_render = lambda: self._call("render")
+            self._unusual_render = True
 
     def name_actions(self) -> None:
         """Find out what the actions of the environment's one player are called. Raises AgentError if that fails."""
@@ -279,12 +279,11 @@ class AgentAdapter:
 
     def draw(self, player: Any = PLAYER) -> Any:
         """What `render` returns, for this player if it takes one."""
-        return self._call("render", player=player)
+        return self._call("render", player=player) if self._unusual_render else self._agent.render()
 
     def render(self) -> Picture:
         """The present picture. Raises FrameError or SceneError if it is none."""
-        value = self._agent.render() if self._unusual_render is None else self._unusual_render()
-        return self.reader.read(value)
+        return self.reader.read(self.draw())
 
     def feedback(self, word: str, player: Any = PLAYER) -> None:
         """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.

@@ -119,10 +119,11 @@ def listening(agent: Any) -> dict[str, Callable[..., Any]]:
 
 
 class Callbacks:
-    """Calls an agent's callbacks. All methods are for the agent's thread, but `take` and `close`.
+    """Calls an agent's callbacks. All methods are for the agent's thread, but those that say otherwise.
 
-    `stamp` returns the first fields of each line. `failed` is told the name and the error of a callback that raises,
-    `late` that lines have come for which the agent's thread did not wait; both on the callbacks' thread.
+    `stamp` returns the first fields of each line, `hide` takes out of a text what must not stand in the recording.
+    `failed` is told the name and the error of a callback that raises, `late` how many lines there are after a callback
+    for which the agent's thread did not wait; both on the callbacks' thread.
     """
 
     def __init__(
@@ -134,14 +135,15 @@ class Callbacks:
         seconds: float,
         stamp: Callable[[], dict[str, Any]],
         failed: Callable[[str, BaseException], None],
-        late: Callable[[], None] = lambda: None,
+        hide: Callable[[str], str] = str,
+        late: Callable[[int], None] = lambda recorded: None,
     ) -> None:
         self._found = found
         self.about = about
         self._env = env
         self._seconds = seconds
         self._late = late
-        self._notes = _Notes(stamp, failed)
+        self._notes = _Notes(stamp, failed, hide)
         self._now = _Standing()
         self._started = False
         self._thread: _Thread | None = None
@@ -205,9 +207,14 @@ class Callbacks:
 
     # ---- lines
 
-    def take(self) -> list[bytes]:
-        """The lines of the recording that have come since the last call. For any thread."""
-        return self._notes.take()
+    @property
+    def recorded(self) -> int:
+        """The number of lines of the recording until now. For any thread."""
+        return self._notes.recorded
+
+    def take(self, recorded: int | None = None) -> list[bytes]:
+        """Those of the first `recorded` lines, or of all, that were not taken yet. For the event loop."""
+        return self._notes.take(recorded)
 
     def close(self) -> None:
         """End the thread after its present callback. For any thread."""
@@ -224,7 +231,7 @@ class Callbacks:
         if method is None:
             return
         if self._thread is None:
-            self._thread = _Thread(self._late)
+            self._thread = _Thread(lambda: self._late(self.recorded))
         running = self._thread.running
         if running is not None:
             self._notes.skipped += 1
@@ -232,7 +239,10 @@ class Callbacks:
                 text = "%s has not returned within callbackSeconds (%g s); callbacks are skipped until it has"
                 log.warning(text, running, self._seconds)
             return
-        call = _Call(self._notes, name, self._now.episode, self._now.ticks)
+        where: dict[str, Any] = {"episode": self._now.episode, "step": self._now.ticks}
+        if arguments and len(self.about.humans) > 1:  # what one of several participants did
+            where["player"] = arguments[0]
+        call = _Call(self._notes, name, where)
         session = self._session(call)
         returned = self._thread.run(name, lambda: call.run(method, session, arguments), self._seconds)
         if not returned and self.first_late is None:
@@ -263,23 +273,30 @@ class Callbacks:
 class _Notes:
     """The lines that callbacks leave, and what is said once about them."""
 
-    def __init__(self, stamp: Callable[[], dict[str, Any]], failed: Callable[[str, BaseException], None]) -> None:
+    def __init__(
+        self,
+        stamp: Callable[[], dict[str, Any]],
+        failed: Callable[[str, BaseException], None],
+        hide: Callable[[str], str],
+    ) -> None:
         self._stamp = stamp
+        self._hide = hide
         self._failed = failed
-        self._lines: deque[bytes] = deque(maxlen=_WAITING)
+        self._lines: deque[bytes] = deque()
+        self._taken = 0
         self._said: set[str] = set()
+        self.recorded = 0
         self.skipped = 0
 
-    def take(self) -> list[bytes]:
-        taken = []
-        while True:
-            try:
-                taken.append(self._lines.popleft())
-            except IndexError:
-                return taken
+    def take(self, recorded: int | None) -> list[bytes]:
+        count = max(0, (self.recorded if recorded is None else recorded) - self._taken)
+        self._taken += count
+        return [self._lines.popleft() for _ in range(count)]
 
     def add(self, **fields: Any) -> None:
-        self._lines.append(recording.line("callback", **self._stamp(), **fields))
+        if len(self._lines) < _WAITING:
+            self._lines.append(recording.line("callback", **self._stamp(), **fields))
+            self.recorded += 1
 
     def once(self, text: str) -> bool:
         """Whether this is the first time; of very many different texts, only so many are first ones."""
@@ -288,21 +305,21 @@ class _Notes:
             self._said.add(text)
         return first
 
-    def failed(self, name: str, error: BaseException, **where: int) -> None:
+    def failed(self, name: str, error: BaseException, **where: Any) -> None:
         """A callback raised. The log and the recording have each error once."""
         words = " ".join(f"{type(error).__name__}: {_words(error)}".split())[:_ERROR]
         if self.once(f"{name} {words}"):
-            self.add(**where, name=name, callback=name, error=words)
+            self.add(**where, name=name, callback=name, error=self._hide(words))
             self._failed(name, error)
 
 
 class _Call:
     """One call of a callback, and what it records."""
 
-    def __init__(self, notes: _Notes, name: str, episode: int, step: int) -> None:
+    def __init__(self, notes: _Notes, name: str, where: Mapping[str, Any]) -> None:
         self._notes = notes
         self._name = name
-        self._where = {"episode": episode, "step": step}
+        self._where = where
         self._left = recording.MAX_EXTRA_BYTES
         self._values = 0
 

@@ -9,11 +9,14 @@ from typing import Any
 from trial.agent.agent import AgentAdapter, StepResult
 from trial.agent.callbacks import Callbacks
 from trial.core.effects import Begun, Call, FeedbackCall, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
+from trial.core.ended import Episode
+from trial.core.message_log import Word
 from trial.core.players import ACTION_MASK, PLAYER, View
-from trial.core.progress import Episode
 from trial.recordings import recording
 
 log = logging.getLogger("trial")
+
+_MOST_SAID = 20  # sentences about what is too large for the recording
 
 
 class Diverged(Exception):
@@ -29,6 +32,7 @@ class Calls:
         self.callbacks: Callbacks | None = None
         """Of an agent that has some."""
         self._said_too_large: set[str] = set()
+        self._cut = False  # something was too large in an info of the line before
 
     def run(self, call: Call) -> Any:
         """Run the call; return its result (see each kind). Raises what the researcher's code raises, and Diverged."""
@@ -39,11 +43,11 @@ class Calls:
         if isinstance(call, ResetCall):
             if self.callbacks:
                 self.callbacks.session_begins()
-            return self._reset(call.episode, call.seed)
+            return self._reset(call)
         assert isinstance(call, ReplayCall)
         return self._replay(call)
 
-    def _reset(self, episode: int, seed: int) -> Begun:
+    def _reset(self, call: ResetCall) -> Begun:
         raise NotImplementedError
 
     def _step(self, call: StepCall) -> StepTaken:
@@ -52,7 +56,7 @@ class Calls:
     def _take_again(self, call: ReplayCall) -> Replayed:
         raise NotImplementedError
 
-    def _say(self, word: str) -> str:
+    def _say(self, word: Word) -> str:
         """Give the agent a word of feedback; the player whose human said it."""
         raise NotImplementedError
 
@@ -71,10 +75,10 @@ class Calls:
             call.heard += 1
             self._feedback(word)
 
-    def _feedback(self, word: str) -> None:
+    def _feedback(self, word: Word) -> None:
         player = self._say(word)
         if self.callbacks:
-            self.callbacks.fed_back(player, word)
+            self.callbacks.fed_back(player, word.text)
 
     def _end(self, call: FeedbackCall) -> None:
         self._give_feedback(call)
@@ -85,15 +89,43 @@ class Calls:
                 self.callbacks.session_ended()
 
     def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {"extra": self._bounded("what step() returns as %r", values)}
+
+    def _line(self, kind: str, /, **fields: Any) -> bytes:
+        """A line of the recording. What is too large in an `info` is replaced by its size."""
+        line = None if self._cut else recording.line(kind, **fields)
+        if line is not None and len(line) <= recording.MAX_EXTRA_BYTES:
+            return line
+        cut = self._cut_infos(fields)
+        self._cut = bool(cut)  # then the next line's is cut at once: to write 50 MB takes seconds
+        return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
+
+    def _cut_infos(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Those fields of a line whose infos are too large, with what is kept of them."""
+        cut: dict[str, Any] = {}
+        info = self._cut_info(fields.get("info"))
+        if info is not None:
+            cut["info"] = info
+        players = fields.get("players", {})
+        for player, part in players.items():
+            info = self._cut_info(part.get("info"))
+            if info is not None:
+                cut.setdefault("players", dict(players))[player] = {**part, "info": info}
+        return cut
+
+    def _cut_info(self, info: Any) -> dict[str, Any] | None:
+        if not isinstance(info, Mapping) or not recording.is_too_large(info):
+            return None
+        return self._bounded("%r in info", info)
+
+    def _bounded(self, what: str, values: Mapping[str, Any]) -> dict[str, Any]:
         kept, too_large = recording.bounded_extra(values)
         for name, size in too_large.items():
-            if name not in self._said_too_large:
-                self._said_too_large.add(name)
-                text = (
-                    "what step() returns as %r is too large for the recording (%d bytes); its size is recorded instead"
-                )
-                log.warning(text, name[:100], size)
-        return {"extra": kept}
+            said = what % name[:100]
+            if said not in self._said_too_large and len(self._said_too_large) < _MOST_SAID:
+                self._said_too_large.add(said)
+                log.warning("%s is too large for the recording (%d bytes); its size is recorded instead", said, size)
+        return kept
 
 
 class AgentCalls(Calls):
@@ -111,7 +143,8 @@ class AgentCalls(Calls):
         self._agent = agent
         self._views = views
 
-    def _reset(self, episode: int, seed: int) -> Begun:
+    def _reset(self, call: ResetCall) -> Begun:
+        episode, seed = call.episode, call.seed
         first, info, seeded = self._agent.reset(seed)
         frame = self._agent.render()
         if self.callbacks:
@@ -119,7 +152,7 @@ class AgentCalls(Calls):
         fields: dict[str, Any] = {"episode": episode, "seed": seed if seeded else None, "info": recording.plain(info)}
         if self._record_observations:
             fields["observation"] = recording.observation(first)
-        return Begun(recording.line("reset", **self._stamp(), **fields), frame, self._view(info))
+        return Begun(self._line("reset", **self._stamp(), **fields), frame, self._view(info))
 
     def _view(self, info: Mapping[str, Any]) -> View | None:
         if not self._views:
@@ -147,8 +180,8 @@ class AgentCalls(Calls):
             info = result.info
         return Replayed(self._agent.render(), self._view(info))
 
-    def _say(self, word: str) -> str:
-        self._agent.feedback(word)
+    def _say(self, word: Word) -> str:
+        self._agent.feedback(word.text)
         return PLAYER
 
     def _tell_step(self, action: int, result: StepResult) -> None:
@@ -168,7 +201,7 @@ class AgentCalls(Calls):
             name = names[index] if 0 <= index < len(names) else str(index)
         if self.callbacks:
             self._tell_step(index, result)
-        line = recording.line(
+        line = self._line(
             "step",
             **stamp,
             **call.fields,

@@ -31,10 +31,6 @@ class Players:
     of_env: bool
     """`env` itself is stepped, and its `agents` are those who are still in the game."""
 
-    def number(self, player: str, action: int) -> int:
-        """The action as the environment counts it."""
-        return action + self.starts[player]
-
 
 class AecTurns:
     """Who is to act in a PettingZoo `AECEnv` in which players take turns."""

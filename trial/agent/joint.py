@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +18,11 @@ from trial.core.players import ACTION_MASK, ALL
 from trial.pictures.picture import Picture
 
 TO_ACT = "to_act"
+_TO_ACT_IS = f"{TO_ACT} of %s is"
+_FLAGS = frozenset({bool})
 
 
-@dataclass(frozen=True, slots=True)
-class Joint:
+class Joint(NamedTuple):
     """What all players of an environment have after a reset or a step. All maps are by the player's name.
 
     A player who has left the game has no observation and no info; `terminated` and `truncated` keep saying why.
@@ -37,9 +37,9 @@ class Joint:
     """Of every player."""
     to_act: frozenset[str]
     """Who is to choose an action for the next step; empty when the episode is over."""
-    masks: Mapping[str, tuple[bool, ...]] = field(default_factory=dict)
+    masks: Mapping[str, tuple[bool, ...]]
     """Of players who may not take each action: which are legal now."""
-    over: bool = False
+    over: bool
     """The episode is over: for all players, or since none is left."""
     extra: Mapping[str, Any] | None = None
     """What else is in the dict that an agent of HIPPO's kind returns."""
@@ -67,6 +67,7 @@ class JointAdapter:
         self._truncated: dict[str, bool] = {}
         self.players: tuple[str, ...] = players.names
         """In the environment's order."""
+        self._named = frozenset(players.names)
         self.action_spaces: Mapping[str, tuple[str, ...]] = players.action_names
         """The names of each player's actions, in the order of their numbers."""
         self.observation_spaces: Mapping[str, Any] = players.observation_spaces
@@ -117,8 +118,9 @@ class JointAdapter:
         Players in the game who are not in `actions` take their first legal action: the environment wants one of each,
         also of those who are not to act.
         """
+        keys, starts, first = self._players.keys, self._players.starts, self._first
         given = {
-            self._players.keys[player]: self._players.number(player, actions.get(player, self._first.get(player, 0)))
+            keys[player]: starts[player] + actions.get(player, first.get(player, 0))
             for player in self.players
             if player not in self._gone
         }
@@ -127,8 +129,10 @@ class JointAdapter:
         returned = _read(self._adapter.step_with(given))
         self._end(returned.terminated, self._terminated)
         self._end(returned.truncated, self._truncated)
-        self._gone |= {player for player in self.players if self._terminated[player] or self._truncated[player]}
-        self._gone |= self._left()
+        if True in self._terminated.values() or True in self._truncated.values():
+            self._gone |= {player for player in self.players if self._terminated[player] or self._truncated[player]}
+        if self._players.of_env:
+            self._gone |= self._left()
         over = len(self._gone) == len(self.players)
         return self._joint(
             "step", returned.observations, returned.infos, returned.rewards, over=over, extra=returned.extra
@@ -161,7 +165,7 @@ class JointAdapter:
         extra: Mapping[str, Any] | None = None,
     ) -> Joint:
         seen = self._by_player(method, observations)
-        told = self._by_player(method, infos) if isinstance(infos, Mapping) else {}
+        told = self._by_player(method, infos) if infos and isinstance(infos, Mapping) else {}
         details = {player: _info(value) for player, value in told.items()}
         paid = self._by_player(method, rewards)
         masks = {} if over else self._masks(seen, details)
@@ -180,13 +184,18 @@ class JointAdapter:
 
     def _end(self, said: Mapping[Any, Any], ended: dict[str, bool]) -> None:
         """Note for whom it is over. The value for all counts for those who are still in the game."""
+        values = said.values()
+        if said.keys() == self._named and _FLAGS.issuperset(map(type, values)) and True not in values:
+            return  # for none of them: the usual case
         for player, value in self._by_player("step", said).items():
-            ended[player] = ended[player] or _truth(value, f"step() returned for {player}, as its end,")
-        if _truth(said.get(ALL), f"step() returned for {ALL}"):
+            ended[player] = ended[player] or _truth(value, "step() returned for %s, as its end,", player)
+        if _truth(said.get(ALL), "step() returned for %s", ALL):
             ended.update(dict.fromkeys((player for player in self.players if player not in self._gone), True))
 
     def _by_player(self, method: str, values: Mapping[Any, Any]) -> dict[str, Any]:
         """The values by the players' names, without the value for all. Raises AgentError for one there is not."""
+        if values.keys() == self._named:  # the usual case
+            return dict(values)
         found = {}
         for key, value in values.items():
             player = str(key)
@@ -202,7 +211,7 @@ class JointAdapter:
     def _left(self) -> set[str]:
         """Who is in the environment's `agents` no more. PettingZoo takes out whoever has ended."""
         now = getattr(self._players.env, "agents", None)
-        if not self._players.of_env or not isinstance(now, list | tuple):
+        if not isinstance(now, list | tuple):
             return set()
         return set(self.players) - {str(key) for key in now}
 
@@ -222,8 +231,12 @@ class JointAdapter:
             if unknown:
                 raise AgentError(f"to_act() returned {unknown[0]!r}; the players are {self._shown()}")
             return frozenset(player for player in there if player in names)
+        if not infos:
+            return frozenset(there)
         return frozenset(
-            player for player in there if _truth(infos.get(player, {}).get(TO_ACT, True), f"{TO_ACT} of {player} is")
+            player
+            for player in there
+            if player not in infos or _truth(infos[player].get(TO_ACT, True), _TO_ACT_IS, player)
         )
 
     def _masks(
@@ -233,10 +246,11 @@ class JointAdapter:
         for player in self.players:
             if player in self._gone:
                 continue
-            mask = infos.get(player, {}).get(ACTION_MASK)
+            mask = infos[player].get(ACTION_MASK) if player in infos else None
             if mask is None:
                 observation = observations.get(player)
-                mask = observation.get(ACTION_MASK) if isinstance(observation, Mapping) else None
+                if observation is not None and isinstance(observation, Mapping):
+                    mask = observation.get(ACTION_MASK)
             if mask is not None:
                 try:
                     legal = tuple(np.asarray(mask).reshape(-1).astype(bool).tolist())
@@ -253,14 +267,16 @@ class JointAdapter:
 
 
 def _info(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {} if value is None else {"info": value}
+    is_map = type(value) is dict or isinstance(value, Mapping)  # the first is quicker
+    return value if is_map else {} if value is None else {"info": value}
 
 
-def _truth(value: Any, what: str) -> bool:
+def _truth(value: Any, what: str, player: str) -> bool:
+    """Raises AgentError if the value has none; the sentence begins with `what`, which has a place for the player."""
     try:
         return bool(value)
     except (TypeError, ValueError):  # such as an array of several numbers
-        raise AgentError(f"{what} {type(value).__name__}, which is neither true nor false") from None
+        raise AgentError(f"{what % player} {type(value).__name__}, which is neither true nor false") from None
 
 
 def _reward(player: str, value: Any) -> float:
@@ -281,11 +297,11 @@ _KEYS = {
     "infos": ("info", "infos"),
 }
 """What each part may be called in a dict, as HIPPO's agents return one."""
+_MAPS = frozenset({dict})
 _WANTED = "step() must return (observations, rewards, terminations, truncations, infos), each of them by player"
 
 
-@dataclass(frozen=True, slots=True)
-class _Returned:
+class _Returned(NamedTuple):
     """What `step` returned, each part by the environment's own names of the players."""
 
     observations: Mapping[Any, Any]
@@ -299,9 +315,12 @@ class _Returned:
 def _read(result: Any) -> _Returned:
     """The parts of a five-tuple, Gym's old four-tuple or a dict. Raises AgentError for all else."""
     extra: Mapping[str, Any] | None = None
-    if isinstance(result, tuple | list) and len(result) == 5:
+    given = len(result) if isinstance(result, (tuple, list)) else None
+    if given == 5:
+        if _MAPS.issuperset(map(type, result)):  # the usual case
+            return _Returned(*result)
         parts = list(result)
-    elif isinstance(result, tuple | list) and len(result) == 4:
+    elif given == 4:
         observations, rewards, done, infos = result
         parts = [observations, rewards, done, {}, infos]
     elif isinstance(result, Mapping):
@@ -311,7 +330,7 @@ def _read(result: Any) -> _Returned:
     else:
         raise AgentError(f"{_WANTED}, or a dict of these")
     for name, part in zip(_KEYS, parts, strict=True):
-        if part is not None and not isinstance(part, Mapping):
+        if part is not None and type(part) is not dict and not isinstance(part, Mapping):
             raise AgentError(f"{_WANTED}; its {name} are {type(part).__name__}")
     observations, rewards, terminated, truncated, infos = (part or {} for part in parts)
     return _Returned(observations, rewards, terminated, truncated, infos, extra)

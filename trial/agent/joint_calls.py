@@ -11,12 +11,15 @@ import numpy as np
 from trial.agent.calls import Calls, Diverged
 from trial.agent.joint import Joint, JointAdapter
 from trial.core.actions import Action
-from trial.core.effects import Begun, ReplayCall, Replayed, StepCall, StepTaken
+from trial.core.effects import Begun, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
+from trial.core.message_log import Word
 from trial.core.players import Player, View
 from trial.core.policies import Observed
 from trial.core.seeds import policy_seed
 from trial.core.unfinished import UnfinishedEpisode
 from trial.recordings import recording
+
+_NONE: frozenset[str] = frozenset()
 
 
 class JointCalls(Calls):
@@ -32,16 +35,20 @@ class JointCalls(Calls):
         stamp: Callable[[], dict[str, Any]],
         *,
         record_observations: bool,
+        stand_ins: Iterable[str] = (),
     ) -> None:
+        """In the places of `stand_ins` a policy may play while their participant is away."""
         super().__init__(stamp, record_observations=record_observations)
         self._agent = agent
         humans = tuple(player.name for player in players if player.human)
         self._first = humans[0]
-        self._policies = frozenset(player.name for player in players if not player.human and not player.by_program)
+        policies = (player.name for player in players if not player.human and not player.by_program)
+        self._policies = frozenset((*policies, *stand_ins))
         self._ended: frozenset[str] = frozenset()  # the episode is over for them
         agent.views = humans
 
-    def _reset(self, episode: int, seed: int) -> Begun:
+    def _reset(self, call: ResetCall) -> Begun:
+        episode, seed = call.episode, call.seed
         joint, seeded = self._agent.reset(seed)
         self._ended = frozenset()
         pictures = self._agent.pictures()
@@ -52,14 +59,18 @@ class JointCalls(Calls):
             "seed": seed if seeded else None,
             "info": recording.plain(joint.infos.get(self._first, {})),
             **self._seen(joint),
-            "players": {player: self._begun(player, seed, joint) for player in self._agent.players},
+            "players": {player: self._begun(player, call, joint) for player in self._agent.players},
             "toAct": sorted(joint.to_act),
+            **call.fields,
         }
-        return Begun(recording.line("reset", **self._stamp(), **fields), pictures, self._view(joint))
+        return Begun(self._line("reset", **self._stamp(), **fields), pictures, self._view(joint))
 
     def _view(self, joint: Joint) -> View:
         """What the core is told. Policies look at it while the environment goes on, so they get copies."""
-        seen = {player: snapshot(joint.observations.get(player)) for player in self._policies & joint.to_act}
+        watching = self._policies & joint.to_act
+        if not watching:
+            return View(joint.to_act, masks=joint.masks)
+        seen = {player: snapshot(joint.observations.get(player)) for player in watching}
         infos = {player: snapshot(joint.infos.get(player, {})) for player in seen}
         return View(joint.to_act, seen, infos, joint.masks)
 
@@ -68,9 +79,9 @@ class JointCalls(Calls):
             return {}
         return {"observation": recording.observation(joint.observations.get(self._first))}
 
-    def _begun(self, player: str, seed: int, joint: Joint) -> dict[str, Any]:
+    def _begun(self, player: str, call: ResetCall, joint: Joint) -> dict[str, Any]:
         """One player's part of a reset's line. Policies have a seed, also if the environment takes none."""
-        seeded = {"seed": policy_seed(seed, player)} if player in self._policies else {}
+        seeded = {"seed": policy_seed(call.seed, player)} if player in call.asked else {}
         return {**seeded, **self._told(player, joint)}
 
     def _told(self, player: str, joint: Joint) -> dict[str, Any]:
@@ -84,9 +95,10 @@ class JointCalls(Calls):
                 said["observation"] = recording.observation(joint.observations[player])
         return said
 
-    def _say(self, word: str) -> str:
-        self._agent.feedback(self._first, word)
-        return self._first
+    def _say(self, word: Word) -> str:
+        player = word.player if word.player in self._agent.players else self._first
+        self._agent.feedback(player, word.text)
+        return player
 
     def _step(self, call: StepCall) -> StepTaken:
         stamp, actions, first = self._stamp(), call.actions, self._first
@@ -97,7 +109,7 @@ class JointCalls(Calls):
             self._tell_step({player: action.index for player, action in actions.items() if action.acts}, joint)
         asked, truncated = actions[first], joint.over and joint.why == "truncated"
         terminated = joint.over and not truncated
-        line = recording.line(
+        line = self._line(
             "step",
             **stamp,
             **call.fields,
@@ -120,15 +132,23 @@ class JointCalls(Calls):
 
     def _part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
         """One player's part of a step's line."""
-        return {
+        part: dict[str, Any] = {
             "action": action.index if action.acts else None,
             "actionName": action.name if action.acts else None,
             "by": action.by if action.acts else None,
-            **({} if action.observed is None else {"observed": action.observed}),
-            "reward": joint.rewards[player],
-            **({} if player in self._ended else _end(player, joint)),
-            **self._told(player, joint),
         }
+        if action.observed is not None:
+            part["observed"] = action.observed
+        if action.pressed_at is not None:
+            part["pressedAt"] = action.pressed_at
+        part["reward"] = joint.rewards[player]
+        if player not in self._ended:
+            if joint.terminated[player]:
+                part["terminated"] = True
+            if joint.truncated[player]:
+                part["truncated"] = True
+        part |= self._told(player, joint)
+        return part
 
     def _tell_step(self, actions: Mapping[str, int], joint: Joint) -> None:
         assert self.callbacks is not None
@@ -163,13 +183,9 @@ class JointCalls(Calls):
 
 def _ended(joint: Joint) -> frozenset[str]:
     """For whom the episode is over."""
+    if True not in joint.terminated.values() and True not in joint.truncated.values():
+        return _NONE
     return frozenset(player for player in joint.terminated if joint.terminated[player] or joint.truncated[player])
-
-
-def _end(player: str, joint: Joint) -> dict[str, bool]:
-    """Whether the player was terminated or truncated by this step; nothing if not."""
-    ends = {"terminated": joint.terminated[player], "truncated": joint.truncated[player]}
-    return {name: True for name, ended in ends.items() if ended}
 
 
 class _Remembered:
@@ -192,13 +208,20 @@ class _Remembered:
 
 
 def snapshot(observation: Any) -> Any:
-    """A copy of an observation, which the environment does not change any more."""
+    """A copy of an observation, which the environment does not change any more; one that holds itself stays."""
+    try:
+        return _copied(observation)
+    except RecursionError:
+        return observation
+
+
+def _copied(observation: Any) -> Any:
     if isinstance(observation, np.ndarray):
         return observation.copy()
     if isinstance(observation, Mapping):
-        return {key: snapshot(value) for key, value in observation.items()}
+        return {key: _copied(value) for key, value in observation.items()}
     if isinstance(observation, list | tuple):
-        return _same_kind(observation, (snapshot(value) for value in observation))
+        return _same_kind(observation, (_copied(value) for value in observation))
     return observation
 
 

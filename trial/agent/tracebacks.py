@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _OURS = Path(__file__).resolve().parents[1]
 _LONGEST_CHAIN = 20
 
 
-def report(error: BaseException, folder: Path, private: str = "") -> str:
+def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> str:
     """The traceback. Its last line says where in the folder's files, and what: `agent.py:30: NameError: …`.
 
-    The whole message of the error is in that line. `private`, a participant's id, is left out.
+    The whole message of the error is in that line. `private`, ids of participants, are left out.
     """
     whole, only = traceback.format_exception(error), traceback.format_exception_only(error)
     frames = whole[: -len(only)] if whole[-len(only) :] == only else whole
@@ -55,9 +55,10 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
         each = each.__cause__ or (None if each.__suppress_context__ else each.__context__)
 
 
-def without(private: str, text: str) -> str:
-    """The text without a participant's id."""
-    # Short numbers are left: they are in every traceback.
-    if not private or (private.isdigit() and len(private) < 6):
+def without(private: Iterable[str], text: str) -> str:
+    """The text without these ids of participants."""
+    # Short numbers are left: they are in every traceback. Of two ids that begin alike, the longer one is found first.
+    ids = [each for each in sorted(private, key=len, reverse=True) if each and not (each.isdigit() and len(each) < 6)]
+    if not ids:
         return text
-    return re.sub(rf"(?<!\w){re.escape(private)}(?!\w)", "(participant)", text)
+    return re.sub(rf"(?<!\w)(?:{'|'.join(map(re.escape, ids))})(?!\w)", "(participant)", text)

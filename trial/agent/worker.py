@@ -32,9 +32,9 @@ class Worker:
     The thread is a daemon: code that never returns cannot keep the process alive.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "agent") -> None:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="agent", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         self._out = 0  # functions that have not returned
         self._waiting: dict[_Job, None] = {}  # those that are not late

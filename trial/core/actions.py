@@ -21,6 +21,8 @@ class Action:
     """If a policy was asked for it: the steps of the episode that were taken when it observed."""
     acts: bool = True
     """False if it is not the player's turn, or the player has left: the environment may want an action all the same."""
+    pressed_at: int | None = None
+    """In a session: the time of the message by which the participant chose it, in nanoseconds."""
 
     @property
     def human(self) -> bool:

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from protocol.trial import Trial
 from trial.core import messages
+from trial.core.alone import Alone
 from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
 from trial.core.progress import Progress
+from trial.core.session import Session
+from trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
-
-
-class StateTimes(NamedTuple):
-    """Seconds that are left: of a break, of a turn, of the first picture, of the episode. None: there is none."""
-
-    next_in: float | None = None
-    turn_ends_in: float | None = None
-    starts_in: float | None = None
-    time_left: float | None = None
 
 
 @dataclass(slots=True)
@@ -38,23 +32,23 @@ class Client:
 class Clients:
     """Every human has one connection at most. Each is shown their player's picture, score and turn."""
 
-    def __init__(self, emit: Callable[[Effect], None]) -> None:
+    def __init__(
+        self, config: Trial, timing: Timing, emit: Callable[[Effect], None], assets: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        """`assets` are the images of a game that is drawn by objects."""
+        self._timing = timing
         self._emit = emit
+        self._scene = _scene_of(config, assets)
+        self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
+        """Clients are told of times also while the game goes on."""
         self._by_human: dict[str, Client] = {}
-        self._places: dict[str, str] = {}  # the player of each human, as long as the trial goes on
         self.pictures: Pictures | None = None
         """What is shown."""
         self.frame_id = 0
 
-    def add(self, human: str, connection: Hashable, window: Window, places: Sequence[str]) -> Client:
-        """Add a connection. One that the human has already must have been removed.
-
-        A human who comes first gets the first of the `places` that no other human has, or else the first.
-        """
-        if human not in self._places:
-            taken = self._places.values()
-            self._places[human] = next((place for place in places if place not in taken), places[0])
-        client = self._by_human[human] = Client(connection, window, self._places[human])
+    def add(self, human: str, connection: Hashable, window: Window, player: str) -> Client:
+        """Add a connection of the human who plays this player. One that they have already must have been removed."""
+        client = self._by_human[human] = Client(connection, window, player)
         return client
 
     def replace(self, human: str) -> Client | None:
@@ -86,21 +80,37 @@ class Clients:
         for client in self._by_human.values():
             self.send(client, text)
 
-    def send_state(self, progress: Progress, times: Callable[[], StateTimes] | None) -> None:
+    def say_each(self, words_for: Callable[[str], str | None]) -> None:
+        """Tell each client these words, by its player, as an error; None: nothing."""
+        for client in self._by_human.values():
+            words = words_for(client.player)
+            if words is not None:
+                self.send(client, messages.error(words))
+
+    def send_controls(self, client: Client, progress: Progress, session: Alone | Session, now: float) -> None:
+        """Tell a client all of the game and of its controls."""
+        times = self._timing.told(progress, now, session.told(now))
+        self.send(client, _controls_of(progress, client.player, times, self._scene))
+
+    def send_state(self, progress: Progress, session: Alone | Session, now: float) -> None:
         """Send the state to those clients that were sent another one, with the times as they are then, if there are."""
+        progress.told = session.state()
         for client in self._by_human.values():
             player = client.player
             state = state_of(progress, player)
             if client.sent == state:
                 continue
             client.sent = state
+            times = None
+            if self._timed or progress.on_break or progress.told is not None:
+                times = self._timing.told(progress, now, session.told(now))
             text = messages.state(
                 progress.state.value,
                 progress.episode,
                 progress.scores[player],
                 progress.frame_rate,
                 episode_score=progress.episode_scores[player],
-                **(of_state(progress, player, times()) if times is not None else {}),
+                **(_of_state(progress, player, times) if times is not None else {}),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
@@ -117,27 +127,29 @@ class Clients:
         if picture is not None:
             self._emit(SendPicture(client.connection, picture, self.frame_id))
 
-    def send_done(self, episodes: int, scores: Mapping[str, float], score: float) -> None:
-        """Tell all clients that the trial is over and stored. `score` is that of a player who is not in `scores`."""
-        for client in self._by_human.values():
-            self._emit(SendDone(client.connection, episodes, scores.get(client.player, score)))
+    def by_human(self) -> list[tuple[str, Client]]:
+        """Those that are connected, and whose they are."""
+        return list(self._by_human.items())
+
+    def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
+        """Tell a client that the trial is over and stored; a member of a session, with which outcome for them."""
+        self._emit(SendDone(client.connection, episodes, score, outcome))
 
 
 def state_of(progress: Progress, player: str) -> tuple[object, ...]:
     """What is sent to clients whenever one of these changes."""
-    state: tuple[object, ...] = (progress.state, progress.episode, progress.scores[player], progress.frame_rate)
-    if progress.stands:
-        state = (*state, "stands")
-    return state if progress.turns is None else (*state, progress.to_act(player))
+    score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
+    return progress.state, progress.episode, score, progress.frame_rate, progress.stands, progress.told, to_act
 
 
-def of_state(progress: Progress, player: str, times: StateTimes) -> dict[str, Any]:
+def _of_state(progress: Progress, player: str, times: StateTimes) -> dict[str, Any]:
     """What a client is told of the times and of its turn."""
-    turn = turn_of(progress, player, times.turn_ends_in)
-    return {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
+    turn = _turn_of(progress, player, times.turn_ends_in)
+    said = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
+    return said if times.session is None else {**said, "session": {**times.session, "you": player}}
 
 
-def turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str, Any]:
+def _turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str, Any]:
     """What a client is told of the turn: nothing in real time."""
     if progress.turns is None:
         return {}
@@ -145,8 +157,8 @@ def turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str,
     return {"to_act": mine, "turn_ends_in": ends_in if mine else None}
 
 
-def controls_of(progress: Progress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
-    """The message that tells a client all of the game and of its controls. `scene` as `scene_of` has it."""
+def _controls_of(progress: Progress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
+    """The message that tells a client all of the game and of its controls. `scene` as `_scene_of` has it."""
     config, action_space = progress.config, progress.players[player].action_space
     return messages.controls(
         ui=config.ui.shown(),
@@ -166,11 +178,11 @@ def controls_of(progress: Progress, player: str, times: StateTimes, scene: Mappi
         players=tuple(progress.players),
         scene=scene,
         input_of_project=_input(config, player),
-        **of_state(progress, player, times),
+        **_of_state(progress, player, times),
     )
 
 
-def scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def _scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """What a client is told of a game that is drawn by objects; None if it is not."""
     if config.scene is None:
         return None

@@ -54,8 +54,14 @@ class Controls:
             if action in self._index
         }
         self._key_names = frozenset().union(*self._keys) if self._keys else frozenset()
+        self._combined: tuple[list[str], int | None] = [], None
+        """The keys that acted last, and their action: most keys are held for many steps."""
         self._single = single
-        self._presses: deque[int] = deque()  # with `single`, those that wait for their step
+        self._presses: deque[tuple[int, int | None]] = deque()  # with `single`, those that wait for their step
+        self.time: int | None = None
+        """The time of the message that is being read, if the caller says it."""
+        self.pressed_at: int | None = None
+        """The time of the message that chose the action which was taken last, if a human asked for it."""
         self.default = self._index.get(NOOP, 0) if default is None else default
 
     def knows(self, name: str) -> bool:
@@ -73,6 +79,7 @@ class Controls:
         if self._single:
             self._wait(index)
             return
+        self.pressed_at = self.time
         self._press = index
         self._press_left = self._lifespan if self._press is not None else 0
 
@@ -84,20 +91,23 @@ class Controls:
         if self._single:
             self._wait(self._combined_with(name, self._held[1:_COMBINED]))
             return
+        self.pressed_at = self.time
         self._unseen.add(name)
         self._press_left = 0
 
     def _wait(self, index: int | None) -> None:
         """With `single`: the action waits for its step."""
         if index is not None and len(self._presses) < PRESSES:
-            self._presses.append(index)
+            self._presses.append((index, self.time))
 
     def release(self, name: str) -> None:
         """A key went up. A key that was pressed and released between two steps still acts on the next one."""
         if name not in self._held:
             return
         self._held.remove(name)
-        if name in self._unseen:
+        if name not in self._unseen:
+            self.pressed_at = self.time  # what is held besides acts from now on
+        else:
             self._unseen.discard(name)
             self._tapped.insert(0, name)
 
@@ -124,10 +134,13 @@ class Controls:
     def take(self) -> tuple[int, bool]:
         """The action of the step that begins now: its index, and whether a human asked for it."""
         if self._presses:
-            return self._presses.popleft(), True
+            pressed, self.pressed_at = self._presses.popleft()
+            return pressed, True
         if not self._held and not self._tapped and self._press_left <= 0:
             return self.default, False
-        keys = [*self._tapped, *(key for key in self._held if key not in self._tapped)]
+        keys = self._held
+        if self._tapped:
+            keys = [*self._tapped, *(key for key in keys if key not in self._tapped)]
         self._tapped.clear()
         self._unseen.clear()
         if self._press_left > 0 and self._press is not None:
@@ -158,11 +171,10 @@ class Controls:
         If there is none, try the next older key. None if no key is part of an action.
         """
         keys = keys[:_COMBINED]
-        for start, newest in enumerate(keys):
-            index = self._combined_with(newest, keys[start + 1 :])
-            if index is not None:
-                return index
-        return None
+        if keys != self._combined[0]:
+            found = (self._combined_with(newest, keys[start:]) for start, newest in enumerate(keys, 1))
+            self._combined = keys, next((index for index in found if index is not None), None)
+        return self._combined[1]
 
     def _combined_with(self, newest: str, others: Sequence[str]) -> int | None:
         for size in range(len(others), -1, -1):

@@ -1,18 +1,20 @@
 """What the core of a trial (`trial/core/trial.py`) asks its shell to do. Pure records.
 
 A connection is whatever the shell uses to name one; the core only compares it. Texts are messages of docs/wire.md.
+Records that are made at each step are named tuples, since frozen dataclasses take several times as long to make.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from trial.core.actions import Action
+from trial.core.ended import Break, Episode
+from trial.core.message_log import Word
 from trial.core.players import Player, View
 from trial.core.policies import AskPolicy, Observed
-from trial.core.progress import Break, Episode
 from trial.core.unfinished import UnfinishedEpisode
 from trial.pictures.picture import Picture
 
@@ -39,8 +41,7 @@ class SendState:
     frame_rate: int
 
 
-@dataclass(frozen=True, slots=True)
-class SendPicture:
+class SendPicture(NamedTuple):
     """Send a picture. It replaces a picture that has not been sent yet."""
 
     connection: Hashable
@@ -55,6 +56,8 @@ class SendDone:
     connection: Hashable
     episodes: int
     score: float
+    outcome: str | None = None
+    """In a session: how the trial has ended for this member."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +89,10 @@ class ResetCall(Call):
 
     episode: int
     seed: int
+    asked: frozenset[str] = frozenset()
+    """Players whose policies begin the episode too."""
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    """More for the line of the recording, if there are several players."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -101,7 +108,7 @@ class ReplayCall(Call):
 class FeedbackCall(Call):
     """Give the agent these words of feedback. `heard` counts those it was given. Returns None."""
 
-    feedback: tuple[str, ...]
+    feedback: tuple[Word, ...]
     messages: int
     """So many of the participant's messages came before this call."""
     heard: int = 0
@@ -143,8 +150,7 @@ class Begun:
     view: View | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class StepTaken:
+class StepTaken(NamedTuple):
     """What came of a step: rewards by player, whether the episode is over, the new picture, the line of the recording.
 
     `view` is as in `Begun`.
@@ -197,8 +203,7 @@ class OpenRecording:
     """Who plays whom, if there are several players."""
 
 
-@dataclass(frozen=True, slots=True)
-class WriteLine:
+class WriteLine(NamedTuple):
     """Add a finished line to the recording."""
 
     line: bytes
@@ -208,7 +213,7 @@ class WriteLine:
 class RecordLine:
     """Add a line of this kind to the recording, stamped with the time."""
 
-    kind: Literal["resume", "error", "end", "break"]
+    kind: Literal["resume", "error", "end", "break", "presence", "ping"]
     fields: Mapping[str, Any]
 
 
@@ -219,9 +224,20 @@ class CloseRecording:
 
 @dataclass(frozen=True, slots=True)
 class SaveAnswer:
-    """Wait until all recordings are stored, then store the answer, if there is one; answered with `answer_saved`."""
+    """Wait until all recordings are stored, then store the answers, if there are some; answered with `answer_saved`."""
 
     answers: Mapping[str, Any] | None
+    """The participant's; None in a session."""
+    by_human: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """In a session: the answers of each member, by their id."""
+
+
+@dataclass(frozen=True, slots=True)
+class SaveMember:
+    """Store the answer of a member who does not play while the others do; answered with `member_saved`."""
+
+    human: str
+    answers: Mapping[str, Any]
 
 
 # ---- the log
@@ -257,6 +273,7 @@ Effect = (
     | RecordLine
     | CloseRecording
     | SaveAnswer
+    | SaveMember
     | Log
     | LogAgentError
 )

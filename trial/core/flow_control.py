@@ -46,12 +46,13 @@ class Window:
 
     def wait(self, now: float, rate: int) -> float:
         """Seconds until another frame may be sent; 0 for at once. An acknowledgement may come before that."""
-        if not self.acknowledging:
+        under_way = len(self._under_way)
+        if under_way < 2 or not self.acknowledging:  # the first is the usual case
             return 0.0
-        if len(self._under_way) < min(2 + math.ceil(self._round_trip * rate), _WIDEST):
+        if under_way < min(2 + math.ceil(self._round_trip * rate), _WIDEST):
             return 0.0
         return max(0.0, self._sent_at + 1.0 - now)  # even then one frame a second: an acknowledgement may be lost
 
     def stalled(self, now: float) -> bool:
         """The client acknowledged before, and has stopped."""
-        return self.acknowledging and bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS
+        return bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS and self.acknowledging

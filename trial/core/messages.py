@@ -21,7 +21,7 @@ _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "right
 """HIPPO's front end presses an action with these controls."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
-_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset"})
+_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden"})
 
 
 class NotAMessage(ValueError):
@@ -30,6 +30,10 @@ class NotAMessage(ValueError):
 
 class BadMessage(ValueError):
     """An object that means nothing here; the words go back to the client."""
+
+
+class CommandRefused(ValueError):
+    """What a client asked for is not possible now; the words go back to it."""
 
 
 class CloseConnection(Exception):
@@ -73,9 +77,11 @@ class Message:
     """How many fields it has sent along that were too long to be recorded."""
     key: str | None = None
     """A key of the keyboard, where the project says what each does."""
+    hidden: bool | None = None
+    """Whether the participant looks at another page. Only members of a session say it."""
 
     def record(self) -> dict[str, Any]:
-        """What goes into a recording: everything but acknowledgements and requestUI."""
+        """What goes into a recording: everything but acknowledgements, requestUI and `hidden`."""
         said: dict[str, Any] = {}
         if self.command is not None and self.command != "requestUI":
             said["command"] = self.command
@@ -171,6 +177,7 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
         ack=_ack(value["ack"]) if "ack" in value else None,
         key=key,
         asset=_asset(value["asset"]) if "asset" in value else None,
+        hidden=_hidden(value["hidden"]) if "hidden" in value else None,
     )
 
 
@@ -194,6 +201,12 @@ def _ack(value: Any) -> int:
 def _asset(value: Any) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 200:
         raise BadMessage("asset must be the name of an image")
+    return value
+
+
+def _hidden(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise BadMessage("hidden must be true or false")
     return value
 
 
@@ -226,6 +239,7 @@ def controls(
     starts_in: float | None = None,
     time_left: float | None = None,
     input_of_project: Mapping[str, Any] | None = None,
+    session: Mapping[str, Any] | None = None,
 ) -> str:
     """The answer to a hello and to `requestUI`.
 
@@ -233,7 +247,7 @@ def controls(
     turn by turn.
 
     `scene` is what a client is told that draws objects: of the picture, and of the images in it. `input_of_project` is
-    what the project says of keys and buttons. `starts_in` and `time_left` as in `state`.
+    what the project says of keys and buttons. `starts_in`, `time_left` and `session` as in `state`.
     """
     return json.dumps(
         {
@@ -255,6 +269,7 @@ def controls(
             **(scene or {}),
             **(input_of_project or {}),
             **_times(starts_in, time_left),
+            **(session or {}),
         }
     )
 
@@ -271,16 +286,18 @@ def state(
     turn_ends_in: float | None = None,
     starts_in: float | None = None,
     time_left: float | None = None,
+    session: Mapping[str, Any] | None = None,
 ) -> str:
     """Where the trial stands, sent whenever one of these changes.
 
     `starts_in`: seconds for which the first picture still stands. `time_left`: seconds of play of the episode.
     `next_in`: seconds of a break that are left. Turn by turn, `to_act`: whether it is the client's turn, and
-    `turn_ends_in`: seconds of it that are left.
+    `turn_ends_in`: seconds of it that are left. `session`: what members are told of each other.
     """
     scores = _scores(score, episode_score, next_in)
     turn, times = _turn(to_act, turn_ends_in), _times(starts_in, time_left)
-    return json.dumps({"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times})
+    said = {"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times}
+    return json.dumps({**said, **session} if session else said)
 
 
 def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]:
@@ -315,9 +332,10 @@ def not_offered(message: Message, ui: Collection[str]) -> str | None:
     return None
 
 
-def done(episodes: int, score: float) -> str:
-    """The trial is over."""
-    return json.dumps({"done": True, "episodes": episodes, "score": tidy(score)})
+def done(episodes: int, score: float, outcome: str | None = None) -> str:
+    """The trial is over; in a session, with this outcome for the client."""
+    said = {"done": True, "episodes": episodes, "score": tidy(score)}
+    return json.dumps(said if outcome is None else {**said, "outcome": outcome})
 
 
 def error(words: str) -> str:

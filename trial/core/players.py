@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from protocol.players import GYM_PLAYER, HUMAN
 from protocol.trial import Trial
@@ -50,15 +50,17 @@ class Player:
         return self.plays.startswith(GYM_PLAYER)
 
 
-@dataclass(frozen=True, slots=True)
-class View:
+_NOTHING: Mapping[str, Any] = {}  # the type forbids changes
+
+
+class View(NamedTuple):
     """What the players see after a reset or a step, by player. The core reads `to_act` and `masks` only."""
 
     to_act: frozenset[str]
     """The players whose actions the next step takes."""
-    observations: Mapping[str, Any] = field(default_factory=dict)
-    infos: Mapping[str, Any] = field(default_factory=dict)
-    masks: Mapping[str, Mask] = field(default_factory=dict)
+    observations: Mapping[str, Any] = _NOTHING
+    infos: Mapping[str, Any] = _NOTHING
+    masks: Mapping[str, Mask] = _NOTHING
     """Which actions are possible now, for those players for which the environment says so."""
 
 

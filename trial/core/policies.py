@@ -40,8 +40,8 @@ class AskPolicy:
     mask: Mask | None
 
 
-class _Seat:
-    """One player, and how far its policy is."""
+class _Place:
+    """One player's place, and how far its policy is."""
 
     def __init__(self, player: Player) -> None:
         self.player = player
@@ -70,7 +70,7 @@ class Policies:
     def __init__(
         self, players: Iterable[Player], *, frame_skip: int = 1, seconds: float | None = None, goes_on: bool = True
     ) -> None:
-        self._seats = {player.name: _Seat(player) for player in players}
+        self._places = {player.name: _Place(player) for player in players}
         self._frame_skip = frame_skip
         self._seconds = seconds
         """With turns: how long a policy may think."""
@@ -78,150 +78,169 @@ class Policies:
         self._asks = 0
 
     def __bool__(self) -> bool:
-        return bool(self._seats)
+        return bool(self._places)
 
     def __contains__(self, player: str) -> bool:
-        return player in self._seats
+        return player in self._places
 
     @property
     def asked(self) -> tuple[Player, ...]:
         """Those that are asked; all but the ones that a program plays."""
-        return tuple(seat.player for seat in self._seats.values() if not seat.player.by_program)
+        return tuple(place.player for place in self._places.values() if not place.player.by_program)
 
     def begin(self) -> None:
         """An episode begins."""
-        for seat in self._seats.values():
-            seat.begin()
+        for place in self._places.values():
+            place.begin()
 
-    def go_on(self, actions: Mapping[str, int]) -> None:
-        """The episode goes on where an earlier server left it: these actions of policies go on until the next ones."""
+    def go_on(self, actions: Mapping[str, int], failures: Mapping[str, int]) -> None:
+        """The episode goes on where an earlier server left it.
+
+        These actions of policies go on until the next ones, and so often they have failed in a row.
+        """
+        for player, count in failures.items():
+            if player in self._places:
+                self._places[player].failures = count
         for player, action in actions.items():
-            if player in self._seats:
-                self._seats[player].last = action
+            if player in self._places:
+                self._places[player].last = action
+
+    def take_place(self, player: Player) -> None:
+        """A policy plays for this player from now on."""
+        self._places[player.name] = _Place(player)
+
+    def give_back(self, player: str) -> None:
+        """The policy plays for this player no more; its late answers change nothing."""
+        self._places.pop(player, None)
 
     def late(self) -> dict[str, int]:
         """How many steps of the episode found a policy late, by player."""
-        return {name: seat.late for name, seat in self._seats.items() if seat.late}
+        return {name: place.late for name, place in self._places.items() if place.late}
 
     def asks(self, view: View, steps: int, now: float) -> list[AskPolicy]:
         """What is to be asked now that `steps` steps of the episode were taken."""
         due = self._seconds is not None or steps % self._frame_skip == 0
         found = []
-        for name, seat in self._seats.items():
-            if seat.player.by_program or seat.idles:
+        for name, place in self._places.items():
+            if place.player.by_program or place.idles:
                 continue
-            seat.due = seat.due or due
-            if name not in view.to_act or not seat.due:
+            place.due = place.due or due
+            if name not in view.to_act or not place.due:
                 continue
-            seat.due = False
-            if self._seconds is None and (seat.asked is not None or seat.answer is not None):
+            place.due = False
+            if self._seconds is None and (place.asked is not None or place.answer is not None):
                 continue  # it still thinks, or what came late is taken first
-            self._asks += 1
-            seat.asked, seat.asked_at, seat.asked_after, seat.answer = self._asks, now, steps, None
-            seat.mask = view.masks.get(name)
-            found.append(AskPolicy(name, self._asks, view.observations.get(name), view.infos.get(name), seat.mask))
+            found.append(self.ask(name, view, steps, now))
         return found
+
+    def ask(self, player: str, view: View, steps: int, now: float) -> AskPolicy:
+        """What this player's policy is to be asked now."""
+        place = self._places[player]
+        self._asks += 1
+        place.asked, place.asked_at, place.asked_after, place.answer = self._asks, now, steps, None
+        place.mask = view.masks.get(player)
+        return AskPolicy(player, self._asks, view.observations.get(player), view.infos.get(player), place.mask)
 
     def acted(self, player: str, ask_id: int, action: Any) -> str | None:
         """The policy has answered. What is wrong with the answer, in words; None if nothing is, or nobody waits."""
-        seat = self._seats.get(player)
-        if seat is None or seat.asked != ask_id:
+        place = self._places.get(player)
+        if place is None or place.asked != ask_id:
             return None
         try:
             index = operator.index(action)
         except TypeError:
             self.failed(player, ask_id)
             return f"its action is of the type {type(action).__name__}, not a whole number"
-        count = len(seat.player.action_space)
+        count = len(place.player.action_space)
         if not 0 <= index < count:
             self.failed(player, ask_id)
             return f"it chose action {str(index)[:20]}, but the actions are 0 to {count - 1}"
-        if not is_legal(index, seat.mask):
+        if not is_legal(index, place.mask):
             self.failed(player, ask_id)
             return f"it chose action {index}, which the environment's action mask forbids"
-        seat.asked, seat.answer, seat.failures = None, index, 0
+        place.asked, place.answer, place.failures = None, index, 0
         return None
 
     def failed(self, player: str, ask_id: int) -> bool:
         """The policy has raised an error; whether anything waits for this answer."""
-        seat = self._seats.get(player)
-        if seat is None or seat.asked != ask_id:
+        place = self._places.get(player)
+        if place is None or place.asked != ask_id:
             return False
-        seat.asked, seat.answer, seat.last = None, None, None
-        seat.failed = True
-        seat.failures += 1
+        place.asked, place.answer, place.last = None, None, None
+        place.failed = True
+        place.failures += 1
         return True
 
     def idles(self, player: str) -> bool:
         """Whether the policy is asked no more in this episode."""
-        return self._seats[player].idles
+        return self._places[player].idles
 
     def advise(self, player: str, action: int) -> None:
         """A program chooses the action of the next step."""
-        seat = self._seats[player]
-        seat.answer = action
+        place = self._places[player]
+        place.answer = action
 
     def take(self, name: str, mask: Mask | None, steps: int) -> Action:
         """The player's action of the step that begins now, in real time; `steps` were taken before."""
-        seat = self._seats[name]
-        player, failed = seat.player, seat.failed
-        seat.failed = False
+        place = self._places[name]
+        player, failed = place.player, place.failed
+        place.failed = False
         by: By
-        looked = seat.asked_after if failed else None
-        if seat.answer is not None:
-            return self._answered(seat, mask)
-        if failed or seat.idles or (player.by_program and seat.last is None):
+        looked = place.asked_after if failed else None
+        if place.answer is not None:
+            return self._answered(place, mask)
+        if failed or place.idles or (player.by_program and place.last is None):
             index, by = player.idle, "none"
-        elif seat.asked is not None or player.by_program:
-            seat.late += 1
-            index, by = self._last(seat), "late"
+        elif place.asked is not None or player.by_program:
+            place.late += 1
+            index, by = self._last(place), "late"
         else:
-            index, by = self._last(seat), "policy" if self._goes_on and seat.last is not None else "none"
+            index, by = self._last(place), "policy" if self._goes_on and place.last is not None else "none"
         index = legal_or_idle(index, player, mask)
         return Action(index, player.action_space[index], by, looked)
 
-    def _last(self, seat: _Seat) -> int:
-        return seat.last if self._goes_on and seat.last is not None else seat.player.idle
+    def _last(self, place: _Place) -> int:
+        return place.last if self._goes_on and place.last is not None else place.player.idle
 
-    def _answered(self, seat: _Seat, mask: Mask | None) -> Action:
-        player, chosen = seat.player, seat.answer
+    def _answered(self, place: _Place, mask: Mask | None) -> Action:
+        player, chosen = place.player, place.answer
         assert chosen is not None
-        seat.answer = None
+        place.answer = None
         index = legal_or_idle(chosen, player, mask)
-        seat.last = index
+        place.last = index
         by: By = "advice" if player.by_program else "policy" if index == chosen else "none"
-        return Action(index, player.action_space[index], by, None if player.by_program else seat.asked_after)
+        return Action(index, player.action_space[index], by, None if player.by_program else place.asked_after)
 
     def choice(self, name: str, mask: Mask | None, now: float) -> Action | None:
         """The player's action of this turn; None if the game waits for it."""
-        seat = self._seats[name]
-        player = seat.player
-        if seat.answer is not None:
-            return self._answered(seat, mask)
-        if seat.failed or seat.idles:
-            looked, seat.failed = seat.asked_after if seat.failed else None, False
+        place = self._places[name]
+        player = place.player
+        if place.answer is not None:
+            return self._answered(place, mask)
+        if place.failed or place.idles:
+            looked, place.failed = place.asked_after if place.failed else None, False
             return _idle(player, mask, "none", looked)
-        if now < self._until(seat):
+        if now < self._until(place):
             return None
-        seat.late += 1
-        if seat.asked is None:
+        place.late += 1
+        if place.asked is None:
             return _idle(player, mask, "late")
-        seat.asked = None
-        seat.failures += 1
-        return _idle(player, mask, "late", seat.asked_after)  # it looks all the same, and remembers that
+        place.asked = None
+        place.failures += 1
+        return _idle(player, mask, "late", place.asked_after)  # it looks all the same, and remembers that
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
         """A turn begins: programs have their time from now on, and nothing counts that was chosen before."""
-        for name, seat in self._seats.items():
-            if name in to_act and seat.player.by_program:
-                seat.asked_at, seat.answer = now, None
+        for name, place in self._places.items():
+            if name in to_act and place.player.by_program:
+                place.asked_at, place.answer = now, None
 
     def until(self, waiting: Sequence[str]) -> float | None:
         """When the time of one of these players is over; None if none of them is a policy."""
-        return min((self._until(self._seats[name]) for name in waiting if name in self._seats), default=None)
+        return min((self._until(self._places[name]) for name in waiting if name in self._places), default=None)
 
-    def _until(self, seat: _Seat) -> float:
-        return seat.asked_at + (self._seconds or 0.0)
+    def _until(self, place: _Place) -> float:
+        return place.asked_at + (self._seconds or 0.0)
 
 
 def _idle(player: Player, mask: Mask | None, by: By, observed: int | None = None) -> Action:

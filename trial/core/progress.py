@@ -1,25 +1,19 @@
-"""How far a trial is, and the rules of it: playing, pausing, episodes, frame rate, scores, actions. Pure; no clock.
+"""How far a trial is, and the rules of it: playing, pausing, episodes, breaks, frame rate, scores. Pure; no clock.
 
-Controls, actions and scores are kept by player (`trial/core/players.py`).
+What each player does at the next step is in `trial/core/choices.py`. Choices and scores are kept by player
+(`trial/core/players.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from enum import Enum
 
 from protocol.trial import Trial
 from trial.core.actions import Action
-from trial.core.controls import Controls
-from trial.core.players import NOOP, Mask, Player, View, is_legal, legal_or_idle, random_action
-from trial.core.policies import Policies
-from trial.core.seeds import policy_seed
-from trial.core.turns import Turns
-
-_NO_ACTION = "that action is not in this game's actionSpace"
-NOT_POSSIBLE = "that move is not possible now"
-"""What a participant is told who, turn by turn, chooses an action that the environment's mask forbids."""
+from trial.core.choices import Choices
+from trial.core.ended import PARTNER_LEFT, Break, Episode
+from trial.core.players import Player
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
@@ -36,37 +30,6 @@ class PlayState(Enum):
     PAUSED = "paused"
     BREAK = "break"
     ENDED = "ended"
-
-
-class CommandRefused(ValueError):
-    """What a client asked for is not possible now; the words go back to it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """An episode that is over. `why`: terminated, truncated, reset, stopped, failed, or turnSeconds (a turn's).
-
-    `score` is that of the first human; `scores` are those of all players, if there are several.
-    """
-
-    number: int
-    steps: int
-    score: float
-    why: str
-    scores: Mapping[str, float] = field(default_factory=dict)
-    limit: str | None = None
-    """The key of `trial` whose limit truncated it: maxSteps or episodeSeconds."""
-
-
-@dataclass(frozen=True, slots=True)
-class Break:
-    """A break that is over. `after`: the number of the episode before it.
-
-    `why`: over (its time), start, pause or stop (the player's command), left (the player), failed.
-    """
-
-    after: int
-    why: str
 
 
 class Progress:
@@ -86,24 +49,12 @@ class Progress:
         """The human whose action and score stand first in the records."""
         self.action_space = self.players[self.first].action_space
         """Of the first human."""
-        self.controls = {
-            name: Controls(
-                self.players[name].action_space,
-                config.action_buffer_lifespan,
-                self.players[name].idle,
-                keys=config.keys_of(name),
-                single=config.input == "single",
-            )
-            for name in self.humans
-        }
-        turns = config.pace == "turns"
-        self.turns = Turns(config.turn_seconds) if turns else None
-        self.policies = Policies(
-            (player for player in self.players.values() if not player.human),
-            frame_skip=config.frame_skip,
-            seconds=config.policy_seconds if turns else None,
-            goes_on=config.input != "single",  # an action that is taken once is not taken again between two choices
-        )
+        self.choices = Choices(config, self.players, self.humans)
+        """What each player does at the next step."""
+        self.controls = self.choices.controls
+        """The keys of each human."""
+        self.turns = self.choices.turns
+        """Turn by turn: who is to act, and the time they have; None in real time."""
         self.state = PlayState.READY
         self.outcome: str | None = None
         self.frame_rate = config.starting_frame_rate
@@ -125,16 +76,8 @@ class Progress:
         """Episodes and breaks that are over, in order; for the caller to take out."""
         self._failures = 0
         self._good_episodes = 0
-        self._advice: dict[str, int] = {}
-        self._usual = {  # made once: a step of a single human takes one of these
-            name: tuple(
-                (Action(index, action), Action(index, action, "human"))
-                for index, action in enumerate(self.players[name].action_space)
-            )
-            for name in self.humans
-        }
-        self._view: View | None = None  # None: all act, and may do all
-        self._seed = 0  # of the episode
+        self.told: Hashable = None
+        """In a session: becomes another value whenever members are to be told of each other anew."""
 
     @property
     def several(self) -> bool:
@@ -159,8 +102,8 @@ class Progress:
             self._add(self.scores, episode.scores or {self.first: episode.score})
             self._good_episodes += episode.why != "failed"
             self.episode = episode.number + 1
-        if ended and ended[-1].why == "stopped":
-            self._end("stopped")
+        if ended and ended[-1].why in ("stopped", PARTNER_LEFT):
+            self._end(ended[-1].why)
         elif self.episode > self.config.max_episodes:
             self.episode = self.config.max_episodes
             self._end("finished" if self._good_episodes else "failed")
@@ -217,8 +160,16 @@ class Progress:
         Without `player`, all humans.
         """
         self._hold("left")
-        for name in self.humans if player is None else (player,):
-            self.controls[name].clear()
+        self.choices.let_go(player)
+
+    def hold(self) -> None:
+        """A member of the session is missing: take no step. A break goes on."""
+        if self.playing:
+            self.state = PlayState.PAUSED
+
+    def partner_left(self) -> None:
+        """End the trial for all members of the session, because one of them stays away."""
+        self._end_all(PARTNER_LEFT, PARTNER_LEFT)
 
     def _hold(self, why: str) -> None:
         if self.on_break:
@@ -254,181 +205,36 @@ class Progress:
         name ends the one before. Turn by turn, each press and each key that goes down is a choice; it does nothing if
         it is not the player's turn. `player` is the first human if it is not given.
         """
-        controls = self.controls[player or self.first]
-        if self.turns is not None:
-            if controls.knows(name) or not lasts:  # a client of HIPPO's says by another name that nothing is pressed
-                self._choose(player or self.first, name, held)
-            return
-        if lasts:
-            controls.keep(name)
-        if not controls.knows(name) and not (lasts and name == NOOP):
-            raise CommandRefused(_NO_ACTION)
-        if lasts:
-            return
-        if held is None:
-            if self.playing and not self.frozen:  # a press while the game is held would act later than it was meant
-                controls.press(name)
-        elif held:
-            controls.hold(name)
-            if self.config.input == "single" and (self.frozen or not self.playing):
-                controls.forget_taps()
-        else:
-            controls.release(name)
-
-    def _choose(self, player: str, name: str, held: bool | None) -> None:
-        """A press, or a key going down or up, turn by turn. Raises CommandRefused."""
-        assert self.turns is not None
-        controls = self.controls[player]
-        if not controls.knows(name):
-            raise CommandRefused(_NO_ACTION)
-        index = controls.choice(name, held)
-        if index is None or not self.playing or self.frozen or not self.turns.waits_for(player):
-            return
-        if not is_legal(index, self._mask(player)):
-            raise CommandRefused(NOT_POSSIBLE)
-        self.turns.choose(player, Action(index, controls.names[index], "human"))
-
-    def _mask(self, player: str) -> Mask | None:
-        return None if self._view is None else self._view.masks.get(player)
+        on = self.playing and not self.frozen
+        self.choices.act(player or self.first, name, held, lasts=lasts, on=on)
 
     def next_actions(self) -> Mapping[str, Action]:
-        """Each player's action of the step that begins now. Advice is for this step, and counts if no key acts."""
-        view, turns = self._view, self.turns
-        actions: dict[str, Action] = {}
-        for name, player in self.players.items():
-            if view is not None and name not in view.to_act:
-                actions[name] = Action(player.idle, player.action_space[player.idle], acts=False)
-            elif turns is not None:
-                actions[name] = turns.chosen[name]
-            elif player.human:
-                actions[name] = self._asked_for(player)
-            else:
-                actions[name] = self.policies.take(name, self._mask(name), self.steps)
-        if self._advice:
-            self._advice.clear()
-        return actions
-
-    def _asked_for(self, player: Player) -> Action:
-        """The action of a human in real time. One that is not possible now is not taken."""
-        name = player.name
-        index, human = self.controls[name].take()
-        advice = self._advice.get(name) if self._advice and not human else None
-        mask = None if self._view is None else self._view.masks.get(name)
-        if advice is not None and is_legal(advice, mask):
-            return Action(advice, player.action_space[advice], "advice")
-        if mask is not None and not is_legal(index, mask):
-            index, human = legal_or_idle(index, player, mask), False
-        return self._usual[name][index][human]
+        """Each player's action of the step that begins now."""
+        return self.choices.next_actions(self.steps)
 
     # ---- turn by turn
 
-    def policies_choose(self, now: float) -> None:
-        """Turn by turn: take the choices of those policies that have answered, or whose time is over."""
-        turns = self.turns
-        for name in self._waiting():
-            if turns is not None and name in self.policies:
-                action = self.policies.choice(name, self._mask(name), now)
-                if action is not None:
-                    turns.choose(name, action)
-
     def turn_over(self) -> None:
-        """The time of the turn is over: choose for the humans who did not, or end the episode (`turnEnds`).
-
-        What a program advises counts before that.
-        """
-        turns = self.turns
-        for name in self._waiting():
-            player, mask = self.players[name], self._mask(name)
-            if turns is None or not player.human:
-                continue
-            advice = self._advice.get(name)
-            if advice is not None and is_legal(advice, mask):
-                turns.choose(name, Action(advice, player.action_space[advice], "advice"))
-            elif self.config.turn_ends == "episode":
-                self._good_episodes += 1
-                self._end_episode("turnSeconds")
-                return
-            elif self.config.turn_ends == "random":
-                index = random_action(player, mask, policy_seed(self._seed, f"{name}/{self.steps}"))
-                turns.choose(name, Action(index, player.action_space[index], "random"))
-            else:
-                index = legal_or_idle(player.idle, player, mask)
-                turns.choose(name, Action(index, player.action_space[index]))
-
-    def _waiting(self) -> tuple[str, ...]:
-        turns = self.turns
-        return () if turns is None else tuple(name for name in self.players if turns.waits_for(name))
-
-    @property
-    def humans_waited_for(self) -> bool:
-        """Turn by turn: the game waits for a human."""
-        return any(self.players[name].human for name in self._waiting())
-
-    def policies_until(self) -> float | None:
-        """Turn by turn: when the time of a policy that the game waits for is over."""
-        return self.policies.until(self._waiting())
+        """The time of the turn is over: choose for the humans who did not, or end the episode (`turnEnds`)."""
+        if self.choices.turn_over(self.steps):
+            self._good_episodes += 1
+            self._end_episode("turnSeconds")
 
     def to_act(self, player: str) -> bool:
         """Turn by turn: whether it is the player's turn, and they have not chosen."""
         return self.playing and self.turns is not None and self.turns.waits_for(player)
 
-    # ---- programs
-
-    def advise(self, action: int, player: str | None = None) -> None:
-        """A program advises this action for the next step, or chooses it for a player that it plays.
-
-        `player` is the one that a program plays, or the first human, if it is not given. Raises CommandRefused if there
-        is no such action or player.
-        """
-        known = self._player_of_program(player)
-        player = known.name
-        if not known.human and not known.by_program:
-            raise CommandRefused(f"the project has another policy for {player}")
-        if not 0 <= action < len(known.action_space):
-            raise CommandRefused(f"there is no action {action}; there are 0 to {len(known.action_space) - 1}")
-        if known.human:
-            self._advice[player] = action
-        else:
-            self.policies.advise(player, action)
-
-    def action_space_of(self, player: str | None) -> tuple[str, ...]:
-        """The names of the actions that `advise` takes. Raises CommandRefused if there is no such player."""
-        return self._player_of_program(player).action_space
-
-    def _player_of_program(self, player: str | None) -> Player:
-        """The player that a program names, or the one that it means if it names none. Raises CommandRefused."""
-        if player is None:
-            player = next((each.name for each in self.players.values() if each.by_program), self.first)
-        known = self.players.get(player)
-        if known is None:
-            raise CommandRefused(f"there is no such player; there are {', '.join(self.players)}")
-        return known
-
     # ---- steps
-
-    def begins(self, seed: int) -> None:
-        """The environment is being reset with this seed."""
-        self._seed = seed
-        self.policies.begin()
 
     def began(self) -> None:
         """The environment has been reset: the episode stands at its first picture."""
-        self._advice.clear()
+        self.choices.began()
         self.needs_reset = False
-
-    def see(self, view: View | None, now: float) -> None:
-        """This is what the players see now. None: all of them act, and all actions are possible."""
-        self._view = view
-        if self.turns is not None:
-            to_act = frozenset(self.players) if view is None else view.to_act & self.players.keys()
-            self.turns.begin(to_act)
-            self.policies.turn(to_act, now)
 
     def thaw(self) -> None:
         """The first picture has stood long enough: keys act, those that are held now too."""
         self.frozen = False
-        for controls in self.controls.values():
-            controls.forget_taps()
+        self.choices.forget_taps()
 
     def time_over(self) -> None:
         """The episode has been played for `episodeSeconds`, and no step is due that could be its last."""
@@ -478,14 +284,13 @@ class Progress:
             return
         if self.playing and self.config.between_seconds > 0:
             self.state = PlayState.BREAK
-            self._clear()  # keys that are held now are meant for the episode that is over
+            self.choices.let_go()  # keys that are held now are meant for the episode that is over
         else:
             self._next_episode()
 
     def _end_break(self, why: str, state: PlayState) -> None:
         self.ended.append(Break(self.episode, why))
-        for controls in self.controls.values():
-            controls.forget_taps()  # keys that go down in the break act in the next episode if they are held then
+        self.choices.forget_taps()  # keys that go down in the break act in the next episode if they are held then
         self.state = state
         self._next_episode()
 
@@ -508,9 +313,4 @@ class Progress:
     def _end(self, outcome: str) -> None:
         self.state = PlayState.ENDED
         self.outcome = outcome
-        self._clear()
-
-    def _clear(self) -> None:
-        """Let go of all keys."""
-        for controls in self.controls.values():
-            controls.clear()
+        self.choices.let_go()

@@ -7,16 +7,23 @@ from typing import Any
 
 from trial.core import messages
 from trial.core.effects import RecordLine
-from trial.core.progress import Break, Episode, Progress
+from trial.core.ended import Break, Episode
+from trial.core.progress import Progress
 
 
-def end(over: Episode | Break, said: Sequence[Mapping[str, Any]]) -> RecordLine:
-    """The line that ends an episode or a break. `said` are the participant's messages since the line before."""
+def end(
+    over: Episode | Break, said: Sequence[Mapping[str, Any]], outcomes: Mapping[str, str | None] | None = None
+) -> RecordLine:
+    """The line that ends an episode or a break. `said` are the participant's messages since the line before.
+
+    `outcomes`: in a session, by player, how the trial has ended with it for each member.
+    """
     fields: dict[str, Any] = {"episode": number(over)}
     if not isinstance(over, Break):
         fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
         fields |= {} if over.limit is None else {"limit": over.limit}
     fields |= {"why": over.why, "messages": said}
+    fields |= {} if outcomes is None else {"outcomes": outcomes}
     return RecordLine("break" if isinstance(over, Break) else "end", fields)
 
 
@@ -37,6 +44,14 @@ def answers(progress: Progress, seconds: float, trial_id: str) -> dict[str, Any]
         "trial": trial_id,
         "outcome": progress.outcome,
     }
+
+
+def member_answers(
+    progress: Progress, player: str, outcome: str | None, seconds: float, trial_id: str
+) -> dict[str, Any]:
+    """The answer of a member of a session, with their own score."""
+    own = {"score": messages.tidy(progress.scores[player]), "player": player, "outcome": outcome}
+    return answers(progress, seconds, trial_id) | own
 
 
 def number(over: Episode | Break) -> int:

@@ -1,9 +1,40 @@
-"""When the next step and the next episode are due, and how long was played. Pure; the clock is passed in.
+"""What is due now: a step, the end of a turn, a break or a first picture; and how long was played. Pure.
 
-All times are seconds of one monotonic clock.
+All times are seconds of one monotonic clock, which is passed in.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+from protocol.trial import Trial
+from trial.core.episode_time import EpisodeTime
+from trial.core.progress import Progress
+
+
+class Due(Enum):
+    """What is to be done now. MORE: the progress has changed, so ask again."""
+
+    NOTHING = "nothing"
+    MORE = "more"
+    RESET = "reset"
+    STEP = "step"
+
+
+class StateTimes(NamedTuple):
+    """Seconds that are left: of a break, of a turn, of the first picture, of the episode. None: there is none.
+
+    `session` is what the members of a session are told of each other.
+    """
+
+    next_in: float | None = None
+    turn_ends_in: float | None = None
+    starts_in: float | None = None
+    time_left: float | None = None
+    session: Mapping[str, Any] | None = None
 
 
 class Pacer:
@@ -30,49 +61,153 @@ class Pacer:
 
 
 class Timing:
-    """The times of one trial."""
+    """The times of one trial. It lets breaks, first pictures, turns and episodes end when their time is over."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: Trial) -> None:
         self.seconds = 0.0
         """Seconds that were played."""
+        self.wake_at: float | None = None
+        """When something is due if nothing is now; None: no time makes it so."""
+        self._between = config.between_seconds
+        self._max_steps = config.max_steps
+        self._episode = EpisodeTime(config.reset_freeze, config.episode_seconds)
         self._pacer = Pacer()
         self._due: float | None = None
         self._last_step: float | None = None
         self._break_began: float | None = None
 
-    def rest(self) -> None:
-        """No steps are taken now. The next one is due at once."""
-        self._pacer.rest()
-        self._due = self._last_step = None
+    # ---- what has happened
+
+    def begin_episode(self) -> None:
+        """An episode begins: its first picture is to stand."""
+        self._episode.begin()
+
+    def resume_episode(self, played: float) -> None:
+        """The episode was played for so long on an earlier server, and goes on."""
+        self._episode.go_on(played)
 
     def skip(self) -> None:
         """The step that was due is not taken."""
         self._due = None
-
-    def step_due(self, now: float, frame_rate: int) -> float:
-        """When the next step is due."""
-        if self._due is None:
-            self._due = self._pacer.next(now, frame_rate)
-        return self._due
-
-    def turn_due(self, frame_rate: int) -> float | None:
-        """When the next step is due turn by turn, if all have chosen; None: at once.
-
-        The rhythm only keeps it from coming before the step before was seen.
-        """
-        return None if self._last_step is None else self._last_step + 1.0 / frame_rate
 
     def stepped(self, now: float, frame_rate: int) -> None:
         """A step was taken."""
         self.seconds += 1.0 / frame_rate if self._last_step is None else now - self._last_step
         self._last_step = now
 
-    def break_left(self, now: float, length: float) -> float:
-        """Seconds of the break that are left. Its time begins when this is asked first."""
+    # ---- what is due
+
+    def next(self, progress: Progress, now: float) -> Due:
+        """What is due now. With NOTHING, `wake_at` says when to ask again."""
+        self.wake_at = None
+        playing = progress.playing
+        if not playing:
+            self._episode.rest(now)
+            left = self._break_left(progress, now)
+            if left is not None:
+                self._rest()
+                return self._break_over(progress, left, now)
+        else:
+            self._break_began = None
+        if progress.needs_reset:
+            return Due.RESET
+        if not playing:
+            self._rest()
+            if progress.turns is not None:
+                progress.turns.hold(now)
+            return Due.NOTHING
+        if self._stands(progress, now):
+            return Due.NOTHING
+        return self._step_due(progress, now) if progress.turns is None else self._turn_over(progress, now)
+
+    def _rest(self) -> None:
+        """No steps are taken now. The next one is due at once."""
+        self._pacer.rest()
+        self._due = self._last_step = None
+
+    def _break_left(self, progress: Progress, now: float) -> float | None:
+        """Seconds until the next episode, infinite if the player begins it; None if this is no break.
+
+        The time of a break begins when this is asked first.
+        """
+        if not progress.on_break:
+            self._break_began = None
+            return None
         if self._break_began is None:
             self._break_began = now
-        return max(0.0, self._break_began + length - now)
+        return max(0.0, self._break_began + self._between - now)
 
-    def break_over(self) -> None:
-        """There is no break now."""
-        self._break_began = None
+    def _break_over(self, progress: Progress, left: float, now: float) -> Due:
+        if left > 0.0:
+            self.wake_at = now + left if left < math.inf else None
+            return Due.NOTHING
+        progress.go_on()
+        return Due.MORE
+
+    def _stands(self, progress: Progress, now: float) -> bool:
+        """Whether the episode's first picture still stands; if not, the episode is played from now on."""
+        left = self._episode.starts_in(now)
+        if left > 0.0:
+            self._rest()
+            if progress.turns is not None:
+                progress.turns.hold(now)
+            self.wake_at = now + left
+            return True
+        if progress.frozen:
+            progress.thaw()
+        self._episode.run(now)
+        return False
+
+    def _step_due(self, progress: Progress, now: float) -> Due:
+        """In real time: whether the step of the next frame is due."""
+        if self._due is None:
+            self._due = self._pacer.next(now, progress.frame_rate)
+        if now < self._due:
+            self.wake_at = self._due
+            return Due.NOTHING
+        self._due = None
+        return Due.STEP
+
+    def _turn_over(self, progress: Progress, now: float) -> Due:
+        """Turn by turn: a step is due once all have chosen. The frame rate lets the step before be seen."""
+        turns, choices = progress.turns, progress.choices
+        assert turns is not None
+        turns.run(now)
+        choices.policies_choose(now)
+        ends_in = turns.ends_in(now) if choices.waits_for else None
+        if ends_in is not None and ends_in <= 0.0:
+            progress.turn_over()
+            return Due.MORE
+        if turns.waiting:
+            left = self._episode.left(now)
+            if left is not None and left <= 0.0:
+                progress.time_over()
+                return Due.MORE
+            ends = (choices.policies_until(), *(None if each is None else now + each for each in (left, ends_in)))
+            self.wake_at = min((each for each in ends if each is not None), default=None)
+            return Due.NOTHING
+        due = None if self._last_step is None else self._last_step + 1.0 / progress.frame_rate
+        if due is not None and now < due:
+            self.wake_at = due
+            return Due.NOTHING
+        return Due.STEP
+
+    def limit_of_step(self, progress: Progress, now: float) -> str | None:
+        """The key of `trial` that makes the step that begins now the episode's last one, if there is one."""
+        if self._max_steps and progress.steps + 1 >= self._max_steps:
+            return "maxSteps"
+        left = self._episode.left(now)
+        nearest = 0.5 / progress.frame_rate  # the step before would be farther from the limit, or the next one
+        return "episodeSeconds" if left is not None and left <= nearest else None
+
+    # ---- what clients are told
+
+    def told(self, progress: Progress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
+        """The seconds that are left of all that ends by its time, beside what is told of the `session`."""
+        return StateTimes(
+            next_in=self._break_left(progress, now),
+            turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
+            starts_in=self._episode.starts_in(now) if progress.stands else None,
+            time_left=None if progress.over or progress.on_break else self._episode.left(now),
+            session=session,
+        )

@@ -7,6 +7,7 @@ method returns, in their order. All times are seconds of one monotonic clock.
 Events in:
   already_played, start, agent_failed    what the store holds of the step, and whether the agent has started
   connect, disconnect, receive           clients; each connection belongs to a human
+  round_trip, member_saved               of a member of a session: their connection, their answer
   call_returned, call_failed             the agent's thread has finished the call that it was given
   policy_acted, policy_failed            the policy of a player that is no human has answered
   recording_opened, recording_failed, answer_saved        the store
@@ -20,59 +21,55 @@ Phases: STARTING until the store was read and the agent has started, PLAYING, SA
 and the answer), then FINISHED (the answer is stored) or CLOSED (there is no answer: the server had to end, or the game
 could not begin).
 
+This module decides what comes next and whom each event concerns. What the parts decide:
+  choices, policies, turns, controls     what each player does at the next step
+  progress                               episodes, breaks, scores, and how the trial ends
+  timing, episode_time                   when a step, a turn, a break or an episode is over
+  commands                               what a client may ask for, and what that does
+  alone, session, presence               who is here, and what follows: of one participant, or of several
+  beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
+  recording, records, message_log        what is recorded and answered
+  clients, messages                      what clients are told
+
 A player is a place of the environment (`trial/core/players.py`): a human plays it, or a policy. Each connection belongs
-to a human, and each human plays one player. Keys, actions and scores are kept by player in `trial/core/progress.py`.
+to a human, and each human plays one player.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-import traceback
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from typing import Any, Literal
 
 from trial.core import messages, records
-from trial.core.clients import Client, Clients, StateTimes, controls_of, scene_of, state_of
-from trial.core.controls import ARROWS, KEY
+from trial.core.alone import Alone
+from trial.core.beginning import Beginning
+from trial.core.clients import Client, Clients, state_of
+from trial.core.commands import Commands
 from trial.core.effects import (
     AgentTimeout,
-    Begun,
     Call,
-    CloseRecording,
     Effect,
     FeedbackCall,
     Log,
-    LogAgentError,
-    OpenRecording,
-    Pictures,
-    RecordLine,
     ReplayCall,
     Replayed,
-    ResetCall,
-    ResetPolicy,
-    SaveAnswer,
     StepCall,
-    StepTaken,
     TellMoved,
-    WriteLine,
 )
-from trial.core.episode_time import EpisodeTime
+from trial.core.ending import LAST_CALL_SECONDS, Ending
 from trial.core.flow_control import Window
 from trial.core.message_log import MessageLog
-from trial.core.players import Player, View, alone
-from trial.core.policies import FAILURES, Observed
-from trial.core.progress import Break, CommandRefused, Episode, Progress
-from trial.core.seeds import policy_seed
-from trial.core.timing import Timing
+from trial.core.players import Player, alone
+from trial.core.progress import Progress
+from trial.core.recording import Recording, words_of
+from trial.core.session import Session
+from trial.core.steps import Steps
+from trial.core.timing import Due, Timing
 from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
 
-LAST_CALL_SECONDS = 2.0
-"""The time that a call of the agent has to come back once the server must end."""
-
-_POLICY_FAILURES_SAID = 20
 EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
 EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
 TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
@@ -101,9 +98,6 @@ class Trial:
         """`assets` are the images of a game that is drawn by objects, as clients are told of them."""
         self.settings = settings
         self.config = settings.trial
-        shown = self.config.ui.shown()
-        self._offered = (*shown, *ARROWS) if self.config.keys else shown
-        self._scene = scene_of(self.config, assets)
         self.step = step
         self.id = trial_id
         self.phase = Phase.STARTING
@@ -114,32 +108,28 @@ class Trial:
         self.wake_at: float | None = None
         """When `advance` is to be called if nothing else happens before; None: there is no need to."""
         self.progress = Progress(self.config, alone(self.config.action_space or ("noop",)))
-        self._new_seed = new_seed
+        self._now = 0.0
         self._effects: list[Effect] = []
-        self._clients = Clients(self._emit)
+        self._emit = self._effects.append
         self._messages = MessageLog()
-        self._timing = Timing()
-        self._episode_time = EpisodeTime(self.config.reset_freeze, self.config.episode_seconds)
+        self._timing = Timing(self.config)
+        self._recording = Recording(self._emit)
+        self._clients = Clients(self.config, self._timing, self._emit, assets)
+        self._commands = Commands(self.config)
+        emit, timing, message_log, recording = self._emit, self._timing, self._messages, self._recording
+        self._beginning = Beginning(
+            settings, timing=timing, recording=recording, message_log=message_log, new_seed=new_seed, emit=emit
+        )
+        self._steps = Steps(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
+        self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
+        self._session: Alone | Session = Alone(self.progress, trial_id)
         self._call: Call | None = None  # the agent has this call
         self._agent_hangs = False  # a call was given up, so the agent's thread takes no other
-        self._commands: list[str] = []  # reset and stop wait for the end of a step
-        self._recording = False  # a recording is open
-        self._opening = False  # an episode waits for its recording to be opened
-        self._seed = 0  # of the episode
-        self._unfinished: UnfinishedEpisode | None = None  # an earlier server began it
-        self._begun_again: int | None = None  # this episode, because it could not be replayed
+        self._give_up_at: float | None = None
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._closing = False
-        self._give_up_at: float | None = None
-        self._break_shut_down = False
-        self._last_lines_written = False
         self._met: set[str] = set()  # players whose participants have been here
-        self._said: set[str] = set()  # of policies, in the log
-        config = self.config
-        self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
-        """Clients are told of times also while the game goes on."""
-        self._now = 0.0
 
     @property
     def broken(self) -> bool:
@@ -164,7 +154,7 @@ class Trial:
     # ---- events: the start
 
     def already_played(self, answers: Mapping[str, Any]) -> list[Effect]:
-        """An earlier server stored this answer of the step."""
+        """An earlier server stored this answer of the step. In a session: those of all members, by their ids."""
         self._earlier_answers = answers
         self.phase = Phase.FINISHED
         self.ready = True
@@ -178,15 +168,41 @@ class Trial:
         self.progress.failed(fatal=True)
         return self.advance(now)
 
-    def start(self, players: Sequence[Player], recorded: RecordedTrial | None, now: float) -> list[Effect]:
-        """The agent has started: these are the environment's players, and what earlier servers recorded of the step."""
+    def start(
+        self,
+        players: Sequence[Player],
+        recorded: RecordedTrial | None,
+        now: float,
+        *,
+        places: Mapping[str, str] | None = None,
+        vacant: Sequence[str] = (),
+    ) -> list[Effect]:
+        """The agent has started: these are the environment's players, and what earlier servers recorded of the step.
+
+        In a session, `places` says which player each member plays, by their id, and `vacant` are the places of humans
+        that no member has: policies are in them.
+        """
         if self.phase is not Phase.STARTING:
             return []
         self.phase = Phase.PLAYING
         self.progress = Progress(self.config, players)
+        if places:
+            self._session = Session(
+                self.config,
+                self.progress,
+                places,
+                vacant=vacant,
+                recorded=recorded,
+                trial_id=self.id,
+                say_each=self._clients.say_each,
+                recording=self._recording,
+                emit=self._emit,
+            )
+        else:
+            self._session = Alone(self.progress, self.id)
         if recorded is not None:
             self.progress.resume(recorded.ended)
-            self._unfinished = recorded.unfinished
+            self._beginning.unfinished = recorded.unfinished
             self._timing.seconds = recorded.seconds
         return self.advance(now)
 
@@ -201,19 +217,24 @@ class Trial:
         replaced = self._clients.replace(human)
         if replaced is not None:
             self._left(replaced)
-        client = self._clients.add(human, connection, window, self.progress.humans)
-        self._note("connected")
+        session, player = self._session, self._session.place_of(human)
+        client = self._clients.add(human, connection, window, player)
+        self._note("connected", client)
         if self.finished:
-            self._send_done()
+            self._send_done(human, client)
             return self._take_effects()
-        self._tell_moved("on_return" if client.player in self._met else "on_join", client.player)
-        self._met.add(client.player)
-        self._clients.send(client, self._controls(client))
-        client.sent = state_of(self.progress, client.player)
-        if self._failed_words is not None:
-            self._clients.send(client, messages.error(self._failed_words))
-        elif self._begun_again == self.progress.episode and not self.progress.steps:
-            self._clients.send(client, messages.error(EPISODE_BEGINS_AGAIN))
+        session.come(player, now)
+        self._tell_moved("on_return" if player in self._met else "on_join", player)
+        self._met.add(player)
+        self._clients.send_controls(client, self.progress, session, now)
+        client.sent = state_of(self.progress, player)
+        words = session.sentence(player) or self._failed_words
+        if words is None and self._beginning.begun_again == self.progress.episode and not self.progress.steps:
+            words = EPISODE_BEGINS_AGAIN
+        if words is not None:
+            self._clients.send(client, messages.error(words))
+        if session.has_answered(human):
+            self._send_done(human, client)
         self._clients.show_again(client)
         return self.advance(now)
 
@@ -226,6 +247,14 @@ class Trial:
         self._left(client)
         return self.advance(now)
 
+    def round_trip(self, human: str, seconds: float, now: float) -> list[Effect]:
+        """The human's browser has answered a ping after so many seconds. Only sessions are told of it."""
+        self._now = now
+        if self.phase is not Phase.PLAYING:
+            return []
+        self._session.round_trip(self._session.place_of(human), seconds, now)
+        return self.advance(now)
+
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
         """A client's message. One from a connection that was replaced changes nothing."""
         self._now = now
@@ -233,19 +262,21 @@ class Trial:
         if client is None:
             return []
         try:
+            if not self._session.hears(client.player, message, client.window, now):
+                return []
             self._handle(client, message)
-        except CommandRefused as error:
+        except messages.CommandRefused as error:
             self._clients.send(client, messages.error(str(error)))
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
         """A program that may do so advises an action for the next step, or chooses it for a player that it plays.
 
-        `player` as in `Progress.advise`. Raises CommandRefused.
+        `player` as in `Choices.advise`. Raises CommandRefused.
         """
         if self.phase is not Phase.PLAYING:
-            raise CommandRefused("no game is going on")
-        self.progress.advise(action, player)
+            raise messages.CommandRefused("no game is going on")
+        self.progress.choices.advise(action, player)
         return self.advance(now) if self.progress.turns is not None else []
 
     # ---- events: the agent
@@ -256,13 +287,14 @@ class Trial:
             return []
         self._now, self._call, self._give_up_at = now, None, None
         if isinstance(call, StepCall):
-            self._stepped(call, result)
+            self._steps.taken(call, result, self.progress, now)
         elif isinstance(call, FeedbackCall):
-            self._record_end(call)
+            self._ending.record(call, self.progress, self._session)
         elif isinstance(call, ReplayCall):
             self._replayed(call.unfinished, result)
         else:
-            self._began(result)
+            self._steps.began(result, self.progress, now)
+            self.ready = True
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
@@ -275,20 +307,19 @@ class Trial:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
             self._emit(Log(logging.WARNING, text))
-            self._begun_again = self.progress.episode
-            self._reset()
+            self._start_call(self._beginning.begin_again(self.progress, self._session))
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
-            self._record_error(error, records.number(self.progress.ended[0]))
+            self._recording.agent_failed(error, records.number(self.progress.ended[0]), self.progress.steps)
             if hangs:
                 self._fail(fatal=True)
-            self._record_end(call)
+            self._ending.record(call, self.progress, self._session)
         else:
             if isinstance(call, StepCall):
                 self._messages.heard(call.heard)  # the messages stay, for the line that ends the episode
-            self._record_error(error, self.progress.episode)
+            self._recording.agent_failed(error, self.progress.episode, self.progress.steps)
             self._fail(fatal=hangs)
             if isinstance(call, ReplayCall):
-                self._repeat_feedback(call.unfinished)
+                self._beginning.repeat_feedback(call.unfinished, self._ns())
         return self.advance(now)
 
     # ---- events: policies
@@ -296,40 +327,32 @@ class Trial:
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
         """The player's policy chose this action. An answer to an earlier question changes nothing."""
         self._now = now
-        wrong = self.progress.policies.acted(player, ask_id, action)
+        wrong = self.progress.choices.policies.acted(player, ask_id, action)
         if wrong is not None:
-            self._policy_failed(player, wrong)
+            self._recording.policy_failed(self.progress, player, wrong)
         # In real time the answer waits for the next step.
         return self.advance(now) if wrong is not None or self.progress.turns is not None else []
 
     def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
         """The player's policy raised this error."""
         self._now = now
-        if self.progress.policies.failed(player, ask_id):
-            self._policy_failed(player, "".join(traceback.format_exception_only(error)).strip()[:2000])
+        if self.progress.choices.policies.failed(player, ask_id):
+            self._recording.policy_failed(self.progress, player, words_of(error))
         return self.advance(now)
 
     # ---- events: the store
 
     def recording_opened(self, now: float) -> list[Effect]:
         """The recording that was asked for is open."""
-        self._now, self._recording, self._opening = now, True, False
-        unfinished, self._unfinished = self._unfinished, None
-        if unfinished is not None and unfinished.steps:
-            self.progress.begins(self._seed)
-            default = {name: player.idle for name, player in self.progress.players.items()}
-            self._start_call(
-                ReplayCall(limit=self.settings.start_seconds, unfinished=unfinished, default_actions=default)
-            )
-        else:
-            if unfinished is not None:
-                self._repeat_feedback(unfinished)
-            self._reset()
+        self._now = now
+        self._recording.opened()
+        self._start_call(self._beginning.opened(self.progress, self._session, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
         """The recording cannot be opened: nothing is played that is not recorded."""
-        self._now, self._opening = now, False
+        self._now = now
+        self._recording.failed()
         self._fail(fatal=True)
         return self.advance(now)
 
@@ -340,9 +363,19 @@ class Trial:
             self.phase = Phase.CLOSED
             return []
         self.phase = Phase.FINISHED
-        self._send_done()
+        for human, client in self._clients.by_human():
+            self._send_done(human, client)
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
         return [Log(logging.INFO, text), *self._take_effects()]
+
+    def member_saved(self, human: str, now: float) -> list[Effect]:
+        """The answer of a member who does not play is stored."""
+        self._now = now
+        self._session.saved(human)
+        for each, client in self._clients.by_human():
+            if each == human and not self.finished:
+                self._send_done(human, client)
+        return self.advance(now)
 
     # ---- events: time
 
@@ -352,16 +385,21 @@ class Trial:
         self.wake_at = None
         if self._give_up_at is not None and now >= self._give_up_at:
             self._call, self._give_up_at, self._agent_hangs = None, None, True
-        while self._call is None and not self._opening and self._go_on():
+        while self._call is None and not self._recording.is_awaited and self._go_on():
             pass
         if self._call is not None:
             self.wake_at = self._give_up_at
-        self._send_state()
+        elif self.phase is Phase.PLAYING and not self._closing:
+            wake_at = self._session.wake_at(now)
+            if wake_at is not None:
+                self.wake_at = wake_at if self.wake_at is None else min(wake_at, self.wake_at)
+        if not self.finished:
+            self._clients.send_state(self.progress, self._session, now)
         return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
         """The server must end: stop where the game stands. There is no answer unless the trial is over."""
-        self._closing = True
+        self._closing = self._commands.closed = self._ending.closing = True
         if self._call is not None:
             self._give_up_at = now + LAST_CALL_SECONDS
         if self.phase is Phase.STARTING:
@@ -374,301 +412,71 @@ class Trial:
         """Do the next thing; whether there is another one to do at this time."""
         if self.phase is Phase.PLAYING:
             return self._play()
-        if self.phase is Phase.SAVING and not self._last_lines_written:
+        if self.phase is Phase.SAVING and not self._ending.all_written:
             return self._write_last_lines()
         return False
 
     def _play(self) -> bool:
         progress = self.progress
         if not self._closing:
-            self._do_commands()
+            self._session.attend(self._now, self._timing.seconds)
+            if self._commands.waiting:
+                self._commands.carry_out_waiting(progress, self._session, self._timing)
             if progress.ended:
                 return self._write_end()
         if progress.over or self._closing:
             self.phase = Phase.SAVING
             self.ready = True
             return True
-        left = self._break_left()
-        if not progress.playing:
-            self._episode_time.rest(self._now)
-        if left is not None:
-            self._timing.rest()
-            if left > 0.0:
-                self.wake_at = self._now + left if left < math.inf else None
-                return False
-            progress.go_on()
-        elif progress.needs_reset:
-            self._begin_episode()
-        elif not progress.playing:
-            self._timing.rest()
-            if progress.turns is not None:
-                progress.turns.hold(self._now)
+        due = self._timing.next(progress, self._now)
+        if due is Due.STEP:
+            if self._paused_by_stalled():
+                return True
+            self._start_call(self._steps.take(progress, self._now))
             return False
-        elif self._stands():
+        if due is Due.RESET:
+            call = self._beginning.begin(progress, self._session)
+            if call is not None:
+                self._start_call(call)
+        elif due is Due.NOTHING:
+            self.wake_at = self._timing.wake_at
             return False
-        elif progress.turns is not None:
-            return self._turn_if_over()
-        else:
-            return self._step_if_due()
         return True
 
-    def _stands(self) -> bool:
-        """Whether the episode's first picture still stands; if not, the episode is played from now on."""
-        progress, left = self.progress, self._episode_time.starts_in(self._now)
-        if left > 0.0:
-            self._timing.rest()
-            if progress.turns is not None:
-                progress.turns.hold(self._now)
-            self.wake_at = self._now + left
-            return True
-        if progress.frozen:
-            progress.thaw()
-        self._episode_time.run(self._now)
-        return False
-
-    def _do_commands(self) -> None:
-        if not self._commands:
-            return
-        commands, self._commands = self._commands, []
-        for command in commands:
-            self._timing.skip()
-            if command == "stop":
-                self.progress.stop()
-            else:
-                self.progress.reset()
-
-    def _break_left(self) -> float | None:
-        """Seconds until the next episode, infinite if the player begins it; None if this is no break."""
-        if not self.progress.on_break:
-            self._timing.break_over()
-            return None
-        return self._timing.break_left(self._now, self.config.between_seconds)
-
-    def _begin_episode(self) -> None:
-        unfinished = self._unfinished
-        self._seed = self._next_seed() if unfinished is None or unfinished.seed is None else unfinished.seed
-        if self._recording:
-            self._reset()
-            return
-        self._opening = True
-        progress = self.progress
-        players = tuple(progress.players.values()) if progress.several else ()
-        self._emit(OpenRecording(progress.episode, self._seed, progress.frame_rate, progress.action_space, players))
-
-    def _next_seed(self) -> int:
-        first = self.config.seed
-        return self._new_seed() if first is None else first + self.progress.episode - 1
-
-    def _reset(self) -> None:
-        self.progress.begins(self._seed)
-        self._reset_policies({})
-        self._start_call(ResetCall(limit=self.settings.step_seconds, episode=self.progress.episode, seed=self._seed))
-
-    def _reset_policies(self, observed: Mapping[str, Sequence[Observed]]) -> None:
-        for player in self.progress.policies.asked:
-            seed = policy_seed(self._seed, player.name)
-            self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
-
-    def _began(self, begun: Begun) -> None:
-        self._emit(WriteLine(begun.line))
-        self.progress.began()
-        self._episode_time.begin()
-        self._see(begun.view)
-        self._show(begun.pictures)
-
-    def _see(self, view: View | None) -> None:
-        """The players see this, and those that are no humans are asked."""
-        progress = self.progress
-        progress.see(view, self._now)
-        if view is not None and progress.policies:
-            for ask in progress.policies.asks(view, progress.steps, self._now):
-                self._emit(ask)
-
     def _replayed(self, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
-        steps = len(unfinished.steps)
-        self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
-        self._reset_policies(replayed.observed)
-        self._episode_time.go_on(steps / self.progress.frame_rate)
-        self.progress.replayed(steps, unfinished.scores or {self.progress.first: unfinished.score})
-        self.progress.policies.go_on(unfinished.going_on)
-        self._see(replayed.view)
-        self._show(replayed.pictures)
-        self._emit(Log(logging.INFO, f"the game goes on after {steps} steps of an earlier server"))
-        self._repeat_feedback(unfinished)
-
-    def _repeat_feedback(self, unfinished: UnfinishedEpisode) -> None:
-        """Take up the feedback that an earlier server's agent did not hear any more."""
-        self._messages.repeat(unfinished.unheard, self._ns())
-
-    def _step_if_due(self) -> bool:
-        due = self._timing.step_due(self._now, self.progress.frame_rate)
-        if self._now < due:
-            self.wake_at = due
-            return False
-        self._timing.skip()
-        if self._paused_by_stalled():
-            return True
-        self._take_step()
-        return False
+        self._beginning.replayed(self.progress, unfinished, replayed)
+        self._steps.show(replayed, self.progress, self._now)
+        self.ready = True
+        self._emit(Log(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
+        self._beginning.repeat_feedback(unfinished, self._ns())
 
     def _paused_by_stalled(self) -> bool:
         """Pause if a page has stopped answering; whether that is so."""
-        stalled = self._clients.stalled(self._now)
+        stalled = [each for each in self._clients.stalled(self._now) if self._session.sleeps(each.player, self._now)]
         for client in stalled:
             self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
-            self._note("stopped answering")
-            self.progress.leave(client.player)
+            self._note("stopped answering", client)
         return bool(stalled)
-
-    def _turn_if_over(self) -> bool:
-        """Take the step of this turn once all have chosen; whether there is another thing to do at this time."""
-        progress, turns, now = self.progress, self.progress.turns, self._now
-        assert turns is not None
-        turns.run(now)
-        progress.policies_choose(now)
-        ends_in = turns.ends_in(now) if progress.humans_waited_for else None
-        if ends_in is not None and ends_in <= 0.0:
-            progress.turn_over()
-            return True
-        left = self._episode_time.left(now)
-        if turns.waiting:
-            if left is not None and left <= 0.0:
-                progress.time_over()
-                return True
-            until = progress.policies_until()
-            ends = [until] if until is not None else []
-            ends += [] if left is None else [now + left]
-            self.wake_at = min([*ends, now + ends_in] if ends_in is not None else ends, default=None)
-            return False
-        due = self._timing.turn_due(progress.frame_rate)
-        if due is not None and now < due:
-            self.wake_at = due
-            return False
-        if self._paused_by_stalled():
-            return True
-        self._take_step()
-        return False
-
-    def _take_step(self) -> None:
-        progress, clients = self.progress, self._clients
-        said, dropped = self._messages.messages, self._messages.take_dropped()
-        fields: dict[str, Any] = {
-            "episode": progress.episode,
-            "step": progress.steps + 1,
-            "frame": clients.frame_id + 1,
-        }
-        if said:
-            fields["messages"] = said
-        if dropped:
-            fields["messagesDropped"] = dropped
-        self._start_call(
-            StepCall(
-                limit=self.settings.step_seconds,
-                actions=progress.next_actions(),
-                feedback=self._messages.feedback,
-                messages=len(said),
-                fields=fields,
-                truncated_by=self._truncates(),
-            )
-        )
-
-    def _truncates(self) -> str | None:
-        """The key of `trial` that makes the step that begins now the episode's last one, if there is one."""
-        most = self.config.max_steps
-        if most and self.progress.steps + 1 >= most:
-            return "maxSteps"
-        left = self._episode_time.left(self._now)
-        nearest = 0.5 / self.progress.frame_rate  # the step before would be farther from the limit, or the next one
-        return "episodeSeconds" if left is not None and left <= nearest else None
-
-    def _stepped(self, call: StepCall, step: StepTaken) -> None:
-        self._emit(WriteLine(step.line))
-        self._messages.recorded(call.messages, len(call.feedback))
-        self._timing.stepped(self._now, self.progress.frame_rate)
-        progress, ended = self.progress, len(self.progress.ended)
-        progress.stepped(step.rewards, step.terminated, step.truncated, call.truncated_by)
-        if len(progress.ended) == ended and (step.view is not None or progress.turns is not None):
-            self._see(step.view)
-        self._show(step.pictures)
-
-    def _show(self, pictures: Pictures) -> None:
-        self._clients.show(pictures)
-        self.ready = True
 
     def _start_call(self, call: Call) -> None:
         self._call = call
         self._emit(call)
 
-    # ---- what ends
-
     def _write_end(self) -> bool:
-        """Record the end of an episode or a break, and its last messages. The agent hears their feedback before."""
-        progress = self.progress
-        call = FeedbackCall(
-            limit=LAST_CALL_SECONDS if self._closing else self.settings.step_seconds,
-            feedback=self._messages.feedback,
-            messages=len(self._messages.messages),
-            over=progress.ended[0],
-            last=progress.over and len(progress.ended) == 1,
-        )
+        """Record the end of an episode or a break. The agent hears the last feedback of it before."""
+        call = self._ending.last_feedback(self.progress)
         if (call.feedback or self.callbacks) and not self._agent_hangs:
             self._start_call(call)
             return False
-        self._record_end(call)
+        self._ending.record(call, self.progress, self._session)
         return True
 
-    def _record_end(self, call: FeedbackCall) -> None:
-        over = self.progress.ended.pop(0)
-        if isinstance(over, Episode):
-            for player, late in self.progress.policies.late().items():
-                self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
-        self._emit(records.end(over, self._messages.messages[: call.messages]))
-        self._messages.recorded(call.messages, len(call.feedback))
-        # The break after an episode belongs to its file.
-        more = isinstance(self.progress.ended[0], Break) if self.progress.ended else self.progress.on_break
-        if self.config.data_file == "episode" and not more:
-            self._close_recording()
-
     def _write_last_lines(self) -> bool:
-        progress = self.progress
-        if self._closing and progress.on_break and not self._break_shut_down:
-            self._break_shut_down = True
-            progress.ended.append(Break(progress.episode, "shutdown"))
-        if progress.ended:
+        self._ending.shut_down_break(self.progress)
+        if self.progress.ended:
             return self._write_end()
-        self._last_lines_written = True
-        if self._closing and not progress.over and not progress.on_break:
-            self._emit(records.shutdown(progress, self._messages.messages))
-        self._close_recording()
-        played = progress.over and not self.broken
-        self._emit(SaveAnswer(records.answers(progress, self._timing.seconds, self.id) if played else None))
+        self._ending.write_last(self.progress, self._session, broken=self.broken)
         return False
-
-    def _close_recording(self) -> None:
-        if self._recording:
-            self._recording = False
-            self._emit(CloseRecording())
-
-    # ---- what fails
-
-    def _record_error(self, error: Exception, episode: int) -> None:
-        words = "".join(traceback.format_exception_only(error)).strip()
-        self._emit(LogAgentError(error))
-        self._emit(RecordLine("error", {"episode": episode, "step": self.progress.steps, "error": words[:2000]}))
-
-    def _policy_failed(self, player: str, words: str) -> None:
-        """Say in the log and in the recording that a policy has failed, once for each reason."""
-        plays = self.progress.players[player].plays
-        said = [f"the policy of {player} ({plays}) failed: {words}"]
-        if self.progress.policies.idles(player):
-            said.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")
-        for text in said:
-            if text in self._said or len(self._said) >= _POLICY_FAILURES_SAID:
-                continue
-            self._said.add(text)
-            self._emit(Log(logging.ERROR, text))
-            where = {"episode": self.progress.episode, "step": self.progress.steps, "player": player}
-            self._emit(RecordLine("error", {**where, "error": text}))
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)
@@ -680,9 +488,8 @@ class Trial:
     # ---- clients
 
     def _left(self, client: Client) -> None:
-        self._note("disconnected")
-        if not self._closing:  # the end of the server has ended what was on
-            self.progress.leave(client.player)
+        self._note("disconnected", client)
+        self._session.go(client.player, self._now, closing=self._closing)
         self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
@@ -691,71 +498,36 @@ class Trial:
 
     def _handle(self, client: Client, message: messages.Message) -> None:
         """Do what a client asks for. Raises CommandRefused with words for the client."""
-        command = message.command
-        if message.frame_rate is not None and not self.config.allow_frame_rate_change:
-            raise CommandRefused("the frame rate of this game is fixed")
-        missing = messages.not_offered(message, self._offered)
-        if missing is not None:
-            raise CommandRefused(f"{missing} is not offered in this game")
-        if messages.is_feedback(command) and self.progress.over:
-            raise CommandRefused("the game is over, and no command has an effect any more")
-        self._messages.add(message, self._ns())
-        if command is not None:
-            self._command(client, command)
-        if message.frame_rate is not None:
-            self.progress.change_frame_rate(message.frame_rate)
-        if message.action is not None:
-            self.progress.act(message.action, message.held, lasts=message.lasts, player=client.player)
-        if message.key is not None:
-            self.progress.act(KEY + message.key, message.held, player=client.player)
+        progress, session = self.progress, self._session
+        self._commands.check(message, progress)
+        self._messages.add(message, self._ns(), session.name_of(client.player))
+        if message.command == "requestUI":
+            self._clients.send_controls(client, progress, session, self._now)
+        self._commands.carry_out(message, client.player, progress, session, self._now)
 
-    def _command(self, client: Client, command: str) -> None:
-        if command == "requestUI":
-            self._clients.send(client, self._controls(client))
-        elif self._closing:
-            pass  # the end of the server has ended what was on
-        elif command == "start":
-            self.progress.start()
-        elif command == "pause":
-            self.progress.pause()
-        elif command in ("reset", "stop") and command not in self._commands:
-            self._commands.append(command)
-
-    def _note(self, event: str) -> None:
+    def _note(self, event: str, client: Client) -> None:
         """Keep for the recording an event that no message reports."""
-        self._messages.note(event, self._ns())
+        self._messages.note(event, self._ns(), self._session.name_of(client.player))
 
     def _ns(self) -> int:
         return int(self._now * 1e9)
 
-    def _send_state(self) -> None:
-        if not self.finished:
-            progress = self.progress
-            self._clients.send_state(progress, self._times if self._timed or progress.on_break else None)
-
-    def _times(self) -> StateTimes:
-        progress, now = self.progress, self._now
-        return StateTimes(
-            next_in=self._break_left(),
-            turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
-            starts_in=self._episode_time.starts_in(now) if progress.stands else None,
-            time_left=None if progress.over or progress.on_break else self._episode_time.left(now),
-        )
-
-    def _controls(self, client: Client) -> str:
-        return controls_of(self.progress, client.player, self._times(), self._scene)
-
-    def _send_done(self) -> None:
-        episodes, score = self.progress.episodes_played, self.progress.score
-        if self._earlier_answers is not None:
-            episodes, score = self._earlier_answers.get("episodes", 0), self._earlier_answers.get("score", 0)
-            self._clients.send_done(episodes, self._earlier_answers.get("scores") or {}, score)
+    def _send_done(self, human: str, client: Client) -> None:
+        progress, answers = self.progress, self._earlier_answers
+        if answers is not None and self.settings.session:
+            answers = answers.get(human)
+        elif answers is None:
+            answers = self._session.answer_of(human)
+        if answers is None:
+            episodes, score = progress.episodes_played, progress.scores[client.player]
+            self._clients.send_done(client, episodes, score)
             return
-        self._clients.send_done(episodes, self.progress.scores, score)
-
-    def _emit(self, effect: Effect) -> None:
-        self._effects.append(effect)
+        scores = {} if self.settings.session else answers.get("scores") or {}
+        score = scores.get(client.player, answers.get("score", 0))
+        outcome = answers.get("outcome") if self.settings.session else None
+        self._clients.send_done(client, answers.get("episodes", 0), score, outcome)
 
     def _take_effects(self) -> list[Effect]:
-        effects, self._effects = self._effects, []
+        effects = self._effects.copy()
+        self._effects.clear()
         return effects

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from trial.core.progress import Episode
+from trial.core.ended import Episode
+from trial.core.message_log import Word
+from trial.core.policies import FAILURES
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,7 @@ class RecordedStep:
     human: int | None
     action: int | None
     reward: float
-    feedback: tuple[str, ...] = ()
+    feedback: tuple[Word, ...] = ()
     advice: int | None = None
     players: Mapping[str, RecordedAction] = field(default_factory=dict)
 
@@ -40,7 +42,7 @@ class UnfinishedEpisode:
     number: int
     seed: int | None
     steps: list[RecordedStep] = field(default_factory=list)
-    unheard: list[str] = field(default_factory=list)
+    unheard: list[Word] = field(default_factory=list)
     """Feedback after the last step, which the agent did not hear before the server ended."""
 
     @property
@@ -70,6 +72,28 @@ class UnfinishedEpisode:
             if part.action is not None and chosen.get(player) == part.action
         }
 
+    @property
+    def failures(self) -> dict[str, int]:
+        """By player, how often its policy failed in a row, up to the end.
+
+        What it looked at stands in a step that a policy failed for. An action that had become illegal when it came
+        looks alike; but after that the policy is asked again, and one that idles is not.
+        """
+        found: dict[str, int] = {}
+        idle: set[str] = set()
+        for step in self.steps:
+            for player, part in step.players.items():
+                failed = part.observed is not None and part.by in ("none", "late")
+                if failed:
+                    found[player] = found.get(player, 0) + 1
+                elif part.by == "none" and found.get(player, 0) >= FAILURES:
+                    idle.add(player)
+                elif part.observed is not None or part.by == "human":
+                    found.pop(player, None)
+                if part.observed is not None or part.by == "human":
+                    idle.discard(player)
+        return {player: count if player in idle else min(count, FAILURES - 1) for player, count in found.items()}
+
 
 @dataclass(slots=True)
 class RecordedTrial:
@@ -78,3 +102,5 @@ class RecordedTrial:
     ended: list[Episode] = field(default_factory=list)
     unfinished: UnfinishedEpisode | None = None
     seconds: float = 0.0
+    outcomes: dict[str, str] = field(default_factory=dict)
+    """In a session, by player: how the trial has ended for each member, as far as it has."""

@@ -33,6 +33,7 @@ from websockets.typing import Subprotocol
 from trial.gym import handover
 from trial.gym.errors import reason
 from trial.gym.limits import Limits
+from trial.gym.wakeup import Wakeup
 
 PATH = "/gym"
 SUBPROTOCOL = "hippodrome.gym.1"
@@ -94,6 +95,14 @@ class Server:
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._control, selectors.EVENT_READ, self._listen_to_spawner)
+        with contextlib.closing(Wakeup()) as wakeup:
+            self._selector.register(wakeup, selectors.EVENT_READ, wakeup.clear)
+            try:
+                self._serve()
+            finally:
+                self._selector.unregister(wakeup)
+
+    def _serve(self) -> None:
         checked = time.monotonic()
         while True:
             for key, _ in self._selector.select(1.0 if any(self._timed()) else None):

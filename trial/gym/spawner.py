@@ -24,6 +24,7 @@ from trial.gym import handover, linux
 from trial.gym.forms import ARRAYS, NAMES
 from trial.gym.handover import Ended, Start
 from trial.gym.limits import Limits
+from trial.gym.wakeup import Wakeup
 from trial.gym.worker import State
 from trial.gym.worker import main as work
 
@@ -61,43 +62,40 @@ class Spawner:
 
     def run(self) -> None:
         """Serve; returns when the server is gone, with all workers killed."""
-        awake, wake = socket.socketpair()
-        wake.setblocking(False)
-        awake.setblocking(False)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the server, which ends this process
         signal.signal(signal.SIGCHLD, lambda *_: None)
-        signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+        wakeup = Wakeup()
         linux.become_subreaper()
         gc.collect()
         gc.freeze()  # so that the collector does not write to pages that workers share
         self._own_megabytes = linux.private_megabytes(os.getpid())
         try:
-            while self._once(awake, wake):
+            while self._once(wakeup):
                 pass
         finally:
             for pid in list(self._workers):
                 _kill(pid)
             self._reap()
 
-    def _once(self, awake: socket.socket, wake: socket.socket) -> bool:
+    def _once(self, wakeup: Wakeup) -> bool:
         to_tell = [self._control] if self._untold else []
         wait = TICK_SECONDS if self._workers else None
-        readable, writable, _ = select.select([self._control, awake], to_tell, [], wait)
+        awaited: list[socket.socket | Wakeup] = [self._control, wakeup]
+        readable, writable, _ = select.select(awaited, to_tell, [], wait)
         if writable:
             self._send_untold()
-        if awake in readable:
-            with contextlib.suppress(BlockingIOError):
-                awake.recv(4096)
+        if wakeup in readable:
+            wakeup.clear()
         if self._control in readable:
             start = handover.receive(self._control)
             if start is None:
                 return False
-            self._start(start, (awake, wake))
+            self._start(start, wakeup)
         self._reap()
         self._watch(time.monotonic())
         return True
 
-    def _start(self, start: Start, others: Sequence[socket.socket]) -> None:
+    def _start(self, start: Start, wakeup: Wakeup) -> None:
         if not self._free:
             start.connection.close()
             self._tell(start.number, 1013, f"{self._limits.workers} connections use environments already; try later.")
@@ -111,19 +109,19 @@ class Spawner:
             self._tell(start.number, 1013, f"No process can be started ({error.strerror}); try later.")
             return
         if pid == 0:
-            self._become_worker(start, state, others)
+            self._become_worker(start, state, wakeup)
         start.connection.close()
         self._free.discard(slot)
         self._workers[pid] = _Watched(start.number, slot, state)
 
-    def _become_worker(self, start: Start, state: State, others: Sequence[socket.socket]) -> None:
+    def _become_worker(self, start: Start, state: State, wakeup: Wakeup) -> None:
         """In the new process. Does not return."""
         status = 1
         try:
+            wakeup.close()
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            for other in (self._control, *others):
-                other.close()
+            self._control.close()
             form = NAMES.get(start.form, ARRAYS)
             work(start.connection, start.received, form, self._limits, state, output=self._output, record=self._record)
             status = 0

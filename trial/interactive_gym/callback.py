@@ -62,17 +62,43 @@ class GameCallback:
 
 
 class MultiCallback(GameCallback):
-    """Several callbacks, given as classes, each called in turn."""
+    """Several callbacks, given as classes, each called in turn.
+
+    What they return is a map by the names of the classes (`Score`, `Score 2` …), without those that return None. One
+    that raises keeps none of the others from being called; its error is raised after the last.
+    """
 
     def __init__(self, callbacks: Iterable[type[GameCallback]], **_options: Any) -> None:
         super().__init__()
         self.callbacks = [make() for make in callbacks]
 
+    def _tell_each(self, event: str, remote_game: Any) -> dict[str, Any] | None:
+        returned: dict[str, Any] = {}
+        raised: list[Exception] = []
+        for name, each in zip(_names(self.callbacks), self.callbacks, strict=True):
+            try:
+                value = getattr(each, event)(remote_game)
+            except Exception as error:  # noqa: BLE001 - the others are called all the same
+                raised.append(error)
+            else:
+                if value is not None:
+                    returned[name] = value
+        if not raised:
+            return returned or None
+        if returned:
+            remote_game.record(event, returned)
+        raise raised[0]
+
+
+def _names(callbacks: Iterable[Any]) -> list[str]:
+    kinds = [type(each).__name__ for each in callbacks]
+    counts = [kinds[: index + 1].count(kind) for index, kind in enumerate(kinds)]
+    return [kind if count == 1 else f"{kind} {count}" for kind, count in zip(kinds, counts, strict=True)]
+
 
 def _to_each(event: str) -> Any:
-    def tell(self: MultiCallback, remote_game: Any) -> None:
-        for each in self.callbacks:
-            getattr(each, event)(remote_game)
+    def tell(self: MultiCallback, remote_game: Any) -> dict[str, Any] | None:
+        return self._tell_each(event, remote_game)
 
     tell.__name__ = event
     return tell

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from protocol.session import MOST_PLAYERS
 from trial.interactive_gym import onnx_inference_utils
 from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
-from trial.interactive_gym.playing import ExperimentAgent, Unplayable, mapping_of, space_of
+from trial.interactive_gym.playing import ExperimentAgent, Unplayable, humans_of, mapping_of, space_of
 from trial.interactive_gym.remote_config import RemoteConfig
 
 _FASTEST = 240
@@ -26,6 +27,12 @@ class Look:
     several: bool
     actions: int
     """How many there are; of several players, the most that one has."""
+    counts: Mapping[Any, int]
+    """The same by player."""
+    spaces: Mapping[Any, Any]
+    """Of several players: the space of each one's observations, None if it is not known."""
+    seen: Mapping[Any, Any]
+    """Of several players: the first observation of each that has one."""
     human: Any
     joined_as_sorted: bool
     """The policies' observations are arrays, or dictionaries whose keys come in their sorted order."""
@@ -47,11 +54,15 @@ def look(config: RemoteConfig) -> Look:
             _check_players(players, observation)
         counts = {player: _count(env, player, several=agent.several) for player in players}
         picture = agent.render()
-        seen = observation.get(players[-1]) if agent.several and isinstance(observation, Mapping) else observation
+        by_player = observation if agent.several and isinstance(observation, Mapping) else None
+        seen = observation if by_player is None else by_player.get(players[-1])
         return Look(
             players=players,
             several=agent.several,
             actions=max(counts.values()),
+            counts=counts,
+            spaces={player: env.observation_space(player) for player in players} if agent.several else {},
+            seen={player: by_player[player] for player in players if player in by_player} if by_player else {},
             human=next(iter(agent.game.human_players)) if agent.game else None,
             joined_as_sorted=not isinstance(seen, Mapping) or list(seen) == sorted(seen, key=str),
             objects=isinstance(picture, Mapping),
@@ -96,14 +107,13 @@ def _check(config: RemoteConfig) -> None:
     """Raises Unplayable for what cannot be, whatever the environment is."""
     if "eventlet" in sys.modules:
         raise Unplayable("take `import eventlet` and `eventlet.monkey_patch()` out: it changes Python's own threads")
-    mapping = mapping_of(config)
-    humans = [player for player, plays in mapping.items() if plays == PolicyTypes.Human]
+    mapping, humans = mapping_of(config), humans_of(config)
     if not humans:
         raise Unplayable("policy_mapping has no PolicyTypes.Human: say which player the participant plays")
-    if len(humans) > 1:
+    if len(humans) > MOST_PLAYERS:
         raise Unplayable(
-            f"policy_mapping has {len(humans)} humans ({', '.join(map(str, humans))}); several participants in one "
-            "game are not possible yet: let one be human, and give the others a policy or PolicyTypes.Random"
+            f"policy_mapping has {len(humans)} humans; at most {MOST_PLAYERS} participants play together: give the "
+            "others a policy or PolicyTypes.Random"
         )
     for player, plays in mapping.items():
         known = plays in (PolicyTypes.Human, PolicyTypes.Random) if isinstance(plays, str) else False

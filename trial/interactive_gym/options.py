@@ -24,13 +24,19 @@ class Option:
     becomes: str
     ignored: str = ""
     """If it has no effect here: why, as a sentence that is said when an experiment sets it."""
+    of_several: bool = False
+    """It has an effect if several players are human: `ignored` is said of other experiments alone."""
 
     def fresh(self) -> Any:
         """The default; lists and dictionaries are new ones."""
         return self.default() if isinstance(self.default, type) else self.default
 
 
-_LOBBY = "there are no waiting rooms yet: each participant plays alone"
+_ALONE = "each participant plays alone, so none waits for another"
+_LOBBY = "a participant waits only until others are there"
+_PING = (
+    "no participant is turned away for a slow connection; what a connection cannot carry is left out of its pictures"
+)
 _PYODIDE = "the environment runs on a participant's server, and not in the browser"
 
 OPTIONS: tuple[Option, ...] = (
@@ -40,7 +46,7 @@ OPTIONS: tuple[Option, ...] = (
     Option("env_config", "environment", dict, "given to `env_creator`"),
     Option("seed", "environment", 42, "`trial.seed`, if you set it; otherwise each episode has a random seed, which the recording holds"),
     # policies
-    Option("policy_mapping", "policies", dict, "`trial.players`: `Human` → `human`, `Random` → `random`, else a class in `agent.py` or a file of `policies/`; exactly one player is human"),
+    Option("policy_mapping", "policies", dict, "`trial.players`: `Human` → `human`, `Random` → `random`, else a class in `agent.py` or a file of `policies/`. If several players are human, `project.players` is their number: [several people](#several-people)"),
     Option("load_policy_fn", "policies", None, "called on the server, once for each policy; a path is that of the copy in the project"),
     Option("policy_inference_fn", "policies", None, "called on the server, on a thread of its own for each player"),
     Option("frame_skip", "policies", 4, "`trial.frameSkip`"),
@@ -73,30 +79,30 @@ OPTIONS: tuple[Option, ...] = (
     Option("host", "hosting", None, "no effect", "on one machine a study is held for that machine only; for others deploy it (docs/aws.md)"),
     Option("port", "hosting", 8000, "the port of `python experiment.py`"),
     Option("max_concurrent_games", "hosting", 1, "`project.maxServers`, if you set it"),
-    Option("max_ping", "hosting", None, "no effect", "no participant is turned away for a slow connection; what a connection cannot carry is left out of its pictures"),
-    Option("min_ping_measurements", "", 5, "no effect", "no participant is turned away for a slow connection"),
+    Option("max_ping", "hosting", None, "`trial.maxPing`", _PING, of_several=True),
+    Option("min_ping_measurements", "", 5, "`trial.pingSamples`", _PING, of_several=True),
     # user_experience
     Option("page_title", "user_experience", "interactive-gym", "`project.name`"),
     Option("instructions_html_file", "user_experience", None, "a page of `steps/`, named by `trial.instructions`: it is shown before the game, and can be read again in a pause"),
     Option("instructions", "user_experience", "", "the same, as text or HTML"),
     Option("experiment_end_redirect_url", "user_experience", None, "a link on the last page, and after `redirect_timeout` the browser goes there"),
     Option("end_game_redirect_url", "user_experience", None, "an older name of `experiment_end_redirect_url`"),
-    Option("waitroom_timeout_redirect_url", "user_experience", None, "no effect", _LOBBY),
+    Option("waitroom_timeout_redirect_url", "user_experience", None, "where the last page leads those who found no other to play with", _ALONE, of_several=True),
     Option("append_subject_id_to_redirect", "user_experience", False, "the participant's id is appended to that address"),
     Option("append_subject_name_to_redirect", "user_experience", False, "an older name of `append_subject_id_to_redirect`"),
     Option("redirect_timeout", "user_experience", 5000, "milliseconds until the last page leads on"),
-    Option("waitroom_timeout", "user_experience", None, "no effect", _LOBBY),
+    Option("waitroom_timeout", "user_experience", None, "`project.patience`: milliseconds there, seconds here (10 to 3600)", _ALONE, of_several=True),
     Option("waitroom_time_randomization_interval_s", "user_experience", (0, 0), "no effect", _LOBBY),
     Option("welcome_header_text", "user_experience", "", "the heading of the first page, `steps/welcome.html`"),
     Option("welcome_text", "user_experience", "", "the text of the first page"),
-    Option("game_header_text", "user_experience", "", "the heading of the instructions"),
+    Option("game_header_text", "user_experience", "", "the heading of the instructions, if they have no `<h1>`"),
     Option("game_page_text", "user_experience", "", "a part of the instructions"),
     Option("game_page_html_fn", "user_experience", None, "called once when the project is made, for the human player; its HTML is a part of the instructions"),
     Option("between_episode_header", "", "", "the heading of the page between two episodes, named by `trial.betweenEpisodes`"),
     Option("between_episode_text", "", "", "the text of that page"),
     Option("final_page_header_text", "user_experience", "", "the heading of the last page, `steps/final.html`"),
     Option("final_page_text", "user_experience", "", "the text of the last page"),
-    Option("reset_timeout", "", 3000, "`trial.betweenEpisodes`: milliseconds there, seconds here"),
+    Option("reset_timeout", "", 3000, "`trial.betweenEpisodes`: milliseconds there, seconds here; no effect if there is a page between two episodes, from which participants go on themselves"),
     # logging
     Option("logfile", "logging", "./server_log.log", "no effect", "the logs of `make run` are in the folder that it names, and those on AWS come from `make logs`"),
     # pyodide
@@ -119,6 +125,8 @@ def table() -> str:
     rows = ["| option of `RemoteConfig` | set by | what becomes of it |", "|---|---|---|"]
     for option in OPTIONS:
         why = f": {option.ignored}" if option.ignored else ""
+        if option.of_several:
+            why = f"; if one player is human no effect{why}"
         rows.append(
             f"| `{option.name}` | {f'`{option.method}()`' if option.method else 'attribute'} | {option.becomes}{why} |"
         )

@@ -5,10 +5,11 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from trial.interactive_gym.playing import humans_of
 from trial.interactive_gym.remote_config import RemoteConfig
 
 _LINKED = re.compile(r'(?P<before>\b(?:src|href)=")(?P<path>[^":#?{}]+\.[A-Za-z0-9]+)(?=")')
@@ -65,37 +66,48 @@ def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, re
     parts += [config.instructions, config.game_page_text]
     if config.game_page_html_fn is not None:
         game.human_players = {human: "participant"}
+        if len(humans_of(config)) > 1:
+            remark(f"game_page_html_fn is called for {human} alone: all participants read the same instructions")
         try:
             parts.append(str(config.game_page_html_fn(game, "participant")))
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
             remark(f"game_page_html_fn is left out; it raises {type(error).__name__}: {error}")
     parts = [part for part in parts if part.strip()]
+    if config.game_header_text and _has_heading(parts):
+        remark("game_header_text is left out: the instructions have a heading (<h1>) of their own")
     return _page(config.game_header_text or "How to play", *parts) if parts else ""
 
 
-def between(config: RemoteConfig) -> str:
+def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
     """The page between two episodes; empty if there is none."""
     if not (config.between_episode_header or config.between_episode_text):
         return ""
+    if config.reset_timeout != RemoteConfig().reset_timeout:
+        remark("reset_timeout has no effect: participants go on themselves from the page between two episodes")
     return _page(config.between_episode_header, config.between_episode_text)
 
 
 def final(config: RemoteConfig) -> str:
-    """The last page, which leads on if the experiment says where."""
+    """The last page, which leads on if the experiment says where. Who found no other to play with has one of theirs."""
     page = _page(config.final_page_header_text or "Thank you!", config.final_page_text, plain="<p>This is the end.</p>")
-    address = config.experiment_end_redirect_url or config.end_game_redirect_url
-    if not address:
+    page += _led(config, config.experiment_end_redirect_url or config.end_game_redirect_url)
+    if len(humans_of(config)) == 1:
         return page
+    alone = _page("There was nobody to play with", "<p>Thank you for waiting.</p>")
+    alone += _led(config, config.waitroom_timeout_redirect_url)
+    return "{% if participant.unmatched %}\n" + alone + "{% else %}\n" + page + "{% endif %}\n"
+
+
+def _led(config: RemoteConfig, address: str | None) -> str:
+    """The link to this address, and the script that follows it; empty if there is none."""
+    if not address:
+        return ""
     appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect
-    return (
-        page
-        + _onward(address, bool(appended))
-        + (
-            "<script>\n"
-            '  const onward = document.getElementById("onward");\n'
-            f"  setTimeout(() => location.assign(onward.href), {max(0, round(config.redirect_timeout))});\n"
-            "</script>\n"
-        )
+    return _onward(address, bool(appended)) + (
+        "<script>\n"
+        '  const onward = document.getElementById("onward");\n'
+        f"  setTimeout(() => location.assign(onward.href), {max(0, round(config.redirect_timeout))});\n"
+        "</script>\n"
     )
 
 
@@ -132,8 +144,12 @@ def as_html(text: str) -> str:
 
 def _page(heading: str, *parts: str, plain: str = "") -> str:
     shown = [as_html(part) for part in parts if part.strip()] or [plain]
-    title = f"<h1>{html.escape(heading, quote=False)}</h1>" if heading and "<h1" not in "".join(shown) else ""
+    title = f"<h1>{html.escape(heading, quote=False)}</h1>" if heading and not _has_heading(shown) else ""
     return raw("\n".join(part for part in (title, *shown) if part)) + "\n"
+
+
+def _has_heading(parts: Iterable[str]) -> bool:
+    return any("<h1" in part for part in parts)
 
 
 def quoted(text: str) -> str:

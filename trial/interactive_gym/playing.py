@@ -68,6 +68,11 @@ def mapping_of(config: RemoteConfig) -> dict[Any, Any]:
     return {"player_0" if config.human_id is None else config.human_id: PolicyTypes.Human}
 
 
+def humans_of(config: RemoteConfig) -> list[Any]:
+    """The players that participants play."""
+    return [player for player, plays in mapping_of(config).items() if plays == PolicyTypes.Human]
+
+
 def make_environment(config: RemoteConfig) -> Any:
     """A new environment, as Interactive Gym makes it. Raises Unplayable without a way to, and what the code raises."""
     if config.env_creator is not None:
@@ -110,8 +115,9 @@ class ExperimentAgent:
     def reset(self, seed: int | None = None) -> Any:
         """Begin an episode."""
         game = self._game
-        for key in game.human_players:
-            game.human_players[key] = os.environ.get(variables.USER_ID, "")
+        alone = len(game.human_players) == 1
+        for key in game.human_players:  # in a game of several no code sees participants' ids
+            game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
         observation, infos = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
         game.began(observation, infos)

@@ -10,13 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from trial.interactive_gym import assets, looking, options, pages, playing, sources
+from trial.interactive_gym import assets, looking, options, pages, playing, sources, trying
 from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
 from trial.interactive_gym.looking import Look
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.sources import MADE, Source
 
+LEAST_PATIENCE, MOST_PATIENCE = 10, 3600
+"""Seconds, as `project.patience` may be."""
 LONGEST_BUFFER = 10_000
 """Steps: the most that `actionBufferLifespan` may be."""
 _NO_ID = re.compile(r"[^A-Za-z0-9_-]+")
@@ -62,13 +64,15 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
             f"there is a {name} beside {source.file.name}, and the project needs one of its own: rename it"
         )
     players = _players(config, look, find, files, remark)
+    for sentence in trying.try_policies(config, look, find, source.root):
+        remark(sentence)
     files |= {f"assets/{name}": data for name, data in assets.of(config, find, remark).items()}
     before, after = pages.around(config)
     steps = {
         **before,
         **after,
         "instructions": pages.instructions(config, look.game, look.human, find, remark),
-        "between": pages.between(config),
+        "between": pages.between(config, remark),
     }
     for name, page in steps.items():
         if page:
@@ -100,10 +104,12 @@ def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callabl
 
 def ignored(config: RemoteConfig) -> list[str]:
     """Sentences about options that the experiment sets and that have no effect here."""
+    several = len(playing.humans_of(config)) > 1
     return [f"{name} has no effect: the game runs on a server" for name in getattr(config, "ignored", ())] + [
         f"{option.name} has no effect: {option.ignored}"
         for option in options.OPTIONS
-        if option.ignored and option.name in config.given and getattr(config, option.name) != option.fresh()
+        if option.ignored and not (several and option.of_several)
+        if option.name in config.given and getattr(config, option.name) != option.fresh()
     ]
 
 
@@ -132,6 +138,8 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
         trial["resetFreeze"] = config.reset_freeze_s
     if "seed" in config.given:
         trial["seed"] = config.seed
+    if config.max_ping is not None and len(playing.humans_of(config)) > 1:
+        trial |= {"maxPing": round(config.max_ping), "pingSamples": int(config.min_ping_measurements)}
     if look.objects:
         trial["scene"] = {
             "width": round(config.game_width),
@@ -222,6 +230,13 @@ def _project(config: RemoteConfig, source: Source, steps: list[str]) -> dict[str
     }
     if "max_concurrent_games" in config.given:
         project["maxServers"] = config.max_concurrent_games
+    humans = len(playing.humans_of(config))
+    if humans > 1:
+        project["players"] = humans
+        if config.waitroom_timeout is not None:
+            seconds = round(config.waitroom_timeout / 1000, 3)
+            seconds = max(LEAST_PATIENCE, min(MOST_PATIENCE, seconds))
+            project["patience"] = int(seconds) if seconds == int(seconds) else seconds
     return project
 
 

@@ -6,13 +6,14 @@ import ast
 import site
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from protocol.players import ONNXRUNTIME
 from trial.interactive_gym.playing import Unplayable
 
 MOST_BYTES = 50 * 2**20
@@ -125,13 +126,13 @@ def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]
     return found, said
 
 
-def requirements(files: Iterable[Path], given: Iterable[str], modules: Iterable[str] = ()) -> list[str]:
+def requirements(files: Iterable[Path], given: Iterable[str], modules: Collection[str] = ()) -> list[str]:
     """The lines of requirements.txt: packages that these files import, with the versions here, and those given.
 
-    `modules` are imported by other code.
+    `modules` are imported by other code; `onnxruntime` is named even if it is not installed here.
     """
     packages = metadata.packages_distributions()
-    found: dict[str, str] = {}
+    found = {"onnxruntime": ONNXRUNTIME} if "onnxruntime" in modules else {}
     for name in sorted({*modules, *(name for file in files if file.suffix == ".py" for name in _imports(file))}):
         for package in packages.get(name, [])[:1]:
             found[package.lower()] = f"{package}=={metadata.version(package)}"

@@ -31,10 +31,14 @@ class Encoder:
     def __init__(self, *, lossy: bool = False) -> None:
         self.lossy = lossy
         self._jpeg = b""
-        self.forget()
+        self._begin()
 
     def forget(self) -> None:
         """The next frame is sent whole: the client was shown something else."""
+        if self._shown is not None:
+            self._begin()
+
+    def _begin(self) -> None:
         self._shown: Frame | None = None  # the picture sent last, in any coding
         self._exact: Frame | None = None  # the last picture that the client has without loss
         self._rows = 0  # of `_shown` that have been sent without loss

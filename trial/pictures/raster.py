@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from protocol.trial import Scene as SceneSection
+from protocol.trial_sections import Scene as SceneSection
 from trial.pictures.assets import Asset, Assets
 from trial.pictures.frames import Frame
-from trial.pictures.scene import CheckedObject, Scene
+from trial.pictures.scene import Scene
+from trial.pictures.scene_object import CheckedObject
 
 _MISSING = "#8080807f"  # what stands where an image is missing
 

@@ -6,9 +6,12 @@ import json
 import struct
 import zlib
 from collections.abc import Mapping
+from itertools import compress
+from operator import is_not, ne
 from typing import Any
 
-from trial.pictures.scene import CheckedObject, Scene
+from trial.pictures.scene import Scene
+from trial.pictures.scene_object import CheckedObject
 
 SCENE, PACKED_SCENE, ASSET = 4, 5, 6
 """Kinds of binary messages; those of frames are in `trial/pictures/frames.py`."""
@@ -18,6 +21,7 @@ ASSET_HEADER = struct.Struct("!BHI")
 """Kind, number of the asset in the table, offset of the bytes that follow."""
 
 _PACK_FROM = 1_200  # bytes; what fits into one packet gains nothing
+_JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False)
 
 
 class SceneEncoder:
@@ -35,14 +39,36 @@ class SceneEncoder:
 
     def encode(self, scene: Scene, scene_id: int) -> bytes:
         """The bytes of one scene. `scene` is kept for the next one."""
-        said = changes(self._sent, scene)
+        kind, body = _LAST.packed(self._sent, scene)
         self._sent = scene
-        body = json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "replace")
-        kind = SCENE
-        if len(body) > _PACK_FROM:
-            packer = zlib.compressobj(1, zlib.DEFLATED, -15)
-            kind, body = PACKED_SCENE, packer.compress(body) + packer.flush()
         return HEADER.pack(kind, scene_id & 0xFFFFFFFF) + body
+
+
+class _Last:
+    """What was packed last. Those who play together are mostly shown the same scene after the same one."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[Scene | None, Scene, tuple[int, bytes]] | None = None  # replaced whole: threads may pack
+
+    def packed(self, before: Scene | None, scene: Scene) -> tuple[int, bytes]:
+        """The kind of the message and its bytes behind the id."""
+        kept = self._kept
+        if kept is not None and kept[0] is before and kept[1] is scene:
+            return kept[2]
+        packed = _pack(changes(before, scene))
+        self._kept = before, scene, packed
+        return packed
+
+
+_LAST = _Last()
+
+
+def _pack(said: Mapping[str, Any]) -> tuple[int, bytes]:
+    body = _JSON.encode(said).encode("utf-8", "replace")
+    if len(body) <= _PACK_FROM:
+        return SCENE, body
+    packer = zlib.compressobj(1, zlib.DEFLATED, -15)
+    return PACKED_SCENE, packer.compress(body) + packer.flush()
 
 
 def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
@@ -50,21 +76,27 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
     if before is None:
         return {"new": True, "set": dict(scene.objects), "hud": scene.hud}
     said: dict[str, Any] = {}
-    known = before.objects
+    known, objects = before.objects, scene.objects
     changed: dict[str, Any] = {}
-    for name, each in scene.objects.items():
+    in_place = list(known) == list(objects)
+    # Those that may have changed. Few have, and to look at the others one by one costs more than all else here.
+    others = compress(objects.items(), map(is_not, known.values(), objects.values())) if in_place else objects.items()
+    for name, each in others:
         earlier = known.get(name)
+        if earlier is each:
+            continue
         if earlier is None or earlier["type"] != each["type"]:
             changed[name] = each
-        elif earlier is not each:
+        else:
             changed[name] = _fields(earlier, each)
-    gone = [name for name in known if name not in scene.objects]
     if changed:
         said["set"] = changed
-    if gone:
-        said["gone"] = gone
-    if not _same_order(known, scene.objects):
-        said["order"] = list(scene.objects)
+    if not in_place:
+        gone = [name for name in known if name not in objects]
+        if gone:
+            said["gone"] = gone
+        if not _same_order(known, objects):
+            said["order"] = list(objects)
     if scene.hud != before.hud:
         said["hud"] = scene.hud
     return said
@@ -72,6 +104,8 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
 
 def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
     """The fields that changed; None for those that have their default again."""
+    if list(before) == list(now):  # the usual case
+        return dict(compress(now.items(), map(ne, before.values(), now.values())))
     changed = {key: value for key, value in now.items() if key not in before or before[key] != value}
     return changed | {key: None for key in before if key not in now}
 

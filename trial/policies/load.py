@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from protocol.players import AGENT_PLAYER, SAMPLE, WHO
+from protocol.players import AGENT_PLAYER, SAMPLE, WHO, files_there
 from trial.policies.policy import Policy, PolicyError, PolicyFileMissing
 from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
 
@@ -46,7 +46,5 @@ def _file(folder: Path, name: str) -> Path:
     if not path.is_relative_to(folder.resolve()):
         raise PolicyError(f"{name} leads out of the project's folder")
     if not path.is_file():
-        near = sorted(other.relative_to(folder).as_posix() for other in folder.glob("policies/**/*.onnx"))
-        hint = f"; there are {', '.join(near[:5])}" if near else ""
-        raise PolicyFileMissing(f"there is no file {name}{hint}")
+        raise PolicyFileMissing(f"there is no file {name}{files_there(folder)}")
     return path

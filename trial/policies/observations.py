@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,9 @@ Array = np.ndarray[Any, np.dtype[Any]]
 Shape = Sequence[int | str | None]
 """Of an input: a text or None is a size that the file leaves open."""
 Encoding = Callable[[Any], Array]
+
+MOST_ONE_HOT = 10_000_000
+"""Numbers of an observation whose discrete parts are one-hot; no policy takes more."""
 
 
 def without_mask(observation: Any) -> Any:
@@ -42,9 +47,24 @@ def numbers(observation: Any) -> Array:
 def encodings(space: Any) -> list[Encoding]:
     """How observations of this space may be meant, the likeliest first: as they are, or a discrete one as one-hot."""
     found: list[Encoding] = [numbers]
-    if space is not None:
+    if space is not None and one_hot_size(space) <= MOST_ONE_HOT:
         found.append(lambda observation: _one_hot(space, observation))
     return found
+
+
+def one_hot_size(space: Any) -> int:
+    """How many numbers an observation of this space has where each `Discrete` is one-hot; 0 if that is not known."""
+    inner = getattr(space, "spaces", None)
+    if isinstance(inner, Mapping):
+        return sum(map(one_hot_size, inner.values()))
+    if isinstance(inner, Sequence):
+        return sum(map(one_hot_size, inner))
+    shape = getattr(space, "shape", None)
+    if hasattr(space, "n") and shape == ():
+        return int(space.n)
+    if hasattr(space, "nvec"):
+        return sum(int(n) for n in flat(space.nvec))
+    return 0 if shape is None else math.prod(int(size) for size in shape)
 
 
 def _one_hot(space: Any, observation: Any) -> Array:
@@ -59,8 +79,11 @@ def _one_hot(space: Any, observation: Any) -> Array:
         row[int(observation) - int(getattr(space, "start", 0))] = 1
         return row
     elif hasattr(space, "nvec"):
-        rows = [np.eye(int(n))[int(value)] for n, value in zip(flat(space.nvec), flat(observation), strict=True)]
-        return np.concatenate(rows)
+        counts = [int(n) for n in flat(space.nvec)]
+        row = np.zeros(sum(counts))
+        for first, value in zip(accumulate(counts, initial=0), flat(observation), strict=False):
+            row[first + int(value)] = 1
+        return row
     else:
         return flat(observation)
     return np.concatenate(parts) if parts else np.zeros(0)

@@ -77,7 +77,13 @@ class OnnxPolicy:
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
         """The action. Raises PolicyError if the observation does not fit, or the answer is no action."""
-        feeds: dict[str, Array] = {**self._ports.constants, **self._state, **self._seen(observation)}
+        try:
+            seen = self._seen(observation)
+        except RecursionError:
+            raise PolicyError(f"{self._spec} takes no observation that holds itself") from None
+        except (TypeError, ValueError) as error:
+            raise PolicyError(f"{self._spec} takes an observation of numbers, and this is none: {error}") from error
+        feeds: dict[str, Array] = {**self._ports.constants, **self._state, **seen}
         if self._ports.mask is not None:
             feeds[self._ports.mask.name] = self._masked(self._ports.mask, mask)
         try:
@@ -149,7 +155,10 @@ def load(spec: str, file: Path, count: int, space: Any, *, sample: bool) -> Onnx
     """
     session = _session(spec, file)
     inputs, outputs = ([_port(spec, port) for port in ports] for ports in (session.get_inputs(), session.get_outputs()))
-    first = None if space is None else without_mask(zero(space))
+    try:
+        first = None if space is None else without_mask(zero(space))
+    except MemoryError as error:
+        raise PolicyError(f"{spec} cannot be tried: an observation of the environment needs more memory") from error
     ports = _read(spec, inputs, outputs, first)
     encode = _encoding(spec, ports, space, first)
     policy = OnnxPolicy(spec, session, ports, count, encode, sha256=_sha256(file), sample=sample)

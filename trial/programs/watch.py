@@ -15,8 +15,7 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from trial.core.messages import CloseConnection
-from trial.core.progress import CommandRefused
+from trial.core.messages import CloseConnection, CommandRefused
 from trial.wire.inbound import MESSAGES_A_SECOND, RateLimit
 
 PATH = "/gym"

@@ -89,10 +89,11 @@ def move(file: Path, path: Path) -> None:
     remove_if_possible(file)
 
 
-def replace(path: Path, data: bytes, scratch: Path | None = None, *, surely: bool = True) -> None:
-    """Create the file, or put these bytes in its place; they are on the disk then. Raises OSError.
+def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, surely: bool = True) -> None:
+    """Create the file, or put these bytes or the content of another file in its place; they are on the disk then.
 
     If not `surely`, a power cut may bring the bytes back that stood there before (or no file), but never half of them.
+    Raises OSError.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:

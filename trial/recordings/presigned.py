@@ -48,10 +48,27 @@ class PresignedStore:
         self._server = server
         self._credential = credential
         self._pause = pause
+        self._kept: dict[str, Mapping[str, Any]] = {}  # presigned GETs that may still be valid, by key
 
     def get(self, key: str) -> bytes | None:
         """Retries transient errors for some seconds. Raises StoreError."""
         return self._with_retries(lambda: self._get(key))
+
+    def look(self, key: str) -> bytes | None:
+        """As `get`, of a document that is read again and again: its presigned request is used until S3 refuses it.
+
+        Tries once. Raises StoreError.
+        """
+        kept = self._kept.pop(key, None)
+        for request in (kept, None) if kept else (None,):
+            signed = request or self._signed({"method": "GET", "key": key})
+            status, body = _send(signed, None)
+            if status in (200, 404):
+                self._kept[key] = signed
+                return body if status == 200 else None
+            if request is None:
+                raise _UnexpectedStatus(status)
+        raise AssertionError
 
     def create(self, key: str, data: bytes | Path) -> bool:
         """Tries once: its callers try again (`spool.retry_forever`). Raises OSError."""

@@ -103,6 +103,9 @@ class Values:
     def _array(self, value: Any) -> Any:
         if value.dtype.kind not in "biuf":
             return text_of(value)
+        if self._listed is None and value.size > self._longest:  # each number has a byte or more
+            self.left_out += value.nbytes
+            return None
         if self._listed is None or not isinstance(value, np.ndarray) or value.size <= self._listed:
             return _numbers(value)
         if value.nbytes > self._longest * _PACKED_BYTES:

@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from protocol.answer import GAME, Answer, answers_in, to_json
-from protocol.keys import answer_key, recordings_folder
+from protocol.keys import answer_key
+from protocol.times import time_text
 from protocol.trial import Trial
 from trial.core.effects import OpenRecording
 from trial.core.players import Player
@@ -26,6 +27,7 @@ log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
 """Play that may be lost if the process is killed outright."""
+_NONE: Mapping[str, Mapping[str, Any]] = {}
 
 
 class Recorder:
@@ -41,13 +43,29 @@ class Recorder:
         self._flush_timer: asyncio.TimerHandle | None = None
         self._flushing: asyncio.Task[None] | None = None
         self._uploads: set[asyncio.Task[None]] = set()
+        self._hurried = asyncio.Event()
 
     # ---- before
 
     async def earlier_answers(self) -> dict[str, Any] | None:
-        """What an earlier server answered for this step; None if the step has not been played."""
+        """What an earlier server answered for this step; None if the step has not been played.
+
+        In a session: the answers of its members, by their ids; None unless each of them has one. A server that is lost
+        between two answers has stored all recordings before, so the next one stores those that are missing.
+        """
+        if not self._settings.session:
+            return await self._earlier_answer(self._settings.user_id)
+        found: dict[str, Any] = {}
+        for user_id in self._settings.seats:
+            answers = await self._earlier_answer(user_id)
+            if answers is None:
+                return None
+            found[user_id] = answers
+        return found or None
+
+    async def _earlier_answer(self, user_id: str) -> dict[str, Any] | None:
         try:
-            found = await asyncio.to_thread(self._store.get, self._answer_key)
+            found = await asyncio.to_thread(self._store.get, self._answer_key(user_id))
         except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
             log.warning("cannot look for an earlier answer (%s)", short_error(error))
             return None
@@ -55,7 +73,7 @@ class Recorder:
 
     async def recorded(self) -> RecordedTrial | None:
         """What earlier servers recorded of the step."""
-        folder, _, server = self._folder.rpartition("/")
+        folder, _, server = self._settings.recordings_folder.rpartition("/")
         try:
             return await asyncio.to_thread(load_recorded, self._store, folder, server, self._step)
         except Exception as error:  # noqa: BLE001 - whatever the store or an old recording raises: it is played anew
@@ -70,7 +88,7 @@ class Recorder:
             "v": recording.SCHEMA,
             "session": self._settings.server,
             "trial": self._trial_id,
-            "time": now_text(),
+            "time": time_text(datetime.now(UTC)),
             "ns": time.monotonic_ns(),
         }
 
@@ -83,12 +101,12 @@ class Recorder:
         """Open a recording and write its header, with who plays whom if there are several. Raises OSError."""
         settings, config = self._settings, self._settings.trial
         name = "trial" if config.data_file == "trial" else f"episode-{opening.episode:04d}"
-        self._recording = self._spool.open(f"{self._folder}/{self._step}-{name}.jsonl.gz")
+        self._recording = self._spool.open(f"{settings.recordings_folder}/{self._step}-{name}.jsonl.gz")
         header = recording.line(
             "header",
             **self.stamp(),
             project=settings.project_id,
-            user=settings.user_id,
+            **_whose(settings),
             server=settings.server,
             step=self._step,
             game=config.game,
@@ -98,7 +116,9 @@ class Recorder:
             actionBufferLifespan=config.action_buffer_lifespan,
             episode=opening.episode,
             seed=opening.seed,
-            versions=recording.versions(recording.OF_SEVERAL if players else ()),
+            versions=recording.versions(
+                (*(recording.OF_SEVERAL if players else ()), *recording.packages(settings.agent_dir))
+            ),
         )
         self._recording.add(header)
 
@@ -146,23 +166,62 @@ class Recorder:
 
     # ---- the end
 
-    async def save(self, answers: Mapping[str, Any] | None) -> None:
-        """Wait until all recordings are stored, then store the answer: a reader of the answer finds them."""
+    async def save(self, answers: Mapping[str, Any] | None, by_human: Mapping[str, Mapping[str, Any]] = _NONE) -> None:
+        """Wait until all recordings are stored, then store the answer: a reader of the answer finds them.
+
+        If they cannot be stored for `recordings_first_seconds`, or the server ends (`hurry`), the answer does not wait
+        any longer. In a session there is one for each member in `by_human`. An answer that is there already stays as it
+        is.
+        """
+        await self._store_recordings_first()
+        settings, now = self._settings, datetime.now(UTC)
+        if answers is not None:
+            await self._create(settings.user_id, Answer(self._step, GAME, settings.group, now, answers))
+        await asyncio.gather(*(self.save_member(user_id, each) for user_id, each in by_human.items()))
+
+    def hurry(self) -> None:
+        """The server ends soon: an answer waits for recordings no longer."""
+        self._hurried.set()
+
+    @property
+    def storing(self) -> bool:
+        """There is a recording that is closed and not stored."""
+        return any(not task.done() for task in self._uploads)
+
+    async def stored(self) -> None:
+        """Wait until all closed recordings are stored."""
         if self._uploads:
             await asyncio.wait(self._uploads)
-        if answers is None:
+
+    async def _store_recordings_first(self) -> None:
+        if not self.storing:
             return
-        answer = Answer(self._step, GAME, self._settings.group, datetime.now(UTC), answers)
-        data = to_json(answer)
-        await retry_forever("write the answer", lambda: asyncio.to_thread(self._store.create, self._answer_key, data))
+        until = [asyncio.create_task(self.stored()), asyncio.create_task(self._hurried.wait())]
+        limit = self._settings.recordings_first_seconds
+        await asyncio.wait(until, timeout=limit, return_when=asyncio.FIRST_COMPLETED)
+        for task in until:
+            task.cancel()
+        if self.storing:
+            log.error("a recording is not stored yet; the answer does not wait for it")
 
-    @property
-    def _folder(self) -> str:
-        return recordings_folder(self._settings.project_id, self._settings.user_id) + self._settings.server
+    async def save_member(self, user_id: str, answers: Mapping[str, Any]) -> None:
+        """Store the answer of a member of a session. One that is there already stays as it is."""
+        settings = self._settings
+        group = next((member.group for member in settings.members if member.user_id == user_id), None)
+        more = {"session": settings.session}
+        await self._create(user_id, Answer(self._step, GAME, group, datetime.now(UTC), {**answers, **more}))
 
-    @property
-    def _answer_key(self) -> str:
-        return answer_key(self._settings.project_id, self._settings.user_id, self._step)
+    async def _create(self, user_id: str, answer: Answer) -> None:
+        key, data = self._answer_key(user_id), to_json(answer)
+        await retry_forever("write the answer", lambda: asyncio.to_thread(self._store.create, key, data))
+
+    def _answer_key(self, user_id: str) -> str:
+        return answer_key(self._settings.project_id, user_id, self._step)
+
+
+def _whose(settings: Settings) -> dict[str, Any]:
+    """Whose recording it is. No participant's id stands in that of a session."""
+    return {"sessionId": settings.session, "group": settings.group} if settings.session else {"user": settings.user_id}
 
 
 def rules(config: Trial, players: Sequence[Player]) -> dict[str, Any]:
@@ -185,8 +244,3 @@ def _with_actions(players: Mapping[str, Any], opening: OpenRecording) -> dict[st
         name: {**said, **({} if spaces[name] == opening.action_space else {"actionSpace": list(spaces[name])})}
         for name, said in players.items()
     }
-
-
-def now_text() -> str:
-    """The time as in all of the study's records: `2026-11-21T14:46:40.123456Z`."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")

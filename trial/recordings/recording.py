@@ -13,9 +13,12 @@ it as its own, even if it is the human's), or one of `trial.core.actions.By`. Ti
 from __future__ import annotations
 
 import base64
+import contextlib
+import functools
 import json
 import os
 import platform
+import re
 import threading
 import time
 import zlib
@@ -27,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from trial.recordings import disk
-from trial.recordings.recorded_values import LISTED, Values, text_of
+from trial.recordings.recorded_values import CUT_OFF, LISTED, Values, text_of
 
 SCHEMA = 1
 VERSION = "1.0"
@@ -36,21 +39,28 @@ SYNC_SECONDS = 5.0
 """An open recording is synced to the disk this often: a power cut takes no more of it."""
 MAX_EXTRA_BYTES = 1_000_000
 """Of what an agent's `step` returns beside Gymnasium's values, as JSON, in one line."""
+MOST_TOO_LARGE = 100
+"""Values of one line that are replaced by their sizes; those after them are left out."""
+LONGEST_NAME = 1_000
+"""Characters of the name of such a value, if it is too large itself."""
 
 
 def line(kind: str, /, **fields: Any) -> bytes:
     """One line of a recording; values that are not JSON are made so."""
     record = {"kind": kind, **fields}
     try:
-        text = json.dumps(record, default=plain, separators=(",", ":"), allow_nan=False)
+        text = _JSON.encode(record)
     except Exception:  # noqa: BLE001 - NaN, keys that are no text, circles, what raises: rare, so not looked for first
-        text = json.dumps(plain(record), separators=(",", ":"), allow_nan=False)
+        text = _JSON.encode(plain(record))
     return text.encode() + b"\n"
 
 
 def plain(value: Any) -> Any:
     """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
     return Values().keep(value)
+
+
+_JSON = json.JSONEncoder(default=plain, separators=(",", ":"), allow_nan=False)
 
 
 def observation(value: Any) -> Any:
@@ -62,12 +72,18 @@ def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tup
     """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
 
     A value that does not fit into `left` bytes together with those before it is replaced by
-    `{"tooLarge": bytes}`. The second result says which, and how large they are at least.
+    `{"tooLarge": bytes}`. The second result says which, and how large they are at least. After `MOST_TOO_LARGE` such
+    values the rest is left out, and `"<cut off>"` is how many these are.
     """
     kept: dict[str, Any] = {}
     too_large: dict[str, int] = {}
-    for key, value in values.items():
+    for index, (key, value) in enumerate(values.items()):
+        if len(too_large) == MOST_TOO_LARGE:
+            kept[CUT_OFF] = len(values) - index
+            break
         name = text_of(key)
+        if len(name) > left:
+            name = name[:LONGEST_NAME]
         reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
         fit = reader.keep(value)
         size = size_of(fit) + reader.left_out
@@ -78,6 +94,13 @@ def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tup
             left -= size
         kept[name] = fit
     return kept, too_large
+
+
+def is_too_large(info: Mapping[str, Any]) -> bool:
+    """Whether an `info` has more than `MAX_EXTRA_BYTES` as JSON. A value that is too large alone is not read."""
+    reader = Values(most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
+    kept = reader.keep(info)
+    return reader.exhausted or size_of(kept) > MAX_EXTRA_BYTES
 
 
 def size_of(kept: Any) -> int:
@@ -95,10 +118,32 @@ OF_SEVERAL = ("pettingzoo", "onnxruntime")
 """Packages that may change how a game of several players plays."""
 
 
+REQUIRED = Path(__file__).resolve().parents[2] / "requirements/project.txt"
+"""In the servers' image, the lines of the project's requirements.txt."""
+_PACKAGE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_MOST_PACKAGES = 100
+
+
+@functools.cache
+def packages(agent_dir: Path) -> tuple[str, ...]:
+    """The packages that the project's requirements.txt names: its games are among them."""
+    names: dict[str, None] = {}
+    for file in (agent_dir / "requirements.txt", REQUIRED):
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            found = map(_PACKAGE.match, map(str.strip, file.read_text(encoding="utf-8-sig").splitlines()))
+            names |= dict.fromkeys(each[0] for each in found if each)
+    return tuple(names)[:_MOST_PACKAGES]
+
+
 def versions(more: Iterable[str] = ()) -> dict[str, str]:
     """Versions of what may change how a game plays; of these packages, too, as far as they are installed."""
+    return dict(_versions(tuple(more)))
+
+
+@functools.cache
+def _versions(more: tuple[str, ...]) -> Mapping[str, str]:
     found = {"trial": VERSION, "python": platform.python_version()}
-    for name in ("gymnasium", "ale-py", "numpy", "websockets", *more):
+    for name in dict.fromkeys(("gymnasium", "ale-py", "numpy", "websockets", *more)):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -14,8 +14,9 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
+from trial.core.ended import PARTNER_LEFT, Episode
+from trial.core.message_log import Word
 from trial.core.messages import is_feedback
-from trial.core.progress import Episode
 from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.recordings import recording
 from trial.recordings.store import Store
@@ -68,11 +69,16 @@ def add_lines(recorded: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> No
 
 def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> None:
     kind, number, current = line["kind"], int(line["episode"]), recorded.unfinished
-    if kind == "reset":
+    if kind in ("end", "break") and isinstance(line.get("outcomes"), Mapping):
+        recorded.outcomes |= {str(player): str(outcome) for player, outcome in line["outcomes"].items()}
+    if kind == "presence" and line["what"] == "refused":
+        recorded.outcomes[str(line["player"])] = "ping"
+    elif kind == "reset":
         recorded.unfinished = UnfinishedEpisode(number, line["seed"])
     elif kind == "break":
-        if line["why"] == "stop" and recorded.ended and recorded.ended[-1].number == number:
-            recorded.ended[-1] = replace(recorded.ended[-1], why="stopped")  # the trial ended in the break after it
+        ends = {"stop": "stopped", PARTNER_LEFT: PARTNER_LEFT}.get(line["why"])
+        if ends is not None and recorded.ended and recorded.ended[-1].number == number:
+            recorded.ended[-1] = replace(recorded.ended[-1], why=ends)  # the trial ended in the break after it
     elif current is None or number != current.number:
         return
     elif kind == "resume":
@@ -90,7 +96,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         _end(recorded, current, str(line["why"]))
 
 
-def _step(line: Mapping[str, Any], words: tuple[str, ...]) -> RecordedStep:
+def _step(line: Mapping[str, Any], words: tuple[Word, ...]) -> RecordedStep:
     # What the environment was given: the action itself, unless the agent took another one than it was asked for.
     advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
     parts = line.get("players") or {}
@@ -106,5 +112,6 @@ def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
     recorded.unfinished = None
 
 
-def _feedback(line: Mapping[str, Any]) -> list[str]:
-    return [message["command"] for message in line.get("messages", ()) if is_feedback(message.get("command"))]
+def _feedback(line: Mapping[str, Any]) -> list[Word]:
+    said = (message for message in line.get("messages", ()) if is_feedback(message.get("command")))
+    return [Word(message["command"], message.get("player")) for message in said]

@@ -16,6 +16,10 @@ class Store(Protocol):
         """The document, or None if there is none."""
         ...
 
+    def look(self, key: str) -> bytes | None:
+        """The same, of a document that is read every few seconds; tries once."""
+        ...
+
     def create(self, key: str, data: bytes | Path) -> bool:
         """Store bytes or a file's content; False, and nothing changed, if the key exists."""
         ...
@@ -52,6 +56,9 @@ class FolderStore:
         except FileNotFoundError:
             return None
 
+    def look(self, key: str) -> bytes | None:
+        return self.get(key)
+
     def create(self, key: str, data: bytes | Path) -> bool:
         path = self.folder / key
         disk.make_folder(path.parent)
@@ -87,6 +94,9 @@ class S3Store:
             raise
         body: bytes = answer["Body"].read()
         return body
+
+    def look(self, key: str) -> bytes | None:
+        return self.get(key)
 
     def create(self, key: str, data: bytes | Path) -> bool:
         from botocore.exceptions import ClientError  # noqa: PLC0415

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import http
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from urllib.parse import parse_qs, urlsplit
 
@@ -13,9 +13,12 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from protocol.keys import NAME
+from protocol.session import member_token
 from trial.core import messages
 from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
 from trial.programs import environments, watch
+from trial.settings import Settings
 from trial.wire import notice, plain
 from trial.wire.connection import SUBPROTOCOLS
 from trial.wire.inbound import RateLimit
@@ -86,14 +89,40 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
     return hello if hello.token is not None else replace(hello, token=token_in_address(websocket))
 
 
-def check_access(websocket: ServerConnection, hello: Hello, token: str, origins: Collection[str]) -> None:
-    """Check that a client has the token, or needs none. Raises CloseConnection.
+def tokens_for(settings: Settings, user_id: str | None) -> tuple[str, ...]:
+    """The tokens with which a client that says this id may play.
+
+    In a session it is the member's own (`protocol.session.member_token`). The server's token opens no session: who has
+    one member's token, or knows another member's id, cannot play in another's place. A warm server does not know yet
+    whether it will be a session's, so with either token it looks for its handover.
+    """
+    named = user_id is not None and NAME.fullmatch(user_id) is not None
+    own = (member_token(settings.token, user_id),) if user_id is not None and named else ()
+    if settings.warm_server:
+        return (settings.token, *own)
+    return own if settings.session else (settings.token,)
+
+
+def check_member(websocket: ServerConnection, user_id: str | None, settings: Settings) -> None:
+    """Check that the participant is a member of the session, and that their client speaks ours. Raises CloseConnection.
+
+    What a client without a subprotocol sends along is recorded, and could hold another member's id.
+    """
+    if user_id not in settings.seats:
+        raise CloseConnection(4401, _REFUSED)
+    if websocket.subprotocol is None:
+        raise CloseConnection(4401, "this game is played with others, and needs a client that offers a subprotocol")
+
+
+def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str], origins: Collection[str]) -> None:
+    """Check that a client has one of the tokens, or needs none. Raises CloseConnection.
 
     It needs none if it offers no subprotocol and its page is of one of `origins`: those of the project's front end, if
     the installation allows such clients. Its id is compared afterwards.
     """
     if hello.token is not None or websocket.subprotocol is not None:
-        check_matches(hello.token, token)
+        if not any(_matches(hello.token, token) for token in tokens):
+            raise CloseConnection(4401, _REFUSED)
     elif not origins:
         raise CloseConnection(4401, NEEDS_PROOF)
     elif _origin(websocket) not in origins:
@@ -102,8 +131,13 @@ def check_access(websocket: ServerConnection, hello: Hello, token: str, origins:
 
 def check_matches(shown: str | None, expected: str, words: str = _REFUSED) -> None:
     """Compare a token or an id in constant time. Raises CloseConnection."""
-    if not hmac.compare_digest((shown or "").encode("utf-8", "surrogatepass"), expected.encode()):
+    if not _matches(shown, expected):
         raise CloseConnection(4401, words)
+
+
+def _matches(shown: str | None, expected: str) -> bool:
+    """Whether they are the same, in constant time."""
+    return hmac.compare_digest((shown or "").encode("utf-8", "surrogatepass"), expected.encode())
 
 
 async def show_refusal(websocket: ServerConnection, words: str) -> None:

@@ -27,7 +27,7 @@ class Lifetime:
         # The clock of the deadline is the wall's; everything else counts seconds of the loop's clock.
         deadline = None if settings.deadline is None else self._loop.time() + settings.deadline - time.time()
         self._watchdog = Watchdog(
-            now=None if settings.warm_server else self._loop.time(),
+            now=self._loop.time() if settings.assigned else None,
             idle=settings.idle_seconds,
             grace=settings.grace_seconds,
             deadline=deadline,

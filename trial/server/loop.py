@@ -9,25 +9,30 @@ import secrets
 import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from trial.agent.callbacks import About, Callbacks
 from trial.agent.calls import AgentCalls, Calls
 from trial.agent.joint import JointAdapter
 from trial.agent.joint_calls import JointCalls
-from trial.agent.tracebacks import report
+from trial.agent.tracebacks import report, without
 from trial.agent.worker import Worker
 from trial.core.effects import (
     Call,
     Close,
     CloseRecording,
     Effect,
+    FeedbackCall,
     Log,
     LogAgentError,
     OpenRecording,
     RecordLine,
+    ReplayCall,
+    ResetCall,
     ResetPolicy,
     SaveAnswer,
+    SaveMember,
     SendDone,
     SendMessage,
     SendPicture,
@@ -40,8 +45,8 @@ from trial.core.messages import Message
 from trial.core.players import Player, PlayersError
 from trial.core.policies import AskPolicy
 from trial.core.trial import Trial
+from trial.policies.places import Places
 from trial.policies.policy import PolicyError
-from trial.policies.seats import Seats
 from trial.programs.watch import Watchers
 from trial.recordings.recorder import Recorder
 from trial.recordings.spool import Spool
@@ -76,42 +81,48 @@ class TrialLoop:
         self.ready = asyncio.Event()
         """The first frame is there, or the trial is over."""
         self._settings = settings
+        self._hide = partial(without, settings.private) if settings.session else str
+        """Takes the ids of members out of what is recorded for all of them."""
         self._worker = worker
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls: Calls
         self._callbacks: Callbacks | None = None
+        self._recorded = 0  # lines of callbacks by the end of the last piece of work
         self._moves: deque[TellMoved] = deque()  # the first is being told
-        self._seats = Seats(self._acted)
+        self._places = Places(self._acted)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
         self._saving: asyncio.Task[None] | None = None
+        self._saving_members: set[asyncio.Task[None]] = set()
         self._done: asyncio.Future[None] = self._loop.create_future()
         self._logged: set[str] = set()
         self._pictured: list[Connection] = []  # connections that have a new picture
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
+            **dict.fromkeys((StepCall, FeedbackCall, ResetCall, ReplayCall), self._call),
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
             SendPicture: self._send_picture,
-            SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score),
+            SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score, effect.outcome),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
-            WriteLine: lambda effect: self._write(effect.line),
+            WriteLine: self._write_line,
             TellMoved: self._tell_moved,
-            RecordLine: lambda effect: self._write(self._recorder.line(effect.kind, effect.fields)),
+            RecordLine: self._record_line,
             OpenRecording: self._open_recording,
             CloseRecording: lambda _: self._recorder.close(),
             SaveAnswer: self._save,
+            SaveMember: self._save_member,
             Log: lambda effect: log.log(effect.level, effect.text),
             LogAgentError: self._log_agent_error,
-            AskPolicy: self._seats.ask,
-            ResetPolicy: self._seats.reset,
+            AskPolicy: self._places.ask,
+            ResetPolicy: self._places.reset,
         }
 
     @property
     def stuck(self) -> bool:
         """A callback of the agent or a policy has not returned, and may never."""
-        return self._seats.busy or (self._callbacks is not None and self._callbacks.busy)
+        return self._places.busy or (self._callbacks is not None and self._callbacks.busy)
 
     def begin(self, agent_ready: Awaitable[Started | None]) -> asyncio.Future[None]:
         """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
@@ -119,17 +130,30 @@ class TrialLoop:
         self._starting.add_done_callback(self._started)
         return self._done
 
+    @property
+    def storing(self) -> bool:
+        """A recording is not stored yet."""
+        return self._recorder.storing
+
+    async def stored(self) -> None:
+        """Wait until all closed recordings are stored."""
+        await self._recorder.stored()
+
     async def close(self, seconds: float) -> None:
         """End playing where the game stands and store what was recorded.
 
-        Gives up after `seconds`, even if the researcher's code or the store never answers.
+        Answers wait for recordings for half the time. Gives up after `seconds`, even if the researcher's code or the
+        store never answers.
         """
         if self._starting is not None:
             self._starting.cancel()
         self._do(self.core.close)
+        hurrying = self._loop.call_later(seconds / 2, self._recorder.hurry)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await asyncio.wait({self._done})
+                await self.stored()
+        hurrying.cancel()
 
     # ---- clients
 
@@ -141,8 +165,16 @@ class TrialLoop:
     def disconnect(self, connection: Connection) -> None:
         self._apply(self.core.disconnect(connection, self._loop.time()))
 
+    def round_trip(self, human: str, seconds: float) -> None:
+        """The human's browser has answered a ping after so many seconds."""
+        self._do(self.core.round_trip, human, seconds)
+
     def receive(self, connection: Connection, message: Message) -> None:
         self._apply(self.core.receive(connection, message, self._loop.time()))
+
+    def woke(self, connection: Connection, frame_id: int) -> None:
+        """The page acknowledges this frame, and had stopped acknowledging."""
+        self._do(self.core.receive, connection, Message(ack=frame_id))
 
     # ---- programs
 
@@ -163,26 +195,33 @@ class TrialLoop:
             self._apply(self.core.agent_failed(self._loop.time()))
             return
         recorded = await self._recorder.recorded()
-        self._calls = self._calls_of(started, table.players)
-        self._seats.fill(table.players, table.policies)
+        self._calls = self._calls_of(started, table)
+        self._places.fill(table.players, table.policies, table.stand_ins, table.seats)
         self._find_callbacks(started, table.players)
-        self._apply(self.core.start(table.players, recorded, self._loop.time()))
+        now = self._loop.time()
+        self._apply(self.core.start(table.players, recorded, now, places=table.places, vacant=table.vacant))
 
     async def _table(self, started: Started) -> Table | None:
         """Who plays whom; None if the policies cannot be loaded, which the log says."""
         settings = self._settings
         try:
-            return await self._worker.call(lambda: started.take(settings.group), limit=settings.start_seconds)
+            return await self._worker.call(lambda: started.take(settings), limit=settings.start_seconds)
         except (PlayersError, PolicyError) as error:
             log.error("%s", error)
         except Exception as error:  # noqa: BLE001 - a policy may be the researcher's code
-            log.error("a policy cannot be loaded\n%s", report(error, settings.agent_dir, settings.user_id))
+            log.error("a policy cannot be loaded\n%s", report(error, settings.agent_dir, settings.private))
         return None
 
-    def _calls_of(self, started: Started, players: Sequence[Player]) -> Calls:
+    def _calls_of(self, started: Started, table: Table) -> Calls:
         stamp, config = self._recorder.stamp, self._settings.trial
         if isinstance(started.agent, JointAdapter):
-            return JointCalls(started.agent, players, stamp, record_observations=config.record_observations)
+            return JointCalls(
+                started.agent,
+                table.players,
+                stamp,
+                record_observations=config.record_observations,
+                stand_ins=table.stand_ins,
+            )
         views = config.pace == "turns"
         return AgentCalls(started.agent, stamp, record_observations=config.record_observations, views=views)
 
@@ -208,24 +247,21 @@ class TrialLoop:
         if not self._done.done() and error is not None:
             self._done.set_exception(error)
 
-    def _called(self, call: Call, result: Any, error: Exception | None) -> None:
-        if not isinstance(call, StepCall):
+    def _called(self, call: Call, found: tuple[Any, int] | None, error: Exception | None) -> None:
+        result, self._recorded = found or (None, self._recorded_now())
+        if not isinstance(call, StepCall) or error is not None:
             self._write_callbacks()  # before the episode's end, with which its recording may be closed
         if error is not None:
             self._do(self.core.call_failed, call, error)
         else:
             self._do(self.core.call_returned, call, result)
-        self._write_callbacks()
 
     # ---- effects
 
     def _apply(self, effects: list[Effect]) -> None:
         """Carry out effects; then see when to go on."""
         for effect in effects:
-            if isinstance(effect, Call):
-                self._call(effect)
-            else:
-                self._carry_out[type(effect)](effect)
+            self._carry_out[type(effect)](effect)
         while self._pictured:  # after the messages of the same event
             self._pictured.pop().send_now()
         core = self.core
@@ -235,13 +271,29 @@ class TrialLoop:
             self._done.set_result(None)
             if self._callbacks:
                 self._callbacks.close()
-            self._seats.close()
+            self._places.close()
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._do, core.advance)
+        self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._wake)
+
+    def _wake(self) -> None:
+        self._timer = None
+        self._do(self.core.advance)
 
     def _call(self, call: Call) -> None:
-        self._worker.submit(lambda: self._calls.run(call), call.limit, lambda *found: self._called(call, *found))
+        self._on_agent(partial(self._calls.run, call), call.limit, partial(self._called, call))
+
+    def _on_agent(
+        self, work: Callable[[], Any], limit: float, done: Callable[[tuple[Any, int] | None, Exception | None], None]
+    ) -> None:
+        """Do `work` on the agent's thread; `done` gets its result with the number of lines of callbacks by then.
+
+        The thread may be at the next piece of work when `done` is called. The lines of that one stay behind.
+        """
+        self._worker.submit(lambda: (work(), self._recorded_now()), limit, done)
+
+    def _recorded_now(self) -> int:
+        return self._callbacks.recorded if self._callbacks else 0
 
     def _find_callbacks(self, started: Started, players: Sequence[Player]) -> None:
         """The agent has started: from now on its callbacks are called, if it has some."""
@@ -262,15 +314,32 @@ class TrialLoop:
             seconds=settings.trial.callback_seconds,
             stamp=self._recorder.stamp,
             failed=lambda name, error: log.error(
-                "the callback %s failed\n%s", name, report(error, settings.agent_dir, settings.user_id)
+                "the callback %s failed\n%s", name, report(error, settings.agent_dir, settings.private)
             ),
-            late=lambda: _soon(loop, self._write_callbacks),
+            hide=self._hide,
+            late=lambda recorded: _soon(loop, lambda: self._write_late(recorded)),
         )
 
+    def _record_line(self, effect: RecordLine) -> None:
+        fields = effect.fields
+        if effect.kind == "error":
+            fields = {**fields, "error": self._hide(fields["error"])}
+        self._write(self._recorder.line(effect.kind, fields))
+
+    def _write_line(self, effect: WriteLine) -> None:
+        """Write the line of a step or a reset, and then what callbacks recorded during it."""
+        self._write(effect.line)
+        self._write_callbacks()
+
+    def _write_late(self, recorded: int) -> None:
+        """Write the lines of a callback for which the game did not wait."""
+        self._recorded = max(self._recorded, recorded)
+        self._write_callbacks()
+
     def _write_callbacks(self) -> None:
-        """Write what callbacks have recorded, if a recording is open."""
+        """Write what callbacks recorded by the end of the last piece of work, if a recording is open."""
         if self._callbacks and self._recorder.is_open:
-            for line in self._callbacks.take():
+            for line in self._callbacks.take(self._recorded):
                 self._write(line)
 
     def _tell_moved(self, effect: TellMoved) -> None:
@@ -293,13 +362,12 @@ class TrialLoop:
     def _tell_next_move(self) -> None:
         callbacks, move = self._callbacks, self._moves[0]
         assert callbacks is not None
-        self._worker.submit(
-            lambda: callbacks.player_moved(move.callback, move.player),
-            self._settings.step_seconds,
-            lambda *_: self._told_move(),
+        self._on_agent(
+            lambda: callbacks.player_moved(move.callback, move.player), self._settings.step_seconds, self._told_move
         )
 
-    def _told_move(self) -> None:
+    def _told_move(self, found: tuple[None, int] | None, _: Exception | None) -> None:
+        self._recorded = found[1] if found else self._recorded_now()
         self._write_callbacks()
         self._moves.popleft()
         if self._moves and not self.core.done:
@@ -321,7 +389,7 @@ class TrialLoop:
 
     def _open_recording(self, opening: OpenRecording) -> None:
         try:
-            self._recorder.open(opening, self._seats.described if opening.players else {})
+            self._recorder.open(opening, self._places.described if opening.players else {})
         except OSError as error:
             log.error("a recording cannot be opened (%s)", short_error(error))
             self._apply(self.core.recording_failed(self._loop.time()))
@@ -329,7 +397,7 @@ class TrialLoop:
             self._apply(self.core.recording_opened(self._loop.time()))
 
     def _save(self, effect: SaveAnswer) -> None:
-        self._saving = asyncio.create_task(self._recorder.save(effect.answers))
+        self._saving = asyncio.create_task(self._recorder.save(effect.answers, effect.by_human))
         self._saving.add_done_callback(self._saved)
 
     def _saved(self, task: asyncio.Task[None]) -> None:
@@ -340,8 +408,21 @@ class TrialLoop:
         else:
             self._do(self.core.answer_saved)
 
+    def _save_member(self, effect: SaveMember) -> None:
+        task = asyncio.create_task(self._recorder.save_member(effect.human, effect.answers))
+        self._saving_members.add(task)
+
+        def saved(task: asyncio.Task[None]) -> None:
+            self._saving_members.discard(task)
+            if not task.cancelled() and task.exception() is not None:
+                self._fail(task.exception())
+            elif not task.cancelled():
+                self._do(self.core.member_saved, effect.human)
+
+        task.add_done_callback(saved)
+
     def _log_agent_error(self, effect: LogAgentError) -> None:
-        text = report(effect.error, self._settings.agent_dir, self._settings.user_id)
+        text = report(effect.error, self._settings.agent_dir, self._settings.private)
         if text in self._logged:
             log.warning("the agent failed again, in the same way")
         else:

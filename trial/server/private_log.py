@@ -1,20 +1,20 @@
-"""Keeps a participant's id out of the log, whichever part of the server says it: the researcher's code knows the id."""
+"""Keeps participants' ids out of the log, whichever part of the server says them: the researcher's code may know."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from trial.agent.tracebacks import without
 
 
-class WithoutId(logging.Filter):
-    """A filter for the logger `trial`. `user_id` returns the id; an empty one while no participant is known."""
+class WithoutIds(logging.Filter):
+    """A filter for the logger `trial`. `ids` returns those of all participants who play; none while none is known."""
 
-    def __init__(self, user_id: Callable[[], str]) -> None:
+    def __init__(self, ids: Callable[[], Iterable[str]]) -> None:
         super().__init__()
-        self._user_id = user_id
+        self._ids = ids
 
     def filter(self, record: logging.LogRecord) -> bool:
-        record.msg, record.args = without(self._user_id(), record.getMessage()), None
+        record.msg, record.args = without(self._ids(), record.getMessage()), None
         return True

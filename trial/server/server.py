@@ -1,7 +1,7 @@
-"""The server: admits one participant, connects them to their trial, and ends when it is over or they do not come.
+"""The server: admits one participant, or the members of one session, connects them to their trial, and ends.
 
-A warm server does not know its participant yet. It refuses clients until it has read its handover
-(`trial/server/warm.py`).
+It ends when the trial is over, or when they do not come. A warm server, and one whose session is not formed yet, do not
+know who plays. They refuse clients until they have read it (`trial/server/assignment.py`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import contextlib
 import json
 import logging
 import os
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Coroutine
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,41 +20,44 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from protocol import exits
-from protocol.handover import Handover
-from protocol.keys import handover_key, recordings_folder
+from trial.agent import match
 from trial.agent.agent import AgentAdapter
 from trial.agent.tracebacks import report
 from trial.agent.worker import Worker
 from trial.core import messages
 from trial.core.effects import AgentTimeout
-from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
+from trial.core.messages import BadMessage, CloseConnection, CommandRefused, Hello, NotAMessage
 from trial.core.players import PlayersError
-from trial.core.progress import CommandRefused
 from trial.policies.policy import PolicyError
 from trial.programs import watch
 from trial.programs.environments import MOST, Environments
 from trial.recordings.spool import Spool, store_file
 from trial.recordings.store import Store, open_store
-from trial.server import warm
+from trial.server.assignment import Found, Search, set_environment
 from trial.server.drawing import Drawing
 from trial.server.handshake import (
     OTHER_ID,
     OTHER_STUDY,
     check_access,
     check_matches,
+    check_member,
     is_program,
     receive_hello,
     show_refusal,
     token_in_address,
+    tokens_for,
 )
 from trial.server.lifetime import Lifetime, exit_hard_after
 from trial.server.listener import CLOSE_SECONDS, Listener
 from trial.server.loop import TrialLoop
-from trial.server.private_log import WithoutId
+from trial.server.matching import Matching
+from trial.server.private_log import WithoutIds
 from trial.server.started import Started
 from trial.settings import Settings
+from trial.wire import round_trips
 from trial.wire.connection import Connection
 from trial.wire.inbound import Inbound
+from trial.wire.reconnects import Reconnects
 
 log = logging.getLogger("trial")
 
@@ -67,11 +70,12 @@ TELL_SECONDS = 5.0
 another server replaces it."""
 _TOLD_SECONDS = 0.3  # the same, once a client has been told
 _NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
+_TOO_OFTEN = "You connect too often. Please wait: it is tried again."
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
 class Server:
-    """One participant's server. `run` returns the process's exit status."""
+    """The server of one participant, or of one session. `run` returns the process's exit status."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -89,31 +93,33 @@ class Server:
         self._trial: TrialLoop | None = None
         self._trials: list[TrialLoop] = []  # also those that are over: a policy or a callback may still run
         self._finished_steps: set[str] = set()
-        self._handover: warm.HandoverSearch
+        self._search: Search
         self._connections: dict[Connection, asyncio.Task[None]] = {}
+        self._reconnects = Reconnects()
         self._tasks: set[asyncio.Task[None]] = set()
         self._watchers = watch.Watchers()
         self._watching = 0  # programs that are connected
         self._environments = Environments(settings.agent_dir)
 
     async def run(self) -> int:
-        """Serve until the trial is over, the participant stays away, the deadline comes, or `end` is called."""
+        """Serve until the trial is over, all participants stay away, the deadline comes, or `end` is called."""
         settings = self.settings
-        log.addFilter(WithoutId(lambda: self.settings.user_id))
-        self._lifetime = Lifetime(settings, saving=lambda: self._trial is not None and self._trial.core.saving)
+        log.addFilter(WithoutIds(lambda: self.settings.private))
+        self._lifetime = Lifetime(settings, saving=self._is_saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
+        self._search = Search(self._store, settings)
         self._listener = Listener(settings, self._store, self._connected)
         port = await self._listener.open()
         print(json.dumps({"port": port}), flush=True)
         log.info("listening on port %d", port)
         self._agent_ready = asyncio.create_task(self._start_agent())
-        if settings.warm_server:
-            key = handover_key(settings.project_id, settings.server)
-            self._handover = warm.HandoverSearch(self._store, key, settings.warm_server_seconds)
-            self._keep(self._handover.run(self._assign))
-        else:
+        if not settings.warm_server:
             self._keep(self._store_files(await self._leftovers(settings)))
+        if not settings.assigned:
+            self._keep(self._search.run(self._assign))
+            if settings.match:
+                self._keep(self._match())
         self._keep(self._listener.renew_certificate())
         self._lifetime.watch()
         reason = await self._lifetime.over()
@@ -131,12 +137,14 @@ class Server:
         """The researcher's code is still running and may never return."""
         return self._worker.busy or any(trial.stuck for trial in self._trials)
 
+    def _is_saving(self) -> bool:
+        return any(trial.core.saving or trial.storing for trial in self._trials)
+
     async def _close(self, reason: str) -> None:
         for task in self._tasks:
             task.cancel()
         self._listener.close("the trial is done" if reason == "done" else "the server is going away")
-        if self._trial is not None:
-            await self._trial.close(self.settings.stop_seconds - STORE_MARGIN)
+        await asyncio.gather(*(each.close(self.settings.stop_seconds - STORE_MARGIN) for each in self._trials))
         if not self._agent_ready.done():
             self._agent_ready.cancel()
         if not self._worker.busy:
@@ -169,27 +177,39 @@ class Server:
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
             settings = self.settings  # as they are now: a warm server may have been assigned meanwhile
             self._failure = exits.LATE_AGENT if isinstance(error, AgentTimeout) else exits.NO_AGENT
-            log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.user_id))
+            log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.private))
             self._lifetime.end_in(TELL_SECONDS, "error")
             return None
         log.info("the agent is ready")
         return started
 
-    async def _assign(self, handover: Handover) -> None:
-        """Make this warm server the server of the participant in the handover."""
-        settings = warm.assigned(self.settings, handover)
-        self._keep(self._store_files(await self._leftovers(settings)))
-        warm.set_environment(os.environ, handover)
+    async def _match(self) -> None:
+        """Say who plays with whom, until it is known who plays here. Only a server that is ready answers."""
+        if await asyncio.shield(self._agent_ready) is None:
+            return
+        function = match.function_of(self._agent.agent_module)
+        if function is None:
+            log.error("matching is match, and agent.py has no function match; nobody is matched")
+            return
+        await Matching(self._store, lambda: self.settings, function).run()
+
+    async def _assign(self, settings: Settings, found: Found) -> None:
+        """Make this server the one of the participant or the session that was found."""
+        if self.settings.warm_server:
+            self._keep(self._store_files(await self._leftovers(settings)))
+            log.info("this server is assigned to a %s now", "session" if settings.session else "participant")
+        set_environment(os.environ, found)
         self.settings = settings
-        self._lifetime.expect_participant()
-        log.info("this server is assigned to a participant now")
+        if settings.session and settings.assigned:
+            log.info("the members of the session are known now: %d of %d", len(settings.seats), settings.players)
+        if settings.assigned:
+            self._lifetime.expect_participant()
 
     async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
         """Recordings that an earlier process of this server left. Call it before this process records anything."""
         if not self._spool.local_only:
-            prefix = recordings_folder(settings.project_id, settings.user_id) + settings.server
             with contextlib.suppress(OSError):
-                return await asyncio.to_thread(self._spool.leftovers, prefix)
+                return await asyncio.to_thread(self._spool.leftovers, settings.recordings_folder)
         return []
 
     async def _store_files(self, left: list[tuple[str, Path]]) -> None:
@@ -222,9 +242,9 @@ class Server:
             else:
                 await self._serve_watching(websocket)
             return
-        step = await self._authenticate(websocket)
+        hello = await self._authenticate(websocket)
         self._listener.authenticated(websocket)
-        trial = self._trial_of(step)
+        trial = self._trial_of(hello.step)
         drawing = self._drawing
         connection = Connection(
             websocket, lossless=self.settings.trial.lossless, assets=drawing.assets, draw=drawing.draw
@@ -233,8 +253,10 @@ class Server:
         self._connections[connection] = sender
         self._lifetime.connected()
         try:
-            await self._connect(trial, connection)
-            await self._receive(trial, connection)
+            human = hello.user_id if self.settings.session else self.settings.user_id
+            await self._connect(trial, human or "", connection)
+            async with self._measured(trial, human or "", connection):
+                await self._receive(trial, connection)
         except CloseConnection as closing:
             connection.close(closing.code, messages.error(closing.words))
             if closing.code == 1011:
@@ -253,7 +275,7 @@ class Server:
     async def _serve_watching(self, websocket: ServerConnection) -> None:
         """Serve a program that watches, with the token in its address. Raises CloseConnection and ConnectionClosed."""
         check_matches(token_in_address(websocket), self.settings.token)
-        if self.settings.warm_server:
+        if not self.settings.assigned:
             raise CloseConnection(1013, _NOT_ASSIGNED)
         if self._watching >= watch.MOST:
             raise CloseConnection(1013, f"{watch.MOST} programs watch already")
@@ -271,7 +293,7 @@ class Server:
         A close says what is wrong: a message would be taken for an answer.
         """
         self._listener.authenticated(websocket)
-        if self.settings.warm_server:
+        if not self.settings.assigned:
             await websocket.close(1013, _NOT_ASSIGNED)
         elif self._environments.connections >= MOST:
             await websocket.close(1013, f"{MOST} programs are connected already; try later.")
@@ -279,7 +301,7 @@ class Server:
             await self._environments.serve(websocket)
 
     def _action_space(self, player: str | None) -> tuple[str, ...]:
-        return self._current().core.progress.action_space_of(player)
+        return self._current().core.progress.choices.action_space_of(player)
 
     def _advise(self, action: int, player: str | None) -> None:
         self._current().advise(action, player)
@@ -289,8 +311,8 @@ class Server:
             raise CommandRefused("no game is going on")
         return self._trial
 
-    async def _authenticate(self, websocket: ServerConnection) -> str | None:
-        """The step that a client asks for who may play. Raises CloseConnection."""
+    async def _authenticate(self, websocket: ServerConnection) -> Hello:
+        """The first message of a client who may play. Raises CloseConnection."""
         hello = await receive_hello(websocket, self.settings.hello_seconds)
         try:
             await self._admit(websocket, hello)
@@ -300,42 +322,65 @@ class Server:
             raise
         if hello.step is not None and hello.step not in self.settings.game_steps:
             raise CloseConnection(4404, "that is not a game step of this server")
-        return hello.step
+        now = asyncio.get_running_loop().time()
+        if self.settings.session and not self._reconnects.allowed(hello.user_id or "", now):
+            raise CloseConnection(4429, _TOO_OFTEN)
+        return hello
 
     async def _admit(self, websocket: ServerConnection, hello: Hello) -> None:
-        """Raises CloseConnection unless this is the participant, with the token where one is needed."""
-        check_access(websocket, hello, self.settings.token, self.settings.plain_origins)
-        if self.settings.warm_server:
-            await self._wait_for_handover(websocket)
-        if hello.token is None:
+        """Raises CloseConnection unless this is a participant of this server, with the token where one is needed."""
+        warm = self.settings.warm_server
+        check_access(websocket, hello, tokens_for(self.settings, hello.user_id), self.settings.plain_origins)
+        if not self.settings.assigned:
+            await self._wait_for_assignment(websocket)
+        if warm:  # now it is known which of the tokens counts
+            check_access(websocket, hello, tokens_for(self.settings, hello.user_id), self.settings.plain_origins)
+        if self.settings.session:
+            check_member(websocket, hello.user_id, self.settings)
+        elif hello.token is None:
             check_matches(hello.user_id, self.settings.user_id, OTHER_ID)
             if hello.project_id is not None:  # an id may take part in two studies, and its name leads to one server
                 check_matches(hello.project_id, self.settings.project_id, OTHER_STUDY)
         else:
             check_matches(hello.user_id, self.settings.user_id)
 
-    async def _wait_for_handover(self, websocket: ServerConnection) -> None:
-        """Look for the handover of a warm server. Raises CloseConnection if it is not there in time."""
+    async def _wait_for_assignment(self, websocket: ServerConnection) -> None:
+        """Look for the documents that say who plays here. Raises CloseConnection if they are not there in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.settings.hello_seconds):
-                await _first_of(self._handover.look(), websocket.wait_closed())
-        if self.settings.warm_server:
+                await _first_of(self._search.look(), websocket.wait_closed())
+        if not self.settings.assigned:
             raise CloseConnection(1013, _NOT_ASSIGNED)
 
-    async def _connect(self, trial: TrialLoop, connection: Connection) -> None:
+    async def _connect(self, trial: TrialLoop, human: str, connection: Connection) -> None:
         """Connect a client to the trial once it has begun. Raises CloseConnection if it cannot begin."""
         await _first_of(trial.ready.wait(), connection.websocket.wait_closed())
         if connection.websocket.close_code is not None:
             return  # gone before the game was ready; a client that plays now is not disturbed
         if trial.core.broken:
             raise CloseConnection(1011, _CANNOT_START)
-        trial.connect(self.settings.user_id, connection)
+        trial.connect(human, connection)
+
+    @contextlib.asynccontextmanager
+    async def _measured(self, trial: TrialLoop, human: str, connection: Connection) -> AsyncIterator[None]:
+        """In a session, tell the trial of the connection's round trips meanwhile."""
+        if not self.settings.session:
+            yield
+            return
+        report, samples = partial(trial.round_trip, human), self.settings.trial.ping_samples
+        measuring = asyncio.create_task(round_trips.measure(connection.websocket, samples, report))
+        try:
+            yield
+        finally:
+            measuring.cancel()
 
     async def _receive(self, trial: TrialLoop, connection: Connection) -> None:
         """Take a client's messages until it goes. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
         inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
         connection.hear_acknowledgements(inbound)
+        if self.settings.session:  # an acknowledgement says nothing to the trial unless the others wait for it
+            connection.woke = partial(trial.woke, connection)
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())
@@ -389,7 +434,13 @@ class Server:
         elif trial is not None and trial.core.finished:
             self._finished_steps.add(trial.core.step)
             if trial.core.step == self.settings.game_steps[-1]:
-                self._lifetime.end_in(self.settings.linger_seconds, "done")
+                self._keep(self._end_when_stored())
+
+    async def _end_when_stored(self) -> None:
+        """All game steps have their answers: end the server once their recordings are stored, too."""
+        for trial in self._trials:
+            await trial.stored()
+        self._lifetime.end_in(self.settings.linger_seconds, "done")
 
 
 def _reason(words: str) -> str:

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from trial.agent import starting
 from trial.agent.agent import AgentAdapter
 from trial.agent.joint import JointAdapter
-from trial.core.players import PLAYER, Player, who_plays
+from trial.core.players import PLAYER, Player, PlayersError, who_plays
+from trial.policies.places import load_policies
 from trial.policies.policy import Policy
-from trial.policies.seats import load_policies
 from trial.settings import Settings
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Who plays whom in a group: the players in the environment's order, and the policies of those that have one."""
+    """Who plays whom: the players in the environment's order, and the policies of those that have one."""
 
     players: tuple[Player, ...]
     policies: Mapping[str, Policy]
+    places: Mapping[str, str] = field(default_factory=dict)
+    """In a session: the place of each member, by their id: the player whom they play."""
+    seats: tuple[str, ...] = ()
+    """In a session: the players of its seats, in their order."""
+    vacant: tuple[str, ...] = ()
+    """In a session: the places of humans that no member has. A policy plays there."""
+    stand_ins: Mapping[str, Policy] = field(default_factory=dict)
+    """In a session: the policies that may play for members who are away, by player."""
 
 
 @dataclass(slots=True)
@@ -40,9 +48,9 @@ class Started:
         Raises PlayersError and PolicyError with a sentence, AgentError, and whatever the researcher's code raises.
         """
         config = settings.trial
-        agent = starting.start(adapter, config.player_names())
+        agent = starting.start(adapter, config.named_players())
         started = cls(settings, agent, agent.callbacks)
-        groups: Iterable[int | None] = config.groups() if settings.warm_server else ()
+        groups: Iterable[int | None] = () if settings.assigned else config.groups()
         for group in groups or (settings.group,):
             started._loaded[started._key(group)] = started._load(group)
         return started
@@ -51,14 +59,47 @@ class Started:
         """The group, if who plays whom differs between groups."""
         return group if self.settings.trial.groups() else None
 
-    def take(self, group: int | None) -> Table:
-        """Who plays whom in this group, for one trial: the next one gets policies of its own. Raises as `start`."""
-        return self._loaded.pop(self._key(group), None) or self._load(group)
+    def take(self, settings: Settings) -> Table:
+        """Who plays whom, for one trial: the next one gets policies of its own. Raises as `start`.
+
+        `settings` are those of now: a server may have learnt its group and its session since it has started.
+        """
+        table = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
+        return self._with_members(table, settings) if settings.session else table
+
+    def _with_members(self, table: Table, settings: Settings) -> Table:
+        """The table of a session: each member has a place, and `substitute` plays in the places that are left."""
+        config, seats = settings.trial, [player.name for player in table.players if player.human]
+        if len(seats) != settings.players:
+            raise PlayersError(
+                f"project.players is {settings.players}, and trial.players has {len(seats)} humans; they must agree"
+            )
+        places = {user_id: seats[seat] for user_id, seat in settings.seats.items()}
+        vacant = tuple(name for name in seats if name not in places.values())
+        plays = config.substitute
+        if vacant and plays is None:
+            raise PlayersError(f"trial.substitute must say what plays in the place of {vacant[0]}, who has not come")
+        if plays is None:
+            return replace(table, places=places, seats=tuple(seats))
+        away = seats if config.after_absent == "policy" else vacant
+        stand_ins = self._policies([replace(each, plays=plays) for each in table.players if each.name in away])
+        return Table(
+            tuple(replace(each, plays=plays) if each.name in vacant else each for each in table.players),
+            {**table.policies, **{name: stand_ins[name] for name in vacant}},
+            places,
+            tuple(seats),
+            vacant,
+            {name: policy for name, policy in stand_ins.items() if name not in vacant},
+        )
 
     def _load(self, group: int | None) -> Table:
         config, agent = self.settings.trial, self.agent
         if not isinstance(agent, JointAdapter):
             return Table(who_plays(config, {PLAYER: agent.action_space}, group), {})
         players = who_plays(config, {name: agent.action_spaces[name] for name in agent.players}, group)
-        folder, spaces = self.settings.agent_dir, agent.observation_spaces
-        return Table(players, load_policies(players, folder, agent.agent_module, spaces))
+        return Table(players, self._policies(players))
+
+    def _policies(self, players: Iterable[Player]) -> dict[str, Policy]:
+        agent = self.agent
+        spaces = agent.observation_spaces if isinstance(agent, JointAdapter) else {}
+        return load_policies(players, self.settings.agent_dir, agent.agent_module, spaces)

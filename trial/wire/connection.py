@@ -65,6 +65,8 @@ class Connection:
         self._loop = asyncio.get_running_loop()
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
+        self.woke: Callable[[int], None] | None = None
+        """Is called with the frame that a client acknowledges which had stopped acknowledging."""
         self.rate = 30
         """Frames per second of the game now."""
         self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
@@ -146,7 +148,10 @@ class Connection:
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         """The client has shown this frame."""
+        slept = self.woke is not None and self.window.stalled(now)
         self.window.acknowledged(frame_id, now)
+        if slept and self.woke is not None:
+            self.woke(frame_id)
         if self._picture is not None or not self._encoder.exact:
             self._wake.set()
 
@@ -169,9 +174,9 @@ class Connection:
             self._closing = (code, last_words)
             self._wake.set()
 
-    def close_done(self, episodes: int, score: float) -> None:
+    def close_done(self, episodes: int, score: float, outcome: str | None = None) -> None:
         """Say that the trial is over, then close. HIPPO's clients expect the plain word `done`, not JSON."""
-        self.close(_DONE, messages.done(episodes, score) if self.binary else "done")
+        self.close(_DONE, messages.done(episodes, score, outcome) if self.binary else "done")
 
     async def run(self) -> None:
         """Send until the connection is closed."""

@@ -57,7 +57,7 @@ function receive(own, message, hear) {
     return own.end("lost"); // no server of ours speaks like that
   }
   if (said.frame) own.show({ id: said.frameId }, decodeJpeg(said.frame));
-  if (said.done) return own.end("done", said);
+  if (said.done) own.end("done", said);
   if (Array.isArray(said.UI)) own.welcome = true;
   hear(said);
 }

@@ -1,9 +1,7 @@
 // The end: the last picture with the score, then a section that stays until the next page of the study can be loaded.
-import { hideMessage, showOverlay } from "./overlay.js";
+import { hideMessage, overlays, showOverlay } from "./overlay.js";
 import { find, points, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause } from "./requests.js";
-
-const SHOWN = 4_000; // ms for which the last picture and the score are shown, unless the participant goes on
 
 // `result` is the server's last message; it lacks the score if the game was not played.
 export async function leave({ score, episodes } = {}) {
@@ -11,7 +9,7 @@ export async function leave({ score, episodes } = {}) {
   const text = scored ? `Your ${episodes > 1 ? `total score in ${episodes} games` : "score"}: ${points(score)}` : "";
   setText(find("leave-score"), text);
   find("leave-score").hidden = !scored;
-  const seen = (scored ? lastPicture(text) : Promise.resolve()).then(() => showSection("leave"));
+  const seen = (scored || overlays.over.note ? lastPicture(text) : Promise.resolve()).then(() => showSection("leave"));
   for (;;) {
     try {
       const answers = await pageAnswers();
@@ -30,7 +28,7 @@ function lastPicture(text) {
   hideMessage();
   for (const id of ["overlay-score", "announce"]) setText(find(id), text);
   return new Promise((resolve) => {
-    setTimeout(resolve, SHOWN);
+    setTimeout(resolve, overlays.over.shown);
     find("overlay-button").addEventListener("click", resolve);
     find("overlay-button").focus({ preventScroll: true });
   });

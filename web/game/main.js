@@ -41,7 +41,7 @@ async function main() {
       polls = 0;
       waitsSince = performance.now();
     } else {
-      document.title = title;
+      document.title = data.title ?? title;
       lostSince = null;
       await showServer(state);
       if (performance.now() - waitsSince > RELOAD_AFTER && !isOver(state)) await loadPage();

@@ -15,7 +15,7 @@ export const overlays = {
   },
   elsewhere: { title: "The game is open in another tab or on another device", button: "Play here instead" },
   ended: { title: "Saving your game…", band: true },
-  over: { title: "The game is over", button: "Go on", band: true },
+  over: { title: "The game is over", button: "Go on", band: true, shown: 4_000 }, // ms, unless the participant goes on
 };
 
 // Shows the overlay of that name; none for other names, such as "playing".

@@ -15,6 +15,7 @@ from deploy.operate.doctor.check_context import CheckContext
 
 USUAL = 1.0  # vCPU of a server, while no project says
 REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
+IN_LOBBY = 0.15  # of one who waits in a lobby: a look takes four calls of S3 more, one after the other
 HEADROOM = 4  # standard deviations above the mean: requests come at random, and none should find no room
 
 
@@ -52,14 +53,16 @@ def functions(context: CheckContext) -> Iterator[Finding]:
     limit = context.account.client("lambda").get_account_settings()["AccountLimit"]
     free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
     workers = concurrency.workers(free)
-    mean = REQUESTS * context.at_once
+    waiting = context.at_once * context.players
+    mean = (IN_LOBBY if context.players > 1 else REQUESTS) * waiting
     need = workers + math.ceil(mean + HEADROOM * math.sqrt(mean))
     more = quotas.ask_for(context.account, quotas.EXECUTIONS, 1000)
+    whom = f" for {waiting:,} participants of {context.at_once:,} servers" if context.players > 1 else ""
     if free >= need:
-        yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted.")
+        yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted{whom}.")
     elif free > workers:
-        yield look(
-            "Lambda quota", f"{free:,} executions at once; about {need:,} are wanted: pages may come late.", more
-        )
+        late = f"{free:,} executions at once; about {need:,} are wanted{whom}: pages may come late."
+        yield look("Lambda quota", late, more)
     else:
-        yield bad("Lambda quota", f"{free:,} executions at once, and about {need:,} are wanted: pages will fail.", more)
+        few = f"{free:,} executions at once, and about {need:,} are wanted{whom}: pages will fail."
+        yield bad("Lambda quota", few, more)

@@ -55,6 +55,11 @@ class CheckContext:
         return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
 
     @cached_property
+    def players(self) -> int:
+        """The most participants who share a server of these projects."""
+        return max((p.players for p in self.projects if p.game_steps), default=1)
+
+    @cached_property
     def warm(self) -> int:
         """The number of warm servers. For each one that is assigned, another is started."""
         return sum(p.warm_servers for p in self.projects)

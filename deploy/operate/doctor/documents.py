@@ -5,9 +5,10 @@ None of them stops anything else: every reader leaves it out. Participants are c
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -19,6 +20,8 @@ from deploy.core.server_records import READERS, SLACK, Records
 from deploy.operate.doctor.check_context import CheckContext
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ParticipantSlots, ServerSlots
+from hippodrome.lobby import decisions
+from hippodrome.lobby.decisions import Decisions
 from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import Project, Step, UnreadableEntry
@@ -26,19 +29,22 @@ from hippodrome.model.warm_pool import Pool
 from hippodrome.participants import fragments, pages
 from hippodrome.participants.fragments import FragmentError
 from hippodrome.participants.pages import StepView
-from hippodrome.ports import Documents
+from hippodrome.ports import Documents, Entry
 from hippodrome.storage import secret
+from protocol.keys import sessions_folder
+from protocol.session import parse
 
-LATEST = 500  # participants of a project whose records are read
+LATEST = 500  # participants, and sessions, of a project whose documents are read
 SHOWN = 3  # servers that are named
 OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 
 def documents(context: CheckContext) -> Iterator[Finding]:
-    """The list of projects, what is written about servers and places, and participants' records."""
+    """The list of projects, what is written about servers and slots, and participants' records."""
     found = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
         found += [*_shared(context.platform.documents, project), *_people(context.platform.documents, project)]
+        found += _sessions(context.platform.documents, project) if project.has_sessions else ()
     yield from found or [good("documents", "All can be read.")]
 
 
@@ -77,7 +83,7 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
 
 
 def _shared(there: Documents, project: Project) -> Iterator[Finding]:
-    """What holds the places of a project, and the warm servers."""
+    """What holds the slots of a project, and the warm servers."""
     check = f"project {project.id}"
     if project.limits_servers and not _is(there, limits.server_slots_key(project.id), ServerSlots):
         yield bad(
@@ -101,6 +107,26 @@ def _shared(there: Documents, project: Project) -> Iterator[Finding]:
         )
 
 
+def _sessions(there: Documents, project: Project) -> Iterator[Finding]:
+    """What is decided in the lobby, and the documents of the latest sessions."""
+    check, key = f"project {project.id}", decisions.key(project.id)
+    if not _is(there, key, Decisions):
+        yield look(
+            check,
+            f"{key} cannot be read: it is made anew, and servers that were started ahead are replaced.",
+            "Nothing needs to be done; if it comes back, see `python -m deploy logs sweep`.",
+        )
+    entries = (entry for entry in there.list(sessions_folder(project.id)) if entry.key.endswith("/session.json"))
+    read = _read_latest(there, entries, parse)
+    if wrong := read.count(False):
+        yield bad(
+            check,
+            f"The documents of {wrong:,} of the latest {count(len(read), 'session')} cannot be read: their members are "
+            "not let in to the game, and their data lack who played whom.",
+            f"{OLDER}.",
+        )
+
+
 def _people(there: Documents, project: Project) -> Iterator[Finding]:
     entries = (
         entry
@@ -108,24 +134,34 @@ def _people(there: Documents, project: Project) -> Iterator[Finding]:
         for entry in those
         if entry.key == participant_key(project.id, user)
     )
-    latest = sorted(entries, key=lambda entry: entry.modified, reverse=True)[:LATEST]
-    with ThreadPoolExecutor(READERS) as pool:
-        read = list(pool.map(lambda entry: _is(there, entry.key, Participant), latest))
+    read = _read_latest(there, entries, partial(msgspec.json.decode, type=Participant))
     if wrong := read.count(False):
         yield look(
             f"project {project.id}",
             f"{count(wrong, 'record')} of the latest {count(len(read), 'participant')} cannot be read: their pages and "
-            "their data lack when they came, their group, and what their link certificate_transfer.",
+            "their data lack when they came, their group, and what their link carried.",
             f"{OLDER}, or leave it: the answers are documents of their own.",
         )
 
 
+def _read_latest(there: Documents, entries: Iterable[Entry], read: Callable[[bytes], object]) -> list[bool]:
+    """Of each of the latest of these documents, whether it can be read."""
+    latest = sorted(entries, key=lambda entry: entry.modified, reverse=True)[:LATEST]
+    with ThreadPoolExecutor(READERS) as pool:
+        return list(pool.map(lambda entry: _can_be_read(there, entry.key, read), latest))
+
+
 def _is(there: Documents, key: str, kind: type[Any]) -> bool:
     """Whether a document is a record of this kind, or is not there at all."""
+    return _can_be_read(there, key, partial(msgspec.json.decode, type=kind))
+
+
+def _can_be_read(there: Documents, key: str, read: Callable[[bytes], object]) -> bool:
+    """Whether `read`, which raises ValueError or RecursionError, can read a document, or it is not there at all."""
     found = there.get(key)
     try:
         if found:
-            msgspec.json.decode(found.body, type=kind)
+            read(found.body)
     except (ValueError, RecursionError):
         return False
     return True

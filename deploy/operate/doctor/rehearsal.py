@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 from deploy.core.captured_log import functions_log
 from deploy.core.finding import Finding, bad, good, look
 from deploy.operate.doctor.check_context import CheckContext, CheckFailed
-from hippodrome.model import server
+from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import Server, State
-from hippodrome.ports import Platform, Topic
+from hippodrome.model.server import Server, State, next_attempt
+from hippodrome.ports import Documents, Platform, Topic
 from hippodrome.servers import causes, resources
-from hippodrome.servers.replacement import next_attempt
 from hippodrome.storage.repository import Repository
-from protocol.keys import participant_folder
+from protocol.keys import session_key
+from protocol.session import Member, Session, owner_folder
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
 CLAIM = 60.0  # seconds until start_server should have acted
@@ -51,7 +51,11 @@ class StateTimes:
 
 
 class Rehearsal:
-    """One server without a participant. `told` gets what is going on."""
+    """One server without a participant. `told` gets what is going on.
+
+    In a project with sessions it is a session's server. Its session has a document, so that the sweep does not take it
+    for one that was started ahead in vain.
+    """
 
     def __init__(
         self,
@@ -70,7 +74,8 @@ class Rehearsal:
         self._clock = clock
         self._sleep = sleep
         self._repository = Repository(platform.documents)
-        self.user_id = f"rehearsal-{secrets.token_hex(6)}"
+        self._name = f"rehearsal-{secrets.token_hex(6)}"
+        self.user_id = ids.new_session_id() if project.has_sessions else self._name
         self.took = StateTimes()
         self.left: list[Finding] = []  # what was found after an interruption
         self._record: Server | None = None
@@ -83,6 +88,9 @@ class Rehearsal:
         found: list[Finding] = []
         try:
             started = self._clock()
+            if self._project.has_sessions:
+                session = Session(self.user_id, self._project.players, (Member(self._name, None, 0),))
+                write_session(self._platform.documents, self._project.id, session)
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
@@ -218,12 +226,17 @@ class Rehearsal:
 
     def _tidy(self, ran: bool) -> None:
         """Forget the rehearsal. The closed record of a server that never ran stays: a late start has to find it."""
-        documents = self._platform.documents
-        for entry in list(documents.list(participant_folder(self._project.id, self.user_id))):
+        documents, project_id = self._platform.documents, self._project.id
+        for entry in list(documents.list(owner_folder(project_id, self.user_id))):
             documents.delete(entry.key)
         record = self._repository.server_of(self._project.id, self.user_id)
         if ran and record:
             documents.delete(server.key(record.label))
+
+
+def write_session(documents: Documents, project_id: str, session: Session) -> None:
+    """Write the document of a session that is to have a server, which the sweep would stop without it."""
+    documents.create(session_key(project_id, session.id), session.to_json())
 
 
 def _why(record: Server) -> str:

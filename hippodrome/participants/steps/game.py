@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import timedelta
+from typing import Any
 
 from hippodrome import http
 from hippodrome.http import Response
 from hippodrome.model import ids, participant, server
 from hippodrome.model.messages import StartServer, to_message
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, State, next_attempt, requestable_attempt
 from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.services import StepServices
+from hippodrome.participants.steps.shared_game import SharedGame, StepAnswered
 from hippodrome.participants.steps.sources import rendering, source_of
 from hippodrome.participants.steps.visit import Visit
 from hippodrome.ports import Topic
-from hippodrome.servers.replacement import next_attempt, requestable_attempt
 
 ASK_AGAIN = timedelta(seconds=30)  # if a start message has had no effect after this time, the next GET sends it again
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
@@ -28,25 +29,28 @@ class GameStep:
 
     def __init__(self, services: StepServices) -> None:
         self._services = services
+        self._shared = SharedGame(services)
 
     def show(self, visit: Visit) -> Response:
-        """Return the page on which the participant waits and plays. Sends a lost start message again."""
+        """Return the page on which the participant waits and plays. Sends a lost start message again.
+
+        Raises `StepAnswered` if the participant was not matched with others.
+        """
         request, project, step = visit.request, visit.project, visit.step
-        record = self._services.repository.server_of(project.id, visit.user_id)
-        attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
-        if attempt is not None:
-            self._request_server(project, visit.user_id, attempt)
-        since = visit.progress.reached_at(project, step)
-        state = self._services.state(project, visit.user_id, step, record, since)
+        ticket = ids.ticket(project.secret, visit.user_id, step.key)
+        if project.has_sessions:
+            state, proof = self._state_together(visit), {"ticket": ticket}
+        else:
+            state, proof = self._state_alone(visit), {}
         view = pages.GameView(
             project=project,
             step=step,
             user_id=visit.user_id,
             state=state,
-            poll=request.url(poll=step.key),
+            poll=request.url(poll=step.key, **proof),
             page=request.url(),
             action=request.url(),
-            ticket=ids.ticket(project.secret, visit.user_id, step.key),
+            ticket=ticket,
             sources=self._services.platform.settings.game_sources,
         )
         if request.wants_json:
@@ -65,10 +69,36 @@ class GameStep:
         """Request another server, if the form asks for a restart and the participant may have one."""
         if form.action != "restart":
             return
-        record = self._services.repository.server_of(project.id, user_id)
+        repository = self._services.repository
+        owner = repository.session_id(project, user_id) if project.has_sessions else user_id
+        record = repository.server_of(project.id, owner) if owner else None
         attempt = requestable_attempt(record) if record else None
+        if owner and attempt is not None:
+            self._request_server(project, owner, attempt)
+
+    def _state_alone(self, visit: Visit) -> dict[str, Any]:
+        """The state of the participant's own server."""
+        record = self._services.repository.server_of(visit.project.id, visit.user_id)
+        self._request_if_overdue(visit, visit.user_id, record)
+        since = visit.progress.reached_at(visit.project, visit.step)
+        return self._services.state(visit.project, visit.user_id, visit.step, record, since)
+
+    def _state_together(self, visit: Visit) -> dict[str, Any]:
+        """The state of the lobby, or of the session's server. Raises `StepAnswered`."""
+        project, user_id, step = visit.project, visit.user_id, visit.step
+        standing = self._shared.visit(project, user_id, step)
+        if standing.is_unmatched:
+            raise StepAnswered
+        if standing.session is not None:
+            self._request_if_overdue(visit, standing.session, standing.record)
+        return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))
+
+    def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None) -> None:
+        """Send a start message that was lost, for the participant or the session that owns the server."""
+        project, step = visit.project, visit.step
+        attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:
-            self._request_server(project, user_id, attempt)
+            self._request_server(project, owner, attempt)
 
     def _first_attempt_if_lost(self, visit: Visit) -> int | None:
         """Return 1 if there should be a server by now, so that its start message was lost; else None."""
@@ -90,8 +120,8 @@ class GameStep:
         stuck = record.state is State.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 
-    def _request_server(self, project: Project, user_id: str, attempt: int) -> None:
-        self._services.platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id, attempt)))
+    def _request_server(self, project: Project, owner: str, attempt: int) -> None:
+        self._services.platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
 
 
 def _page_for_program(view: pages.GameView, method: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from hippodrome.log import logger
 from hippodrome.model import ids
+from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Step
 from hippodrome.participants import fragments
 from hippodrome.participants.page_error import CONTENT_NOT_FOUND, PageError
@@ -34,7 +35,7 @@ def source_of(services: StepServices, visit: Visit, page: Step) -> PageSource:
         logger.error("step page missing", extra={"project": project.id, "file": file})
         said = "It was not uploaded. Please tell whoever invited you."
         raise PageError(500, "This page is missing", said, CONTENT_NOT_FOUND)
-    return PageSource(file, text, _values(services, visit, page, fragments.records_mentioned(text)))
+    return PageSource(file, text, _values(services, visit, page, text))
 
 
 @contextmanager
@@ -48,9 +49,10 @@ def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
         raise PageError(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
 
 
-def _values(services: StepServices, visit: Visit, page: Step, mentioned: frozenset[str]) -> Mapping[str, Any]:
+def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapping[str, Any]:
     """The values that a page may use. Records are read only if the page mentions them."""
     project, user_id, repository = visit.project, visit.user_id, services.repository
+    mentioned = fragments.records_mentioned(text)
     values: dict[str, Any] = {
         "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
         "participant": {"userId": user_id},
@@ -60,6 +62,10 @@ def _values(services: StepServices, visit: Visit, page: Step, mentioned: frozens
     if "participant" in mentioned:
         known = repository.participant(project.id, user_id)
         values["participant"] = {**(known.link if known else {}), "userId": user_id}
+    if project.has_sessions and ("participant" in mentioned or "completion_code" in text):
+        membership = repository.membership(project.id, user_id) or Membership()
+        values["participant"] |= {"unmatched": membership.unmatched, "members": membership.members}
+        values["completion_code"] = membership.completion_code or values["completion_code"]
     named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
     values["answers"] = {key: services.answers.read(project.id, user_id, key) for key in named}
     return values

@@ -1,4 +1,4 @@
-"""Hands a warm server (`warmServers`) over to a participant, in seconds instead of a minute.
+"""Hands a warm server (`warmServers`) over to a participant or a session, in seconds instead of a minute.
 
 `reserve` first writes the warm server's name into the participant's record. `assign` then decides by one
 compare-and-swap on the warm server's own record: from there on no other participant gets it, and it cannot be drained.
@@ -104,7 +104,8 @@ class Handovers:
 
     def _write_handover(self, project: Project, record: Server) -> None:
         own = ids.server_name(record.label, record.attempt)
-        handover = Handover(record.user_id, project.group(record.user_id), own)
+        group = None if record.is_sessions else project.group(record.user_id)  # a session's is in its document
+        handover = Handover(record.user_id, group, own)
         with contextlib.suppress(Conflict):  # written by an earlier delivery
             self._platform.documents.create(handover_key(project.id, record.name), handover.to_json())
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,12 +23,12 @@ from typing import Any
 
 import pytest
 
-from hippodrome.log import logger
 from hippodrome.model import ids
 from testing import clocked_moto, exploration
 from testing.aws_faults import Fault, Kind, Made, Reach, invisible, kinds, reaches
 from testing.clocked_moto import GAME, PROJECT, Person, TimedInstallation
 from testing.exploration import sample
+from testing.quiet_log import quiet
 
 USER, OTHER = "R_alice", "R_bob"
 EACH, ALL = 1, 99  # fault points at each call
@@ -330,10 +329,8 @@ def order(combos: list[tuple[Kind, Reach]]) -> list[tuple[Kind, Reach]]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _quiet() -> Iterator[None]:
-    level = logger.log_level
-    logger.setLevel(logging.CRITICAL)
-    yield
-    logger.setLevel(level)
+    with quiet():
+        yield
 
 
 @pytest.fixture(scope="module")

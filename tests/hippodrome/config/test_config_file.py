@@ -29,6 +29,14 @@ __all__ = ["folder"]
             "config.yml:3: the indentation does not match the lines above; a section's keys start in one column",
         ),
         (b"a: b: c\n", "config.yml:1: an unexpected colon; check the indentation, put text with a colon in quotes"),
+        (
+            b"project:\n  matching: same: language # both\n",
+            'config.yml:2: an unexpected colon; write "matching: {same: language}"',
+        ),
+        (
+            b"project:\n  matching:  different:  my role\n",
+            'config.yml:2: an unexpected colon; write "matching: {different: my role}"',
+        ),
         (b"project:\n  id:a\n  live: true\n", 'config.yml:2: the space after the colon is missing; write "id: a"'),
         (b"steps:\n  1:consent\n  2: game\n", 'config.yml:2: the space after the colon is missing; write "1: consent"'),
         (b"a: " + b"[" * 5000, "config.yml: the sections are nested too deeply"),

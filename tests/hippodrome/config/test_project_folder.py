@@ -110,6 +110,10 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "maxServerHours": None,
         "warmServers": 0,
         "signedLinks": False,
+        "players": 1,
+        "matching": "arrival",
+        "patience": 300,
+        "afterPatience": "unmatched",
         "gamePages": {},
         "trial": {
             "actionBufferLifespan": 1,

@@ -21,7 +21,7 @@ from deploy.core.project_folder import may_use_aws
 from hippodrome.config import ConfigErrors, config_schema, fargate, parse_registration, project_keys, read_project
 from hippodrome.config.__main__ import main
 from hippodrome.model.project import Project
-from protocol import trial
+from protocol import trial, trial_keys
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -190,7 +190,7 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
             "minFrameRate": rates[0],
             "startingFrameRate": rates[1],
             "maxFrameRate": rates[2],
-            "ui": draw(st.dictionaries(st.sampled_from(sorted(trial.names(trial.Ui))), st.booleans(), min_size=1)),
+            "ui": draw(st.dictionaries(st.sampled_from(sorted(trial_keys.names(trial.Ui))), st.booleans(), min_size=1)),
             "options": draw(
                 st.dictionaries(words, words | st.integers(-(2**53), 2**53) | st.lists(st.booleans()), max_size=4)
             ),
@@ -274,7 +274,7 @@ known_keys = st.sampled_from(
     sorted(
         project_keys.Project.names()
         | {"trial"}
-        | trial.names(trial.Trial)
+        | trial_keys.names(trial.Trial)
         | project_keys.AwsSetup.names()
         | {"1", "2", "finalStep"}
     )
@@ -428,7 +428,7 @@ def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
     sections = (project_keys.Project, project_keys.AwsSetup, project_keys.Events, project_keys.Ssl)
     keys = frozenset().union(
-        *(section.names() for section in sections), trial.names(trial.Trial), trial.names(trial.Ui)
+        *(section.names() for section in sections), trial_keys.names(trial.Trial), trial_keys.names(trial.Ui)
     )
     missing = [key for key in keys if f"`{key}`" not in text]
     assert not missing

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hippodrome.config import ConfigErrors, parse_registration, remarks
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from protocol import trial, trial_check
+from protocol import trial, trial_check, trial_keys
 from protocol.values import Plain
 from trial.settings import SettingsError, trial_section
 
@@ -48,6 +48,10 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
     **dict.fromkeys(("frameSkip", "policySeconds", "seed", "turnSeconds"), NUMBERS),
     "pace": st.sampled_from(["realtime", "turns", "fast"]),
+    **dict.fromkeys(("absent", "gather", "countdown", "maxPing", "pingSamples"), NUMBERS),
+    "afterAbsent": st.sampled_from(["end", "policy", "wait"]),
+    "substitute": st.sampled_from(["random", "human", "agent:Partner", "../x.onnx", "gym://x", 3]),
+    "playerNames": st.dictionaries(PLAYERS, st.sampled_from(["Red", "", 3, "x" * 65]), max_size=2),
     "turnEnds": st.sampled_from(["idle", "random", "episode", "game"]),
     "idleAction": st.sampled_from(["noop", "up", 3, "a" * 65]) | st.dictionaries(PLAYERS, st.just("up"), max_size=2),
     "players": WHO | st.dictionaries(st.sampled_from(["0", "1", "x"]), WHO, max_size=2),
@@ -84,7 +88,7 @@ def started(section: dict[str, Any]) -> trial.Trial | str:
 
 
 def test_every_key_is_tried_here() -> None:
-    assert set(KEYS) | {"game"} == trial.names(trial.Trial) | {trial.RATE_CHANGE_MISSPELT}
+    assert set(KEYS) | {"game"} == trial_keys.names(trial.Trial) | {trial.RATE_CHANGE_MISSPELT}
 
 
 @given(SECTIONS)

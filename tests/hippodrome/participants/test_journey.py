@@ -18,8 +18,8 @@ from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
 from hippodrome.model.records import to_json
+from hippodrome.model.server import MAX_ATTEMPTS
 from hippodrome.ports import Refused, Topic
-from hippodrome.servers.replacement import MAX_ATTEMPTS
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
 from lambdas import next_step

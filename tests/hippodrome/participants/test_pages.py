@@ -280,6 +280,34 @@ def test_without_javascript_the_waiting_page_asks_again_and_says_what_is_missing
     assert "http-equiv" not in game(state="ended").html
 
 
+TOGETHER = msgspec.structs.replace(PROJECT, players=2)
+LOBBY = {"state": "lobby", "players": 2, "here": 1, "seconds": 3, "patience": 300, "then": "unmatched"}
+
+
+def test_in_the_lobby_the_page_waits_for_others_and_not_for_a_server() -> None:
+    found = {attrs["id"]: attrs for _, attrs in Elements(game(project=TOGETHER, **LOBBY).html).all if "id" in attrs}
+    assert "hidden" not in found["wait"]
+    assert "hidden" not in found["lobby"]
+    matched = game(project=TOGETHER, state="queued", session=True, members=2)
+    found = {attrs["id"]: attrs for _, attrs in Elements(matched.html).all if "id" in attrs}
+    assert "hidden" in found["lobby"]
+
+
+def test_a_browser_without_javascript_is_not_matched_as_it_asks_only_once() -> None:
+    html = game(project=TOGETHER, **LOBBY).html
+    assert "http-equiv" not in html
+    assert "The game needs JavaScript" in html
+    assert "http-equiv" in game(project=TOGETHER, state="queued").html
+
+
+@pytest.mark.parametrize(("after", "ends"), [("end", True), (None, True), ("policy", False)])
+def test_the_page_knows_what_follows_if_a_participant_stays_away(after: str | None, ends: bool) -> None:
+    trial = {"afterAbsent": after} if after else {}
+    data = data_of(game(project=msgspec.structs.replace(TOGETHER, trial=trial)))
+    assert (data["players"], data["absentEnds"]) == (2, ends)
+    assert not {"players", "absentEnds"} & data_of(game()).keys()
+
+
 @given(st.dictionaries(st.text(), st.text()) | st.just({"reason": "</script><script>alert(1)//"}))
 def test_the_state_reaches_the_script_whole_and_harmless(more: dict[str, str]) -> None:
     more = {"x" + key: value for key, value in more.items()}
@@ -362,6 +390,16 @@ def test_the_page_of_a_game_drawn_by_objects_is_small(capsys: pytest.CaptureFixt
     with capsys.disabled():
         print("\ncompressed page of a game drawn by objects, bytes:", size)
     assert len(gzip.compress(game().html.encode())) + 1_000 < size < 40_000
+
+
+def test_the_page_of_a_game_for_several_participants_is_small_and_no_other_page_carries_its_parts(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    size = len(gzip.compress(game(project=TOGETHER, **LOBBY).html.encode()))
+    with capsys.disabled():
+        print("\ncompressed page of a game for several participants, bytes:", size)
+    assert size < 18_000
+    assert not [part for part in ("lobby", "company", "#people", "sendBeacon") if part in game().html]
 
 
 def test_a_page_carries_the_style_of_its_own_kind_only() -> None:

@@ -68,6 +68,7 @@ FAILED = "TaskFailedToStart"
         ("InfrastructureHealth", "Task stopped because of a problem of the infrastructure", "machine"),
         (EXITED, "OutOfMemoryError: Container killed due to memory usage", "out of memory"),
         (EXITED, "Essential container in task exited OutOfMemoryError: container killed", "out of memory"),
+        (EXITED, "Essential container in task exited: the process was killed", "killed"),
         (None, "", "unknown"),
         ("AWordOfNextYear", "something new", "unknown"),
     ],

@@ -7,9 +7,9 @@ import pytest
 
 from hippodrome.model import server
 from hippodrome.model.project import Events, Project, Step
-from hippodrome.model.server import Reason, Server
+from hippodrome.model.server import Reason, Server, next_attempt, requestable_attempt
 from hippodrome.ports import Conflict, Topic
-from hippodrome.servers.replacement import Replacement, next_attempt, requestable_attempt
+from hippodrome.servers.replacement import Replacement
 from hippodrome.servers.services import ServerServices
 from protocol.keys import answer_key
 from testing.studies import installed, study

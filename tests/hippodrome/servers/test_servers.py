@@ -12,10 +12,9 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, State, requestable_attempt
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.causes import Cause
-from hippodrome.servers.replacement import requestable_attempt
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
@@ -588,7 +587,7 @@ def test_a_record_that_keeps_changing_is_left_to_the_queue(platform: FakePlatfor
     key = server.key(LABEL)
 
     def touch() -> None:
-        platform.documents.put(key, platform.documents.kept[key][0])
+        platform.documents.keep(key, platform.documents.kept[key][0])
 
     platform.documents.before_write = [touch] * 50
     running = event(platform, "RUNNING")

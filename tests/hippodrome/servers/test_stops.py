@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StartServer, StopServer, StopUser
 from hippodrome.model.project import MASTER_LIST, MasterList, write_list
+from hippodrome.model.records import to_json
 from hippodrome.servers import stops as stops_module
+from hippodrome.servers.services import ServerServices
+from hippodrome.servers.termination import STOP_TRIES
 from lambdas import installed as place
 from lambdas import stop_server
 from testing.aws_events import queue_event
@@ -18,6 +22,7 @@ from testing.servers import Servers
 from testing.studies import installed, study
 
 PROJECTS = ("atari", "gone", "maze")
+ALICE = server.key(ids.server_label("maze", "alice"))
 
 
 @pytest.fixture
@@ -107,6 +112,67 @@ def test_a_message_whose_server_could_not_be_stopped_comes_again(platform: FakeP
     assert again == [StopUser("alice")]
     assert servers.stop(again) == []
     assert running(platform) == set()
+
+
+def changes_before(platform: FakePlatform, times: int) -> None:
+    """Another function writes alice's record just before each of the next writes."""
+
+    def change() -> None:
+        body = platform.documents.kept[ALICE][0]
+        platform.documents.keep(ALICE, body)
+
+    platform.documents.before_write.extend([change] * times)
+
+
+def state(platform: FakePlatform) -> str:
+    found = ServerServices(platform).repository.server_of("maze", "alice")
+    assert found
+    return str(found.state)
+
+
+def test_a_record_that_changes_while_its_server_is_stopped_is_closed_at_once(platform: FakePlatform) -> None:
+    """The queue would deliver the message again after 90 seconds, in which the participant waits."""
+    servers = started(platform, ("maze", "alice"))
+    changes_before(platform, 1)
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    assert state(platform) == "closed"
+    assert running(platform) == set()
+
+
+def test_a_task_that_starts_while_its_server_is_stopped_is_stopped_too(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"))
+    late = "late"
+    (task,) = platform.tasks.running
+    request = platform.tasks.running[task]
+
+    def starts() -> None:
+        platform.tasks.running[late] = request
+        stored = ServerServices(platform).repository.server(ids.server_label("maze", "alice"))
+        assert stored
+        platform.documents.keep(ALICE, to_json(msgspec.structs.replace(stored.server, task=late)))
+
+    platform.documents.before_write.append(starts)
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    assert (state(platform), running(platform)) == ("closed", set())
+
+
+def test_a_message_whose_record_keeps_changing_comes_again(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"))
+    changes_before(platform, STOP_TRIES)
+    assert servers.stop([StopServer("maze", "alice")]) == [StopServer("maze", "alice")]
+    assert state(platform) != "closed"
+
+
+def test_the_next_attempts_server_is_not_stopped_by_a_stop_that_came_before_it(platform: FakePlatform) -> None:
+    servers = started(platform, ("maze", "alice"))
+
+    def next_attempt() -> None:
+        Servers(platform).stop([StopServer("maze", "alice")])
+        Servers(platform).start(StartServer("maze", "alice", 2))
+
+    platform.documents.before_write.append(next_attempt)
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    assert running(platform) == {ids.server_name(ids.server_label("maze", "alice"), 2)}
 
 
 def test_the_messages_of_single_servers_do_not_wait_for_the_list(platform: FakePlatform) -> None:

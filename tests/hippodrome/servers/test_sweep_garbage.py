@@ -115,7 +115,7 @@ def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platfo
 
 def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(platform: FakePlatform) -> None:
     held = {ids.server_label("maze", str(number)): ServerSlot(1, 60) for number in range(2_000)}
-    platform.documents.put(
+    platform.documents.keep(
         limits.server_slots_key("maze"), to_json(ServerSlots({**held, "no label": ServerSlot(1, 60)}, 5))
     )
     assert sweep.handler({}, None)["slots"] == 2_000

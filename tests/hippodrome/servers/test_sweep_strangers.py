@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import logging
 import math
 import random
 import time
@@ -30,7 +29,6 @@ from moto.scheduler.models import EventBridgeSchedulerBackend, scheduler_backend
 from moto.sqs.models import sqs_backends
 
 from hippodrome.aws import AwsPlatform
-from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason, Server
@@ -39,6 +37,7 @@ from lambdas import installed, sweep
 from testing.aws_events import ACCOUNT
 from testing.exploration import TIMES, sample
 from testing.moto_world import MotoWorld, _InvalidBatch
+from testing.quiet_log import quiet
 from testing.studies import study
 
 DOMAIN = "example.org"
@@ -449,10 +448,8 @@ def _asked(record: dict[str, Any]) -> tuple[str, Any, Any, str, tuple[str, ...]]
 
 @pytest.fixture(autouse=True)
 def _quiet() -> Iterator[None]:
-    level = logger.log_level
-    logger.setLevel(logging.CRITICAL)
-    yield
-    logger.setLevel(level)
+    with quiet():
+        yield
 
 
 @pytest.fixture

@@ -50,6 +50,24 @@ def _ids(one: Resource, there: Installation) -> Iterator[str]:
         yield "its rules are not called apart"
 
 
+def _lobby_kept(one: Resource, there: Installation) -> Iterator[str]:
+    """Pages of the lobby write every two seconds, and what they wrote is deleted when they are matched."""
+    if one.properties.get("VersioningConfiguration", {}).get("Status") != "Enabled":
+        return
+    for prefix in ("_lobby/", "_lobbies/", "_match/"):
+        rules = [rule for rule in _lifecycle(one) if rule.get("Prefix") == prefix and rule["Status"] == "Enabled"]
+        if not any(rule.get("NoncurrentVersionExpiration", {}).get("NoncurrentDays") == 1 for rule in rules):
+            yield f"older versions of {prefix} are kept for more than a day"
+    for prefix in ("_lobby/", "_match/"):
+        if not any(rule.get("Prefix") == prefix and rule.get("ExpirationInDays") == 1 for rule in _lifecycle(one)):
+            yield f"entries and delete markers of {prefix} are kept for more than a day"
+
+
+def _without_lobby(template: Template) -> None:
+    rules = first(template, BUCKET)["LifecycleConfiguration"]["Rules"]
+    rules[:] = [rule for rule in rules if rule.get("Prefix") != "_lobby/"]
+
+
 def _long_policy(one: Resource, there: Installation) -> Iterator[str]:
     if len(json.dumps(one.properties["PolicyDocument"], separators=(",", ":"))) > 20_480:
         yield "more than 20 KB"
@@ -187,6 +205,14 @@ RULES: tuple[Rule, ...] = (
         LIFECYCLE,
         _ids,
         setting(BUCKET, f"{RULES_PATH}.*.Id", "x" * 256),
+    ),
+    each(
+        BUCKET,
+        RULES_PATH,
+        "of what is written every few seconds, versions and delete markers go after a day: they slow down listings",
+        "S3 User Guide, Troubleshooting (503s by versions and delete markers), Lifecycle conflicts (the shorter one counts)",
+        _lobby_kept,
+        _without_lobby,
     ),
     each(
         BUCKET_POLICY,

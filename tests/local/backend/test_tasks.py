@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 
 from hippodrome.model import messages
 from hippodrome.ports import Address, Refused, TaskRequest
+from local.backend import task_process
 from local.backend import tasks as tasks_module
 from local.backend.processes import end_everything, marked
 from local.backend.task_record import Task, TaskFolder
@@ -77,16 +78,20 @@ class Here:
     def log(self, name: str = NAME) -> str:
         return (self.state / "logs" / f"{name}.log").read_text()
 
-    def forget(self) -> None:
-        """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
+    def written(self) -> None:
+        """Wait until all that was told is written down: an event is sent before its version is saved."""
         until = time.monotonic() + 5
-        for event in self.events:  # what was told has been written down, too
+        for event in self.events:
             file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
             while json.loads(file.read_text())["version"] < event["detail"]["version"]:
                 assert time.monotonic() < until
                 time.sleep(0.01)
-        for tasks in self.made:
-            tasks._rescue = lambda task: threading.Event().wait()  # type: ignore[assignment, method-assign, return-value]
+
+    def forget(self) -> None:
+        """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
+        self.written()
+        for server in (server for tasks in self.made for server in tasks._all()):
+            server._rescue = lambda: threading.Event().wait()  # type: ignore[assignment, method-assign, return-value]
         self.events.clear()
 
 
@@ -158,7 +163,7 @@ def test_a_server_that_ends_by_itself(here: Here, status: int) -> None:
 
 
 def test_a_server_that_never_listens_is_ended(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tasks_module, "START_TIMEOUT", 0.3)
+    monkeypatch.setattr(task_process, "START_TIMEOUT", 0.3)
     here.tasks().run(request(FAKE_SILENT="yes"))
     here.wait("STOPPED")
     assert here.processes() == []
@@ -230,6 +235,7 @@ def test_the_next_process_takes_up_what_runs(here: Here) -> None:
 BEGIN = """
 import os, signal, sys
 from pathlib import Path
+from local.backend.task_process import TaskProcess
 from local.backend.tasks import ProcessTasks
 from tests.local.backend.test_tasks import FAKE, request
 from protocol.handover import Handover
@@ -239,11 +245,11 @@ def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 tasks = ProcessTasks(Path(state), Path(data), Path(project), lambda event: None, command=FAKE)
-spawn, save = tasks._spawn, tasks._save
+spawn = TaskProcess._spawn
 if moment == "before":
-    tasks._spawn = lambda request: die()
+    TaskProcess._spawn = lambda self, request: die()
 elif moment == "after":
-    tasks._spawn = lambda request: (spawn(request), die())
+    TaskProcess._spawn = lambda self, request: (spawn(self, request), die())
 tasks.run(request(FAKE_SECONDS=seconds))
 die()
 """
@@ -341,6 +347,7 @@ def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: H
 def test_processes_that_nobody_knows_of_are_ended(here: Here) -> None:
     here.tasks().run(request())
     here.wait("RUNNING")
+    here.written()
     (here.state / "tasks" / f"{NAME}.json").unlink()
     here.tasks().start()
     until = time.monotonic() + 5
@@ -361,6 +368,24 @@ def test_a_recording_of_a_killed_server_is_kept(here: Here) -> None:
     assert (here.data / folder / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
+def test_a_recording_of_a_killed_server_of_a_session_is_kept_with_the_session(here: Here) -> None:
+    folder = f"study/sessions/{SESSION}/trials/{NAME}"
+    here.tasks().run(request(SESSION=SESSION, USER_ID=""))
+    here.wait("RUNNING")
+    (here.state / "spool" / folder).mkdir(parents=True)
+    (here.state / "spool" / folder / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
+    kill(here)
+    here.wait("STOPPED")
+    assert (here.data / folder / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_a_desktops_own_variable_makes_no_session(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SESSION", "ubuntu")
+    tasks = here.tasks()
+    assert "SESSION" not in tasks._shared.environment(request())
+    assert tasks._shared.environment(request(SESSION=SESSION))["SESSION"] == SESSION
+
+
 def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
     folder = f"study/users/P1/trials/{NAME}"
     tasks = here.tasks(stop_timeout=0.2)
@@ -376,6 +401,7 @@ def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
 # --- warm servers, which are somebody's only later
 
 OWN = "saaaaaaaaaaaaaaaaaaab-3"
+SESSION = "s.0123456789abcdef0123"
 PLAYED = f"study/users/P1/trials/{OWN}"
 
 
@@ -411,6 +437,14 @@ def test_a_recording_of_a_killed_warm_server_is_kept_where_its_participants_are(
     kill(here)
     here.wait("STOPPED")
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+
+
+def test_a_warm_server_that_was_handed_to_a_session_is_the_sessions(here: Here) -> None:
+    tasks = here.tasks()
+    tasks.run(warm_server_request())
+    here.wait("RUNNING")
+    give(here).write_bytes(Handover(SESSION, None, OWN).to_json())
+    assert [(task.folder, task.server) for task in tasks.playing()] == [(f"study/sessions/{SESSION}", OWN)]
 
 
 def test_a_warm_servers_document_may_be_gone_when_its_process_is(here: Here) -> None:
@@ -489,7 +523,9 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
         while time.monotonic() < until:
             player.recv(5)
         kill(here)
-    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 137
+    stopped = here.wait("STOPPED")
+    assert stopped["containers"][0]["exitCode"] == 137
+    assert "the process was killed" in stopped["stoppedReason"], "and not that its memory was full"
     [file] = (here.data / PLAYED).iterdir()
     lines = recording.read(file.read_bytes())
     assert lines[0]["user"] == "P1"

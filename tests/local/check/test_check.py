@@ -14,6 +14,7 @@ import pytest
 from hippodrome.config import read_project
 from local.backend.platform import LocalPlatform
 from local.check import agent as agent_check
+from local.check.agent_report import slowness
 from local.check.pace import Pace
 from local.check.pages import check_pages
 from local.check.project import check_project
@@ -22,7 +23,8 @@ from local.watch import Watch
 from testing import preloaded
 from testing.exploration import sample
 from tests.local.conftest import ROOT, Local, write_study
-from trial.server import process_group
+
+pytestmark = pytest.mark.usefixtures("forked")
 
 
 @pytest.fixture
@@ -48,12 +50,6 @@ def agent(folder: Path, old: str, new: str) -> None:
 
 def looked(folder: Path) -> list[str]:
     return [str(problem) for problem in check_project(folder, read_project(folder))]
-
-
-@pytest.fixture(autouse=True)
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried in this process is tried in a forked one; `make check` (`run`) starts it as its users do."""
-    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
 
 
 def tried(folder: Path, seconds: float = 60) -> list[str]:
@@ -542,7 +538,7 @@ def test_players_whom_no_participant_plays_are_remarked(folder: Path) -> None:
     (line,) = looked(folder)
     assert line.endswith(
         "remark: trial.players: 2 players are human (a, b), and a game has one participant, who plays the first; "
-        "let the others be played by a policy, random or idle"
+        "write players: 2 under project, or let the others be played by a policy"
     )
     groups = "players: {0: {a: human, b: random}, 1: {a: human, b: human}}"
     config(folder, "players: {a: human, b: human, c: idle}", groups)
@@ -585,7 +581,7 @@ def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
     pace = Pace()
     for each in seconds:
         pace.took(each)
-    said = agent_check.slowness(pace, 15)
+    said = slowness(pace, 15)
     assert said == (None if slow is None else f"it plays {slow} here; startingFrameRate is 15")
 
 

@@ -11,9 +11,7 @@ from PIL import Image
 
 from hippodrome.config import read_project
 from local.check import agent as agent_check
-from testing import preloaded
 from tests.local.conftest import ROOT, write_study
-from trial.server import process_group
 
 DOCS = (ROOT / "docs" / "objects.md").read_text()
 EXAMPLE = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)[0]
@@ -23,8 +21,7 @@ SECTION = re.findall(r"```yaml\n(.*?)```", DOCS, re.DOTALL)[0]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
+def folder(tmp_path: Path, forked: None) -> Path:
     made = write_study(tmp_path / "study", start=2)
     (made / "agent.py").write_text(EXAMPLE)
     config = made / "config.yml"
@@ -46,6 +43,11 @@ def changed(folder: Path, old: str, new: str) -> None:
     file = folder / "agent.py"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
+
+
+def shorten(folder: Path) -> None:
+    """The game is over when the first ball has landed: what is wrong with its pictures is wrong from the first one on."""
+    changed(folder, "self.caught >= 10", "landed")
 
 
 def line_of_render(folder: Path) -> int:
@@ -74,6 +76,7 @@ def test_what_cannot_be_drawn_is_remarked_at_render(folder: Path, old: str, new:
     (folder / "assets").mkdir()
     (folder / "assets" / "ball.png").write_bytes(image())
     changed(folder, old, new)
+    shorten(folder)
     remarks = tried(folder)
     assert f"agent.py:{line_of_render(folder)}: remark: render(): {said}" in remarks
     assert all(": remark: " in remark for remark in remarks), remarks
@@ -82,6 +85,7 @@ def test_what_cannot_be_drawn_is_remarked_at_render(folder: Path, old: str, new:
 def test_an_image_that_cannot_be_used_is_remarked(folder: Path) -> None:
     (folder / "assets").mkdir()
     (folder / "assets" / "ball.svg").write_text("<svg/>")
+    shorten(folder)
     (remark,) = tried(folder)
     assert remark.endswith("trial.scene: assets/ball.svg is no PNG, JPEG or WebP image; sprites show only these"), (
         remark
@@ -103,3 +107,42 @@ def test_too_many_objects_are_a_mistake(folder: Path) -> None:
     changed(folder, "[self.ground(), self.ball(), self.stick()]", "[self.ball()] * 3000")
     (mistake,) = tried(folder)
     assert mistake == (f"agent.py:{line_of_render(folder)}: render() returned 3000 objects; a scene has at most 2000")
+
+
+def test_places_in_pixels_are_remarked_where_coordinates_are_relative(folder: Path) -> None:
+    changed(folder, '"x": self.x, "y": self.y,', '"x": 600 * self.x, "y": 400 * self.y,')
+    (remark,) = tried(folder)
+    assert remark == (
+        f"agent.py:{line_of_render(folder)}: remark: render(): the object 'ball' is never in the picture: its place is "
+        "(180, 0), and 1 is the picture's right or lower edge; did you mean pixels? Write coordinates: pixels into "
+        "trial.scene"
+    )
+    config = folder / "config.yml"
+    config.write_text(config.read_text().replace("    width: 600\n", "    width: 600\n    coordinates: pixels\n"))
+    assert tried(folder) == []
+
+
+def test_several_objects_with_places_in_pixels_are_one_remark(folder: Path) -> None:
+    changed(folder, '"x": self.x, "y": self.y,', '"x": 600 * self.x, "y": 400 * self.y,')
+    changed(folder, "(self.paddle - 0.1, 0.94), (self.paddle + 0.1, 0.94)", "(240, 370), (360, 370)")
+    (remark,) = tried(folder)
+    assert "'ball' is never in the picture, nor is 1 other: its place is (180, 0)" in remark
+
+
+@pytest.mark.parametrize(
+    "place", ['"x": -0.5, "y": 0.5,', '"x": 2, "y": 2,', '"x": 3 * self.x, "y": 30 - 300 * self.x,']
+)
+def test_an_object_that_waits_beside_the_picture_is_no_remark(folder: Path, place: str) -> None:
+    changed(folder, '"x": self.x, "y": self.y,', place)
+    assert tried(folder) == []
+
+
+def test_an_info_that_is_too_large_for_the_recording_is_remarked(folder: Path) -> None:
+    shorten(folder)
+    changed(folder, "False, {}", 'False, {"seen": "x" * 2_000_000}')
+    (remark,) = tried(folder)
+    assert remark.endswith(
+        ": remark: 'seen' in info is too large for the recording (2000002 bytes; all values of a step may have a "
+        "megabyte as JSON): its size is recorded instead"
+    )
+    assert remark.startswith("agent.py:")

@@ -9,9 +9,10 @@ import pytest
 
 from hippodrome.config import read_project
 from local.check import agent as agent_check
-from testing import onnx_files, preloaded
+from testing import onnx_files
 from tests.local.conftest import write_study
-from trial.server import process_group
+
+pytestmark = pytest.mark.usefixtures("forked")
 
 AGENT = """
 import numpy
@@ -57,12 +58,6 @@ trial:
   actionSpace: [noop, up, down]
   players: {left: human, right: PLAYS}
 """
-
-
-@pytest.fixture(autouse=True)
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The agent is tried in a forked process, whose imports are done."""
-    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
 
 
 @pytest.fixture

@@ -221,6 +221,32 @@ def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int
         assert process.returncode == 0
 
 
+def test_ctrl_c_ends_the_server_whichever_of_its_threads_it_reaches(tmp_path: Path) -> None:
+    """As it does if it comes just before the main thread waits for connections."""
+    program = """
+import signal, sys, threading, time
+
+threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+from trial.gym.__main__ import main
+sys.exit(main(["--port", "0"]))
+"""
+    (tmp_path / "serve.py").write_text(program)
+    with subprocess.Popen(
+        [sys.executable, str(tmp_path / "serve.py")],
+        env={"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=interruptible,  # noqa: PLW1509 - as above
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(0.2)  # it waits for connections
+        process.send_signal(signal.SIGINT)
+        try:
+            assert process.communicate(timeout=10) == ("", "Ended.\n")
+        finally:
+            process.kill()
+        assert process.returncode == 0
+
+
 def test_a_server_of_the_tests_ends_by_ctrl_c_where_their_shell_ignores_it() -> None:
     """A shell starts what it runs in the background so, and processes inherit it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -107,3 +107,17 @@ config = (
               input_mode=configuration_constants.InputModes.SingleKeystroke)
 )
 '''
+PEOPLE = TOGETHER.replace('"brains/two.txt"', "configuration_constants.PolicyTypes.Human").replace(
+    "config = (\n    RemoteConfig()",
+    """config = (
+    RemoteConfig()
+    .hosting(max_ping=250, max_concurrent_games=3)
+    .user_experience(
+        waitroom_timeout=90_000,
+        waitroom_timeout_redirect_url="https://example.org/alone?id=",
+        experiment_end_redirect_url="https://example.org/done?id=",
+        append_subject_id_to_redirect=True,
+        game_page_html_fn=lambda game, subject: "Play well",
+    )""",
+)
+"""TOGETHER, with two humans."""

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, TOGETHER
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER
+from tests.trial.sessions import SID, answer, form, member, recordings
 from trial.interactive_gym import playing
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.remote_game import RemoteGame
@@ -96,6 +98,47 @@ def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_clien
         ]
         for step in steps
     ]
+
+
+def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
+    made = project(tmp_path / "mine", PEOPLE)
+    told = yaml.safe_load((made / "config.yml").read_text())["trial"] | {"instructions": None, "countdown": 0}
+    members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60"}
+    server = launch(
+        None, {key: value for key, value in told.items() if value is not None}, AGENT_DIR=str(made), **members
+    )
+    form(server.store)
+
+    async def journey() -> None:
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            await anna.say(key="ArrowUp", held=True)
+            await asyncio.gather(*(each.until(lambda each=each: each.done) for each in (anna, bert)))
+
+    asyncio.run(journey())
+    assert server.wait() == 0, server.said()
+    assert [answer(server.store, name)["answers"]["outcome"] for name in ("anna", "bert")] == ["finished"] * 2
+    (found,) = recordings(server.store).values()
+    steps = [line for line in found if line["kind"] == "step"]
+    assert len(steps) == 10
+    assert {line["players"]["1"]["by"] for line in steps} == {"none"}
+    told = [line["value"] for line in found if line["kind"] == "callback" and line["name"] == "tick"]
+    assert [value[2] for value in told] == [{}] * 10, "no player is a bot"
+
+
+def test_in_a_game_of_several_humans_have_the_names_of_their_players(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The agent's code sees no id of a participant there."""
+    monkeypatch.delenv("USER_ID", raising=False)
+
+    class Env:
+        def reset(self, seed: int | None = None) -> Any:
+            return {0: 1, 1: 1}, {}
+
+    config = RemoteConfig().environment(env_creator=lambda **_: Env())
+    agent = playing.ExperimentAgent(config.policies(policy_mapping={0: "human", 1: "human", 2: "random"}))
+    agent.start()
+    agent.reset(1)
+    assert agent.game is not None
+    assert agent.game.human_players == {0: "0", 1: "1"}
 
 
 def test_running_the_experiments_file_holds_its_project_until_ctrl_c(tmp_path: Path) -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from jinja2 import Environment
 
 from hippodrome.config import read_project
-from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, TOGETHER
+from protocol.players import ONNXRUNTIME
+from testing import onnx_files
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER
 
 ROOT = Path(__file__).resolve().parents[3]
 MAKE = RUN.replace("SERVE", "False")
@@ -105,6 +110,20 @@ def test_what_has_no_effect_is_said(tmp_path: Path) -> None:
     assert "Remark: host has no effect: on one machine a study is held for that machine only" in said
     assert "Remark: max_ping has no effect: no participant is turned away" in said
     assert "waitroom" not in said, "only what the experiment sets"
+
+
+def test_a_heading_and_a_time_that_a_page_takes_no_notice_of_are_said(tmp_path: Path) -> None:
+    more = "config.user_experience(game_header_text='Drive', game_page_text='<h2>On</h2>')\n"
+    _, said = made(tmp_path / "heading", ALONE + more)
+    assert "Remark: game_header_text is left out: the instructions have a heading (<h1>) of their own" in said
+    project, said = made(
+        tmp_path / "time", ALONE + "config.reset_timeout = 9000\nconfig.between_episode_text = 'Rest'\n"
+    )
+    assert "Remark: reset_timeout has no effect: participants go on themselves from the page between" in said
+    assert config_of(project)["trial"]["betweenEpisodes"] == "between"
+    project, said = made(tmp_path / "alone", ALONE + "config.reset_timeout = 9000\n")
+    assert "reset_timeout" not in said
+    assert config_of(project)["trial"]["betweenEpisodes"] == 9
 
 
 def test_players_and_their_policies(tmp_path: Path) -> None:
@@ -204,7 +223,7 @@ def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [
         ("PolicyTypes.Human}", "PolicyTypes.Random}", "policy_mapping has no PolicyTypes.Human"),
-        ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "human"}', "several participants in one game are not possible yet"),
+        ("PolicyTypes.Human}", 'PolicyTypes.Human, **{n: "human" for n in range(16)}}', "policy_mapping has 17 humans; at most 16 participants play together"),
         ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "x.pkl"}', "there is no policies(policy_inference_fn=…) that could play other by 'x.pkl'"),
         ('"ArrowRight": RIGHT', '"ArrowRight": 7', "'ArrowRight' leads to the action 7; there are 0 to 2"),
         ("default_action=NOOP", "default_action=3", "'default_action' leads to the action 3; there are 0 to 2"),
@@ -314,3 +333,110 @@ def test_scenes_that_cannot_be_are_refused(tmp_path: Path, scenes: str, said: st
     done = python(tmp_path, "experiment.py")
     assert done.returncode == 1
     assert said in done.stderr
+
+
+def test_an_experiment_with_two_humans_is_a_study_for_two_participants(tmp_path: Path) -> None:
+    project, said = made(tmp_path, PEOPLE)
+    config = config_of(project)
+    assert [config["project"][key] for key in ("players", "patience", "maxServers")] == [2, 90, 3]
+    assert config["trial"]["players"] == {"0": "human", "1": "human"}
+    assert [config["trial"][key] for key in ("maxPing", "pingSamples")] == [250, 5]
+    assert "has no effect" not in said
+    assert "Remark: game_page_html_fn is called for 0 alone: all participants read the same instructions" in said
+    done = python(tmp_path, "-m", "local.check", str(project))
+    assert done.returncode == 0, done.stdout
+    assert "is the game (fields) for 2 participants together" in done.stdout
+
+
+def test_who_found_no_other_is_led_to_the_address_for_that(tmp_path: Path) -> None:
+    project, _ = made(tmp_path, PEOPLE)
+    page = Environment(autoescape=True).from_string((project / "steps/final.html").read_text())
+    alone, paired = (page.render(participant={"userId": "P1", "unmatched": unmatched}) for unmatched in (True, False))
+    assert re.findall(r'href="([^"]+)"', alone) == ["https://example.org/alone?id=P1"]
+    assert re.findall(r'href="([^"]+)"', paired) == ["https://example.org/done?id=P1"]
+    assert "5000" in alone
+    project, _ = made(tmp_path / "other", PEOPLE.replace("waitroom_timeout_redirect_url", "final_page_header_text"))
+    page = Environment(autoescape=True).from_string((project / "steps/final.html").read_text())
+    assert "href" not in page.render(participant={"userId": "P1", "unmatched": True}), "they have not taken part"
+
+
+@pytest.mark.parametrize(("wait", "patience"), [(1, 10), (12_500, 12.5), (60_000, 60), (10**9, 3600)])
+def test_a_waiting_time_is_one_that_a_lobby_can_have(tmp_path: Path, wait: int, patience: float) -> None:
+    project, _ = made(tmp_path, PEOPLE.replace("waitroom_timeout=90_000", f"waitroom_timeout={wait}"))
+    assert config_of(project)["project"]["patience"] == patience
+    read_project(project)
+
+
+# ---- policies are tried
+
+
+WITH_A_FILE = (
+    TOGETHER.replace('"brains/two.txt"', '"brains/partner.onnx"')
+    .replace("load_policy_fn=load", "load_policy_fn=onnx_inference_utils.load_onnx_policy_fn")
+    .replace("policy_inference_fn=infer", "policy_inference_fn=onnx_inference_utils.onnx_model_inference_fn")
+    .replace("from trial import ", "from trial import onnx_inference_utils, ")
+)
+
+
+def test_a_file_that_fits_is_a_policy(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "brains/partner.onnx", [[1, 0, 0], [0, 1, 0]])
+    project, said = made(tmp_path, WITH_A_FILE)
+    assert config_of(project)["trial"]["players"]["1"] == "sample:policies/partner.onnx"
+    assert "Remark" not in said
+
+
+def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "brains").mkdir()
+    (tmp_path / "brains/partner.onnx").write_bytes(b"a spreadsheet")
+    assert refused(tmp_path, WITH_A_FILE).startswith(
+        "the policy of 1 does not fit: partner.onnx is no ONNX file that onnxruntime can read: "
+    )
+
+
+def test_a_file_for_other_observations_is_refused(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
+    assert refused(tmp_path, WITH_A_FILE) == (
+        "the policy of 1 does not fit: partner.onnx takes observations of 7 numbers (its input 'obs'); "
+        "the environment gives 2 numbers"
+    )
+
+
+def test_a_file_for_other_observations_is_refused_where_no_space_is_known(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
+    said = refused(tmp_path, WITH_A_FILE.replace("    observation_space = ", "    seen_by_all = "))
+    assert "partner.onnx takes observations of 7 numbers" in said
+
+
+def test_a_file_for_other_actions_is_refused(tmp_path: Path) -> None:
+    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((2, 5)))
+    assert refused(tmp_path, WITH_A_FILE) == (
+        "the policy of 1 does not fit: partner.onnx returns 5 numbers as 'output'; expected 3, one for each action"
+    )
+
+
+def test_without_onnxruntime_files_are_not_tried_and_the_project_names_it(tmp_path: Path) -> None:
+    (tmp_path / "brains").mkdir()
+    (tmp_path / "brains/partner.onnx").write_bytes(b"a spreadsheet")
+    hidden = "import importlib.util, sys; sys.modules['onnxruntime'] = None\nfrom importlib import metadata\n"
+    hidden += "names = metadata.packages_distributions\n"
+    hidden += "metadata.packages_distributions = lambda: {k: v for k, v in names().items() if k != 'onnxruntime'}\n"
+    project, said = made(tmp_path, hidden + WITH_A_FILE)
+    assert (
+        f"Remark: ONNX files are not tried, since onnxruntime is not installed here: pip install {ONNXRUNTIME}" in said
+    )
+    assert ONNXRUNTIME in (project / "requirements.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("return int(policy)", "return [1, 2][int(policy)]", "the policy of 1 fails: IndexError: list index out of range (experiment.py:"),
+        ("return int(policy)", "return 3", "the policy of 1 chose action 3; there are 0 to 2"),
+        ("return open(name)", "return open(name + '.gz')", "the policy of 1 fails: FileNotFoundError: "),
+    ],
+)  # fmt: skip
+def test_functions_that_choose_no_action_are_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    (tmp_path / "brains").mkdir()
+    (tmp_path / "brains/two.txt").write_text("2")
+    assert old in TOGETHER
+    assert refused(tmp_path, TOGETHER.replace(old, new)).startswith(said)

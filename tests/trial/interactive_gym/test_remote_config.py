@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -204,3 +205,41 @@ def test_several_callbacks_are_told_in_turn() -> None:
     both.on_game_tick_end("the game")
     both.on_episode_start("the game")
     assert told == [("first", "the game"), ("second", "the game")]
+
+
+class Told:
+    """A game that keeps what is recorded."""
+
+    def __init__(self) -> None:
+        self.recorded: list[Any] = []
+
+    def record(self, name: str, value: Any) -> None:
+        self.recorded.append((name, value))
+
+
+class Score(callback.GameCallback):
+    def on_episode_end(self, remote_game: object) -> Any:
+        return {"score": 3}
+
+
+class Pace(callback.GameCallback):
+    def on_episode_end(self, remote_game: object) -> Any:
+        return [1, 2]
+
+
+class Broken(callback.GameCallback):
+    def on_episode_end(self, remote_game: object) -> Any:
+        raise KeyError("score")
+
+
+def test_what_several_callbacks_return_is_kept_by_their_names() -> None:
+    several = callback.MultiCallback([Score, callback.GameCallback, Pace, Score])
+    assert several.on_episode_end("the game") == {"Score": {"score": 3}, "Pace": [1, 2], "Score 2": {"score": 3}}
+    assert several.on_game_tick_end("the game") is None
+
+
+def test_a_callback_that_raises_takes_nothing_from_the_others() -> None:
+    told = Told()
+    with pytest.raises(KeyError):
+        callback.MultiCallback([Score, Broken, Pace]).on_episode_end(told)
+    assert told.recorded == [("on_episode_end", {"Score": {"score": 3}, "Pace": [1, 2]})]

@@ -23,8 +23,12 @@ from deploy.core.server_records import Records
 from deploy.operate.eraser import Eraser
 from deploy.study import links
 from deploy.study.register import invoke
+from hippodrome.lobby import decisions, entries
+from hippodrome.lobby.decisions import Decisions
 from hippodrome.model.project import MASTER_LIST, STEPS_FOLDER, MasterList, Project, read_list, write_list
+from hippodrome.model.records import from_json
 from hippodrome.ports import Conflict, Documents, Platform
+from protocol.keys import questions_folder
 
 ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
 MAX_RUNTIME = 30  # minutes: no server lives longer, even if the rehearsal is killed
@@ -48,6 +52,11 @@ class Copy:
     def project(self) -> Project:
         assert self._made is not None, "not made yet"
         return self._made
+
+    @property
+    def players(self) -> int:
+        """How many participants play together; 1 also before the copy is made."""
+        return self._made.players if self._made else 1
 
     def make(self, of: Project) -> int:
         """Copy the pages and register the copy; return how many pages there are. Raises `Problem`."""
@@ -136,10 +145,13 @@ def remove(
     told("removing the copy of the study from the list")
     unregister(platform.documents, project_id)
     known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.people(platform.documents, project_id))])
+    known |= dict.fromkeys(_sessions_ahead(platform.documents, project_id))
     if users is None:
         records = Records(platform.documents).since()
         known |= dict.fromkeys(record.user_id for record in records if record.project_id == project_id)
-    deleted = 0
+    bucket = VersionedBucket(account, installation["Bucket"])
+    lobby = (entries.folder(project_id), decisions.key(project_id), questions_folder(project_id))
+    deleted = sum(bucket.delete(bucket.versions(place)) for place in lobby)
     for number, user in enumerate(known, 1):
         told(f"removing what is left of bot {number} of {len(known)}")
         eraser = Eraser(account, installation, project_id, user, late=False)
@@ -147,8 +159,16 @@ def remove(
             raise Problem("Something of a bot is still there.", f"`python -m deploy stop --project {project_id}`.")
         deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.receipt.deleted.values())
     told("removing the pages")
-    bucket = VersionedBucket(account, installation["Bucket"])
     return deleted + bucket.delete(bucket.versions(f"{project_id}/"))
+
+
+def _sessions_ahead(documents: Documents, project_id: str) -> list[str]:
+    """The ids of sessions that no bot is a member of: their servers were started ahead."""
+    found = documents.get(decisions.key(project_id))
+    try:
+        return sorted(from_json(found.body, Decisions).session_ids()) if found else []
+    except (ValueError, RecursionError):  # the sweep stops what no lobby lists
+        return []
 
 
 def unregister(documents: Documents, project_id: str) -> None:

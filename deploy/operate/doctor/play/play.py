@@ -21,7 +21,7 @@ from deploy.operate.doctor.play import WITHIN, upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
 from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.transcript import LINES, Transcript
-from deploy.operate.doctor.play.walk import Walk
+from deploy.operate.doctor.play.walk import Walk, each_once
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 from hippodrome.storage.project_cache import FRESH
@@ -128,8 +128,8 @@ class Play:
         return False
 
     def _records(self) -> list[Server]:
-        """The records of every server of the rehearsal, as they are now."""
-        return [record for user in self._copy.users if (record := self._scene.server(user))]
+        """The records of every server of the rehearsal, each once, as they are now."""
+        return each_once(record for user in self._copy.users if (record := self._scene.server(user)))
 
     def _make(self) -> None:
         self._told("registering a copy of the study")

@@ -56,8 +56,9 @@ class Scene:
         return Bot(self.copy.link(user), user, random, play=play, patience=patience, where=self.where)
 
     def server(self, user: str) -> Server | None:
-        """The record of a bot's server. Its token and names will not be shown."""
-        found = self.repository.server_of(self.copy.id, user)
+        """The record of a bot's server, or of its session's. Its token and names will not be shown."""
+        membership = self.repository.membership(self.copy.id, user) if self.copy.players > 1 else None
+        found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
         if found is not None:
             self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
         return found

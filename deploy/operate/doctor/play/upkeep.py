@@ -17,9 +17,12 @@ from deploy.operate.doctor.play.scene import Scene
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import shown
 from deploy.operate.doctor.play.walk import left
+from deploy.operate.doctor.rehearsal import write_session
+from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.server import Reason, Server, State
 from hippodrome.ports import DnsRecord, Topic
+from protocol.session import Member, Session
 
 READY = 420.0  # seconds until a server must be ready, a lost attempt included
 SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
@@ -41,11 +44,18 @@ class Timer:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self.user = scene.copy.user("timer")
-        scene.transcript.hide(self.user)
+        bot = scene.copy.user("timer")
+        self.user = ids.new_session_id() if scene.copy.players > 1 else bot
+        scene.transcript.hide(bot, self.user)
+        self._bot = bot
         self.record: Server | None = None
 
     def begin(self) -> None:
+        if self.user != self._bot:
+            copy = self._scene.copy
+            copy.users.append(self.user)
+            session = Session(self.user, copy.players, (Member(self._bot, None, 0),))
+            write_session(self._scene.platform.documents, copy.id, session)
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
     def end(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from bots import verification
@@ -12,6 +12,7 @@ from bots.account import Account
 from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
+from console.formatting import count
 from deploy.core.finding import Mark
 from deploy.operate.doctor.check_context import CheckFailed
 from deploy.operate.doctor.play.scene import Scene
@@ -40,15 +41,21 @@ class Walk:
 
     def __init__(self, scene: Scene, bots: int) -> None:
         self._scene = scene
+        bots += -(bots + 1) % scene.copy.players  # with the victim, as many as play together, or a multiple of that
         self.bots = [scene.bot(f"{number}", PLAY) for number in range(1, bots + 1)]
         self.victim = scene.bot("victim", VICTIM_PLAYS)
         self._struck: Server | None = None
         self._not_struck = "its game never began"
-        self.records: dict[str, Server] = {}
+        self.records: dict[str, Server] = {}  # by bot: those of one session have the same record
 
     @property
     def all(self) -> list[Bot]:
         return [*self.bots, self.victim]
+
+    @property
+    def ran(self) -> list[Server]:
+        """The servers, each once."""
+        return each_once(self.records.values())
 
     # Links
 
@@ -148,18 +155,18 @@ class Walk:
         found = {bot: self._scene.server(bot.account.user_id) for bot in self.all}
         self.records = {bot.account.user_id: record for bot, record in found.items() if record}
         waited = [play.waited for bot in self.bots for play in bot.account.plays if play.addresses]
-        if len(waited) < len(self.bots) or not all(record.running for record in self.records.values()):
-            reasons = sorted({str(record.reason or record.state) for record in self.records.values()})
+        if len(waited) < len(self.bots) or not all(record.running for record in self.ran):
+            reasons = sorted({str(record.reason or record.state) for record in self.ran})
             transcript.bad(
                 "servers",
                 f"{len(waited)} of {len(self.bots)} bots got a server ({', '.join(reasons) or 'none was asked for'}).",
                 "See `python -m deploy logs start_server` and `… logs task_changed`.",
             )
             return
-        spot = sum(record.spot for record in self.records.values())
+        spot = sum(record.spot for record in self.ran)
         transcript.good(
             "servers",
-            f"{len(self.records)} ran, {spot} of them on Spot; bots waited {shown(waited)} on the game's page.",
+            f"{len(self.ran)} ran, {spot} of them on Spot; bots waited {shown(waited)} on the game's page.",
             waited=[round(one, 1) for one in waited],
         )
 
@@ -221,14 +228,20 @@ class Walk:
             scene.transcript.bad("end", f"{failed}{', '.join(dict.fromkeys(self._left))}.", failed.advice)
             return
         self.records = {user: record for user in users if (record := scene.server(user))}
-        reasons = sorted({str(record.reason) for record in self.records.values()})
+        reasons = sorted({str(record.reason) for record in self.ran})
         wanted = {Reason.STOPPED, Reason.ENDED}
-        if not all(record.reason in wanted for record in self.records.values()):
+        if not all(record.reason in wanted for record in self.ran):
             scene.transcript.bad("end", f"The servers ended as {', '.join(reasons)}.", "See `python -m deploy status`.")
             return
         scene.transcript.good(
-            "end", f"{len(self.records)} servers ended ({', '.join(reasons)}); nothing of them is left."
+            "end", f"{count(len(self.ran), 'server')} ended ({', '.join(reasons)}); nothing of them is left."
         )
+
+    def _played_with_the_victim(self) -> list[Bot]:
+        """The victim, and the bots of its session."""
+        record = self.records.get(self.victim.account.user_id)
+        own = {user for user, other in self.records.items() if record and other.label == record.label}
+        return [bot for bot in self.all if bot is self.victim or bot.account.user_id in own]
 
     def data(self) -> None:
         """`deploy data` brings everything that the bots have sent and played."""
@@ -239,14 +252,19 @@ class Walk:
         with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary)
             made = data.run(source, scene.copy.id, folder / "data", data.Options(raw=True))
-            users = folder / "seen" / scene.copy.id / "users"
-            users.parent.mkdir(parents=True)
-            users.symlink_to(folder / "data" / "private" / "raw")
-            accounts = [bot.account for bot in self.bots]
-            found = verification.verify(folder / "seen", scene.copy.id, accounts, recorded=recorded)
-            struck = verification.verify(folder / "seen", scene.copy.id, [self.victim.account], recorded=recorded)
+            seen = folder / "seen" / scene.copy.id
+            seen.mkdir(parents=True)
+            for owners in ("users", "sessions"):
+                (seen / owners).symlink_to(folder / "data" / "private" / "raw")
+            struck = self._played_with_the_victim()
+            others = [bot for bot in self.all if bot not in struck]
+            found = [
+                verification.verify(folder / "seen", scene.copy.id, [bot.account for bot in bots], recorded=recorded)
+                for bots in (others, struck)
+            ]
+        of_others, of_struck = found
         # A recording that a killed server has left may lack its end: that is what being killed means.
-        missing = [*found.missing, *(one for one in struck.missing if not one.endswith("is cut off"))]
+        missing = [*of_others.missing, *(one for one in of_struck.missing if not one.endswith("is cut off"))]
         counts = made["counts"]
         if missing or counts["problems"] or counts["participants"] != len(self.all):
             missing += [f"{counts['problems']} files are not as they should be"] if counts["problems"] else []
@@ -255,12 +273,17 @@ class Walk:
                 "data", f"Of {len(self.all)} bots: {'; '.join(missing)}.", "See `python -m deploy logs trial`."
             )
             return
-        answers = found.answers + found.games + struck.answers + struck.games
-        recordings = found.recordings + struck.recordings
-        steps = found.steps + struck.steps
+        answers = sum(one.answers + one.games for one in found)
+        recordings = sum(one.recordings for one in found)
+        steps = sum(one.steps for one in found)
         scene.transcript.good(
             "data", f"{answers} answers and {recordings} recordings with {steps} steps, as they were sent and played."
         )
+
+
+def each_once(records: Iterable[Server]) -> list[Server]:
+    """Without repetitions: the members of a session have one server together."""
+    return list({record.label: record for record in records}.values())
 
 
 def left(scene: Scene, user: str) -> list[str]:

@@ -12,7 +12,7 @@ from hippodrome import registry
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ServerSlots
 from hippodrome.model import ids, messages, server, warm_pool
-from hippodrome.model.messages import KeepWarm, StartServer, StopServer, TaskChanged
+from hippodrome.model.messages import KeepWarm, StartServer, StopServer
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Reason, Server, State
@@ -27,6 +27,8 @@ from protocol.keys import handovers_folder
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
+from tests.hippodrome.servers import delivery
+from tests.hippodrome.servers.delivery import events
 
 LABEL = ids.server_label("maze", "alice")
 START = StartServer("maze", "alice")
@@ -44,37 +46,9 @@ def register(platform: FakePlatform, project: Project) -> None:
     platform.wait(seconds=11)
 
 
-def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskChanged]:
-    """One for each task that runs."""
-    given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
-    return [
-        TaskChanged(task=task, cluster=request.cluster, name=request.name, status=status, **given)  # type: ignore[arg-type]
-        for task, request in platform.tasks.running.items()
-    ]
-
-
 def deliver(platform: FakePlatform) -> None:
-    """Every message there is, and what comes of it, each once; tasks run and are named."""
-    servers = Servers(platform)
-    servers.tasks_changed(events(platform, "RUNNING"))
-    while platform.bus.sent or platform.bus.delayed:
-        sent, platform.bus.sent = platform.bus.sent, []
-        later, platform.bus.delayed = platform.bus.delayed, []
-        for topic, message in sent:
-            body = json.loads(json.dumps(message))
-            if topic is Topic.START:
-                start = messages.parse_start_server(body)
-                assert start
-                servers.start(start)
-            else:
-                stop = messages.parse_stop_server(body)
-                assert stop
-                assert servers.stop([stop]) == []
-        for _, message in later:
-            changed = messages.parse_dns_changed(json.loads(json.dumps(message)))
-            assert changed
-            servers.dns_changed(changed)
-        servers.tasks_changed(events(platform, "RUNNING"))
+    """Every message there is, and what comes of it."""
+    delivery.deliver(platform, Servers(platform))
 
 
 def warmed(number: int = 2, **changes: object) -> FakePlatform:

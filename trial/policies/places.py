@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ from trial.core.policies import AskPolicy
 from trial.policies.inline import InlinePolicy
 from trial.policies.load import load
 from trial.policies.policy import Policy, PolicyError
+from trial.policies.simple import IdlePolicy, RandomPolicy
 from trial.policies.thread import PolicyThread
 
 Acted = Callable[[str, int, int | None, Exception | None], None]
 """Takes the player, the id of a question, and the action or else the exception that the policy raised."""
 
-_INLINE = frozenset({"random", "idle"})
+NO_POLICIES: Mapping[str, Policy] = {}
 _AGAIN = -1  # the id of questions whose answers nobody wants
 
 
@@ -39,7 +40,7 @@ def load_policies(
     return found
 
 
-class Seats:
+class Places:
     """Asks the policies of one trial. To be called from the event loop, on which `acted` is called too."""
 
     def __init__(self, acted: Acted) -> None:
@@ -53,20 +54,34 @@ class Seats:
         """A policy has not returned, and may never."""
         return any(policy.busy for policy in self._asked.values())
 
-    def fill(self, players: Iterable[Player], policies: Mapping[str, Policy]) -> None:
-        """These play. Each policy is asked from now on in this trial only."""
-        for player in players:
-            policy = policies.get(player.name)
-            self.described[player.name] = _described(player, policy)
-            if policy is not None:
-                self._asked[player.name] = self._seat(player, policy)
+    def fill(
+        self,
+        players: Iterable[Player],
+        policies: Mapping[str, Policy],
+        stand_ins: Mapping[str, Policy] = NO_POLICIES,
+        seats: Sequence[str] = (),
+    ) -> None:
+        """These play. Each policy is asked from now on in this trial only.
 
-    def _seat(self, player: Player, policy: Policy) -> PolicyThread | InlinePolicy:
+        `stand_ins` play for humans who are away, by player; `seats` are the players of the session's seats, in order.
+        """
+        for player in players:
+            policy, stand_in = policies.get(player.name), stand_ins.get(player.name)
+            self.described[player.name] = _described(player, policy)
+            if stand_in is not None:
+                self.described[player.name] = {"kind": "human", "substitute": stand_in.description()}
+            if player.name in seats:
+                self.described[player.name] = {**self.described[player.name], "seat": seats.index(player.name)}
+            asked = policy or stand_in
+            if asked is not None:
+                self._asked[player.name] = self._place(player, asked)
+
+    def _place(self, player: Player, policy: Policy) -> PolicyThread | InlinePolicy:
         def done(ask_id: int, action: int | None, error: Exception | None) -> None:
             if ask_id != _AGAIN:
                 self._acted(player.name, ask_id, action, error)
 
-        if player.plays in _INLINE:
+        if isinstance(policy, RandomPolicy | IdlePolicy):
             return InlinePolicy(policy, done)
         return PolicyThread(policy, done, name=f"policy of {player.name}")
 

@@ -1,0 +1,266 @@
+"""Crowds that play together on the simulated account, and faults of their journeys: `python -m bench sessions`.
+
+Figures of the simulation, not of AWS; what it assumes stands in the rows of `scale`. Participants come within a minute,
+read two pages, meet in the lobby, and play in pairs or fours. A server for each session starts ahead, while they read.
+Waiting counts from the lobby to the first picture. Beside it stands what AWS alone would take, where the server that is
+ready first is the next session's (`testing/simulation/aws_bound.py`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from bench.scale import quantile, spread
+from bench.table import Row, each, row
+from deploy.cost.prices import Prices
+from hippodrome.lobby import decisions
+from hippodrome.model.project import Project
+from hippodrome.model.records import from_json
+from hippodrome.model.server import RECORDS, Server
+from testing.clock import EPOCH
+from testing.quiet_log import quiet
+from testing.simulation import faults, lobby
+from testing.simulation.aws_bound import aws_alone_together
+from testing.simulation.members import Habits, Member
+from testing.simulation.ports import Conditions
+from testing.simulation.world import PROJECT, World
+
+CROWD, WITHIN, SEED = 1000, 60.0, 2026
+SMALLER, SMALLER_WITHIN = 340, 20.0  # as many a second: where something goes wrong, and crowds that come several times
+SEEDS = range(2026, 2029)  # of the crowds whose waits are compared: a slow span of Route 53 decides the p95 of one
+HOURS = 2.0  # after which a crowd must be through, its servers gone
+PAIRS: Project = msgspec.structs.replace(PROJECT, players=2, patience=300.0)
+FOURS: Project = msgspec.structs.replace(PAIRS, players=4)
+POINTS = 30  # fault points of each journey that are tried; `make hunt` tries all
+USUAL = Habits()
+LEAVE = (Habits(leaves=0.8), Habits(leaves=1.6, beacon=None))  # with a beacon, and without one
+
+
+def rows() -> Iterator[Row]:
+    """Crowds, then faults, each with a row as soon as it is measured. About twenty minutes of one processor."""
+    with quiet():
+        yield from each([crowds, faults_of_groups])
+
+
+@dataclass(frozen=True)
+class Together:
+    """How it went for those who came. Times are virtual seconds."""
+
+    world: World
+    came: Sequence[Member]
+    seconds: float  # that the simulation took
+
+    @property
+    def project(self) -> Project:
+        return self.world.project
+
+    @property
+    def wrong(self) -> list[str]:
+        """Sessions whose members are split, or that are merged, and ghosts."""
+        return lobby.wrong(self.world.platform.documents.kept, self.project, self.came)
+
+    @property
+    def waits(self) -> list[float]:
+        """From the lobby to the first picture, of those who saw one."""
+        seen = [(one.lobby, one.first_picture) for one in self.came]
+        return [picture - came for came, picture in seen if came is not None and picture is not None]
+
+    @property
+    def matched(self) -> list[float]:
+        """From the lobby until their page says that they are matched, or unmatched."""
+        return [one.matched - one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
+
+    @property
+    def alone(self) -> list[float]:
+        """What AWS alone would take for those who stay."""
+        asked = [one.visit.asked for one in self.came if one.visit.asked is not None]
+        there = [one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
+        return aws_alone_together(asked, there, self.project.players, self.world.clock.seed, self.world.conditions)
+
+    @property
+    def at_best(self) -> list[float]:
+        """With servers that are ready when these were: each at once for the next session, in the order of arrival."""
+        found = (from_json(body, Server) for key, (body, _, _) in self._kept.items() if key.startswith(RECORDS))
+        ready = sorted((one.ready - EPOCH).total_seconds() for one in found if one.ready)
+        there = sorted(one.lobby for one in self.came if one.lobby is not None and one.matched is not None)
+        players = self.project.players
+        sessions = [there[at : at + players] for at in range(0, len(there) - players + 1, players)]
+        pairs = zip(sessions, ready, strict=False)
+        return [max(members[-1], server) - one for members, server in pairs for one in members]
+
+    @property
+    def _kept(self) -> lobby.Kept:
+        return self.world.platform.documents.kept
+
+
+def crowd(
+    project: Project,
+    conditions: Conditions | None = None,
+    habits: Callable[[int], Habits] = lambda number: USUAL,
+    *,
+    people: int = CROWD,
+    within: float = WITHIN,
+    seed: int = SEED,
+) -> Together:
+    """So many participants who come within so many seconds, until all of them are through."""
+    begun = time.perf_counter()
+    world = World(seed, conditions, project)
+    came = [Member(world, number, habits=habits(number)) for number in range(people)]
+    for one in came:
+        world.clock.spawn(one.walk, delay=world.clock.random.uniform(0, within))
+    world.settle(HOURS * 3600)
+    return Together(world, came, time.perf_counter() - begun)
+
+
+def crowds() -> Iterator[Row]:
+    """1,000 participants in a minute as pairs; as many a second as fours, and where something goes wrong."""
+    usual = crowd(PAIRS)
+    yield from judged("in pairs", usual)
+    yield from costs(usual)
+    yield waits_of([smaller(PAIRS, seed=seed) for seed in SEEDS])
+    yield from judged("in fours", smaller(FOURS))
+    spot = Conditions(interrupted=1 / 3, interrupted_after=(5.0, 120.0))
+    yield from judged("in pairs, a third of the servers lost", smaller(PAIRS, spot))
+    yield from judged("in pairs, 10 % leave the lobby", smaller(PAIRS, None, one_in_ten_leaves))
+    yield from judged("in pairs, 100 to 200 ms a call of S3", smaller(PAIRS, Conditions(s3=(0.1, 0.2))))
+
+
+def smaller(
+    project: Project,
+    conditions: Conditions | None = None,
+    habits: Callable[[int], Habits] = lambda number: USUAL,
+    seed: int = SEED,
+) -> Together:
+    """A crowd of a third as many in a third of the time."""
+    return crowd(project, conditions, habits, people=SMALLER, within=SMALLER_WITHIN, seed=seed)
+
+
+def spreads(waits: Sequence[float], alone: Sequence[float]) -> dict[str, list[float]]:
+    """How waits are spread, beside those with AWS alone, for the detail of a row."""
+    return {"p50, p95, max": spread(waits), "AWS alone p50, p95, max": spread(alone)}
+
+
+def waits_of(crowds: Sequence[Together]) -> Row:
+    """How long participants of several crowds waited, together."""
+    waits = [wait for one in crowds for wait in one.waits]
+    alone = [wait for one in crowds for wait in one.alone]
+    return row(
+        f"{len(crowds)} crowds of {SMALLER} within {SMALLER_WITHIN:.0f} s, in pairs: "
+        "from the lobby to the first picture, p95, beside AWS alone",
+        quantile(waits, 0.95),
+        "s",
+        yardstick=quantile(alone, 0.95),
+        detail={
+            **spreads(waits, alone),
+            "with these servers, given at once, p50, p95, max": spread(
+                [wait for one in crowds for wait in one.at_best]
+            ),
+            "of each crowd, p95 beside AWS alone": ", ".join(
+                f"{quantile(one.waits, 0.95):.0f} and {quantile(one.alone, 0.95):.0f} s" for one in crowds
+            ),
+        },
+    )
+
+
+def one_in_ten_leaves(number: int) -> Habits:
+    """Half of those who leave close the page without a beacon."""
+    return USUAL if number % 10 else LEAVE[number // 10 % 2]
+
+
+def judged(how: str, found: Together) -> Iterator[Row]:
+    """All are matched or told, no session is split or merged, nothing is left; and how long they waited."""
+    world, came = found.world, found.came
+    left = {what: count for what, count in world.left().items() if count}
+    ended = Counter("played to the end" if one.visit.finished is not None else one.visit.told for one in came)
+    well = 100 * sum(faults.served_or_told(one.visit) for one in came) / len(came)
+    sizes = Counter(len(one.members) for one in lobby.formed(world.platform.documents.kept, found.project))
+    within = WITHIN if len(came) == CROWD else SMALLER_WITHIN
+    name = f"{len(came):,} arrive within {within:.0f} s and play {how}"
+    yield row(
+        f"{name}: share that plays to the end or is told; 0 if groups are split or merged, or anything is left",
+        0.0 if left or found.wrong else well,
+        "%",
+        bound="all participants; no group is split or merged, none is matched with a participant who has gone",
+        at_least=100,
+        detail={
+            "how it ended for them": dict(ended),
+            "groups by size": dict(sizes),
+            "split, merged, ghosts": dict(Counter(text.split(":")[0] for text in found.wrong)) or "none",
+            "left behind": left or "nothing",
+            "servers that Spot took": sum(task.interrupted for task in world.platform.tasks.tasks.values()),
+            "simulated in": f"{found.seconds:.0f} s",
+        },
+    )
+    waits, alone = found.waits, found.alone
+    yield row(
+        f"{name}: from the lobby to the first picture, p95, beside AWS alone",
+        quantile(waits, 0.95),
+        "s",
+        yardstick=quantile(alone, 0.95),
+        detail={
+            **spreads(waits, alone),
+            "of it until they are matched, p50, p95, max": spread(found.matched),
+            "longest page": f"{world.next_step.longest:.1f} s",
+        },
+    )
+
+
+def costs(found: Together) -> Iterator[Row]:
+    """What the lobby costs for each who waits there."""
+    world, people, calls = found.world, len(found.came), found.world.cloud.lobby_calls
+    yield row(
+        "calls of S3 about the lobby and the session, per participant of these pairs",
+        sum(calls.values()) / people,
+        "calls",
+        detail={
+            **{action: count / people for action, count in calls.items()},
+            "questions of the lobby's page": sum(one.polls for one in found.came) / people,
+            "writes of the lobby's document that met another, in all": world.cloud.conflicts[
+                decisions.key(found.project.id)
+            ],
+        },
+    )
+    yield row(
+        "cost of these calls and of the lobby's questions per participant",
+        lobby_cost(calls, sum(one.polls for one in found.came), Prices()) / people,
+        "$",
+        detail={"left out": "the seconds of next_step, which rows of `scale` count"},
+    )
+
+
+def lobby_cost(calls: Mapping[str, int], polls: int, prices: Prices) -> float:
+    """US dollars of requests."""
+    writes = calls.get("s3:PutObject", 0) + calls.get("s3:ListObjectsV2", 0)
+    requests = prices.http_request.usd + prices.lambda_request.usd
+    return calls.get("s3:GetObject", 0) * prices.s3_read.usd + writes * prices.s3_write.usd + polls * requests
+
+
+def faults_of_groups() -> Iterator[Row]:
+    """A crash before, after and with the lost reply of calls of each journey of a session."""
+    tried, bad, detail = 0, 0, dict[str, Any]()
+    for journey in faults.JOURNEYS_OF_GROUPS:
+        points = faults.points(journey, SEED)
+        tries = points[:: max(1, len(points) // POINTS)]
+        outcomes = [faults.run(journey, SEED, point)[1] for point in tries]
+        failed = sum(not outcome.well for outcome in outcomes)
+        detail[journey.name] = f"{len(outcomes)} of {len(points)} faults, {failed} bad"
+        tried, bad = tried + len(outcomes), bad + failed
+    yield row("fault points of groups tried", tried, "", detail=detail)
+    yield judged_faults(bad)
+
+
+def judged_faults(bad: int) -> Row:
+    """The row of those that did harm."""
+    return row(
+        "fault points of groups that strand a participant, leave something behind, or split or merge a group",
+        bad,
+        "",
+        bound="ours: no fault strands a participant, leaves anything behind, or splits or merges a group",
+        at_most=0,
+    )

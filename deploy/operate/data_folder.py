@@ -1,0 +1,84 @@
+"""A data folder of this machine, as a storage of documents. A file has one version."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from deploy.aws.versions import Version
+from deploy.operate.storage import Note
+from export.fetch import remove_empty
+from trial.recordings import disk
+
+SCRATCH = ".erase"
+"""Where files lie that are being written."""
+
+
+class DataFolder:
+    """The files of a data folder. Only one process may change it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+
+    def versions(self, prefix: str) -> Iterator[Version]:
+        """Every file whose key begins so."""
+        for top, _, names in os.walk(self.root / prefix.rpartition("/")[0]):
+            for name in sorted(names):
+                key = Path(top, name).relative_to(self.root).as_posix()
+                if key.startswith(prefix):
+                    yield self._version(key)
+
+    def versions_of(self, key: str) -> Iterator[Version]:
+        """The file with this key, if there is one."""
+        if (self.root / key).is_file():
+            yield self._version(key)
+
+    def uploads(self, prefix: str) -> Iterator[Version]:
+        """None: a file appears whole."""
+        return iter(())
+
+    def read(self, version: Version) -> bytes:
+        """The file's content; empty if it is gone."""
+        with contextlib.suppress(FileNotFoundError):
+            return (self.root / version.key).read_bytes()
+        return b""
+
+    def fetch(self, version: Version, to: Path) -> None:
+        """Copy the file."""
+        shutil.copyfile(self.root / version.key, to)
+
+    def store(self, key: str, file: Path) -> None:
+        """Put a file's content in the place of another's, on the disk before it has the name."""
+        self._put(key, file)
+
+    def replace(self, key: str, before: bytes, after: bytes) -> bool:
+        """Put a small document in the place of `before`; whether that was there."""
+        if (self.root / key).read_bytes() != before:
+            return False
+        self._put(key, after)
+        return True
+
+    def delete(self, versions: Iterable[Version], note: Note = lambda _: None) -> int:
+        """Delete these files, and the folders that are empty then."""
+        gone = list(versions)
+        for each in gone:
+            path = self.root / each.key
+            path.unlink(missing_ok=True)
+            remove_empty(path.parent, self.root)
+        note(gone)
+        return len(gone)
+
+    def remove_unfinished(self) -> None:
+        """Remove the files that a process was writing when it was killed."""
+        shutil.rmtree(self.root / SCRATCH, ignore_errors=True)
+
+    def _version(self, key: str) -> Version:
+        return Version(key, "", (self.root / key).stat().st_size, latest=True)
+
+    def _put(self, key: str, data: bytes | Path) -> None:
+        scratch = self.root / SCRATCH
+        scratch.mkdir(exist_ok=True)
+        disk.replace(self.root / key, data, scratch)

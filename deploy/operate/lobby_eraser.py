@@ -1,0 +1,66 @@
+"""Takes one person out of a project's lobby: the entries of who waits, its decisions, and what `match` was asked."""
+
+from __future__ import annotations
+
+from deploy.aws.versions import Version
+from deploy.operate.storage import Note, Storage, newest, older, read_all
+from hippodrome.lobby import decisions, entries, rules
+from hippodrome.lobby.decisions import Decisions
+from hippodrome.model import ids
+from hippodrome.model.records import from_json, to_json
+from protocol.keys import groups_folder, questions_folder
+
+
+class LobbyEraser:
+    """Takes one person out of one project's lobby. May be interrupted anywhere and called again."""
+
+    def __init__(self, storage: Storage, project: str, user: str) -> None:
+        self._storage = storage
+        self._project = project
+        self._user = user
+        self._label = ids.server_label(project, user)
+        self._decisions = decisions.key(project)
+        self.unreadable: list[str] = []
+        """Documents that name the person and cannot be read."""
+
+    def look(self) -> list[Version]:
+        """Their entries, and the documents that name them: that of decisions, and those of the function `match`."""
+        last = newest(self._storage, self._decisions)
+        decided = [last] if last is not None and self._names(self._storage.read(last)) else []
+        return [*self._entries(), *self._questions(), *decided]
+
+    def erase(self, note: Note) -> None:
+        """Delete their entries, and take them out of the lobby's decisions, in all versions."""
+        self.unreadable = []
+        last = newest(self._storage, self._decisions)
+        if last is not None:
+            if not self._take_out(self._storage.read(last)):
+                return  # another has written it: the next round comes back
+            self._storage.delete(older(self._storage, self._decisions), note)
+        self._storage.delete(self._entries(), note)
+        self._storage.delete(self._questions(), note)  # the lobby asks anew, without them
+
+    def _take_out(self, body: bytes) -> bool:
+        """Write these decisions without them; return False if others have been written meanwhile."""
+        if not self._names(body):
+            return True
+        try:
+            decided = from_json(body, Decisions)
+        except (ValueError, RecursionError):
+            self.unreadable.append(self._decisions)
+            return True
+        after = decisions.next_version(decided, rules.without(decided, self._label))
+        return self._storage.replace(self._decisions, body, to_json(after))
+
+    def _entries(self) -> list[Version]:
+        return [*self._storage.versions(entries.prefix_of(self._project, self._label))]
+
+    def _questions(self) -> list[Version]:
+        """All versions of the question to the function `match` and of its answers that hold their label."""
+        folders = (questions_folder(self._project), groups_folder(self._project))
+        found = [each for folder in folders for each in self._storage.versions(folder) if not each.marker]
+        bodies = read_all(self._storage, found)
+        return [version for version, body in zip(found, bodies, strict=True) if self._names(body)]
+
+    def _names(self, body: bytes) -> bool:
+        return self._label.encode() in body or f'"{self._user}"'.encode() in body

@@ -1,0 +1,50 @@
+"""What plays in the place of a participant who is not there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lanterns import MOVES, PLAYERS, Place, distances
+
+RESTS = 3
+"""It waits at every third step, since people are no faster."""
+
+
+class Helper:
+    """Goes to the plate that it should take, if the other player takes the other one by the shortest way."""
+
+    def __init__(self, player: str) -> None:
+        self._player = player
+
+    def reset(self, seed: int) -> None:
+        self._steps = 0
+
+    def act(self, observation: dict[str, Any], info: dict[str, Any]) -> int:
+        self._steps += 1
+        if self._steps % RESTS == 0:
+            return 0
+        return step_towards(observation, plate_of(observation, self._player))
+
+
+def plate_of(observation: dict[str, Any], player: str) -> Place:
+    """Of the two ways to share the plates, the one in which the later of the two players is there first.
+
+    If both ways are as good, red takes the first plate: else two helpers might both go to the same one.
+    """
+    me, other, hedges = observation["me"], observation["other"], observation["hedges"]
+    first, second = observation["plates"]
+
+    def waits(mine: Place, theirs: Place) -> tuple[int, int]:
+        own, others = distances(mine, hedges)[me], distances(theirs, hedges)[other]
+        return max(own, others), own + others
+
+    plates = (first, second) if player == PLAYERS[0] else (second, first)
+    return min(plates, key=lambda mine: waits(mine, second if mine == first else first))
+
+
+def step_towards(observation: dict[str, Any], plate: Place) -> int:
+    """The move after which the plate is nearest; waiting on the plate."""
+    away = distances(plate, observation["hedges"])
+    column, row = observation["me"]
+    reached = {move: (column + x, row + y) for move, (x, y) in enumerate(MOVES)}
+    return min((move for move in reached if reached[move] in away), key=lambda move: (away[reached[move]], move))

@@ -1,0 +1,259 @@
+"""The tables of answers: a row per participant, or per field.
+
+Everything is read from the state a row at a time, so that memory does not grow with the study.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from export import scrub
+from export.recording_columns import when
+from export.scrub import clean, texts
+from export.state import Person, State
+from export.table_files import Column, fit, json_text
+from hippodrome.model.project import Project
+from protocol.session import is_session_id
+
+MAX_FIELDS = (
+    1_000  # columns of answers; of more fields (every participant can send some) the rarest share the column `other`
+)
+MAX_LINK = 50  # columns of what links carried
+_MAX_COUNTED = 50_000  # fields that are counted at once
+
+
+@dataclass
+class Field:
+    """What one field's answers are like."""
+
+    place: int  # the order of appearance
+    count: int = 0
+    kinds: set[str] = field(default_factory=set)
+
+    @property
+    def type(self) -> str:
+        """The narrowest type that holds them all; else text, with JSON for what is none."""
+        if self.kinds <= {*_SENT_NUMBERS, _EMPTY} and self.kinds != {_EMPTY}:
+            return "number" if "number as text" in self.kinds else "whole"
+        kinds = {"text" if kind in (*_SENT_NUMBERS, _EMPTY) else kind for kind in self.kinds}
+        if "other" in kinds:
+            return "text"
+        if "texts" in kinds:
+            return "texts" if kinds <= {"text", "texts"} else "text"
+        if kinds == {"whole", "number"}:
+            return "number"
+        return next(iter(kinds)) if len(kinds) == 1 else "text"
+
+
+class Answers:
+    """All answers of a study. Made by one pass that finds the columns; the tables are further passes."""
+
+    def __init__(self, state: State, project: Project | None, apart: bool) -> None:
+        self._state = state
+        self._project = project
+        self._apart = apart
+        self.scrubbed = 0
+        self.finished = 0
+        self.in_sessions = False
+        fields: dict[tuple[str, str], Field] = {}
+        links: dict[str, int] = {}
+        steps: set[str] = set()
+        for person, found in self._people():
+            self.in_sessions = self.in_sessions or bool(person.membership)
+            for step, answers in found.items():
+                steps.add(step)
+                for name, value in _fields(answers).items():
+                    seen = fields.setdefault((step, name), Field(len(fields)))
+                    seen.count += 1
+                    seen.kinds.add(_kind(value))
+            for name in texts(person.document.get("link")):
+                links[name] = links.get(name, 0) + 1
+            _only_common(fields)
+        self.steps = self._in_order(steps)
+        widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
+        self.fields = {
+            key: fields[key] for key in sorted(widest, key=lambda key: (self.steps.index(key[0]), fields[key].place))
+        }
+        self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
+        self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK
+
+    def _people(self) -> Iterator[tuple[Person, dict[str, Mapping[str, Any]]]]:
+        """Everybody, with their documents as they may be shown."""
+        for person, found in self._state.answers():
+            if not self._apart:
+                yield person, found
+                continue
+            hide = scrub.Scrub(scrub.identities(person))
+            yield person, {step: hide.value(answers) for step, answers in found.items()}
+            self.scrubbed += hide.found
+
+    def _in_order(self, steps: set[str]) -> list[str]:
+        """In the study's order; steps that it does not have (any more) come last."""
+        known = [step.key for step in self._project.steps] if self._project else []
+        rest = sorted(steps - set(known), key=lambda step: (not step.isdigit(), step.zfill(64)))
+        return [*known, *rest]
+
+    def _finished(self, found: Mapping[str, Any]) -> bool | None:
+        """Whether every step before the last has an answer; not known without the study."""
+        return all(step.key in found for step in self._project.steps[:-1]) if self._project else None
+
+    @property
+    def columns(self) -> list[Column]:
+        """The columns of the wide table."""
+        shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
+        return _distinct(
+            Column("participant"),
+            Column("group", "whole"),
+            Column("arrived", "time"),
+            Column("finished", "truth"),
+            *(_MEMBERSHIP if self.in_sessions else ()),
+            *([] if self._apart else [Column("completionCode")]),
+            *([] if self._apart else [Column(f"link.{clean(name)}") for name in self.links]),
+            *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
+            *(Column(f"answered.{step}", "time") for step in shown),
+            *([Column("other")] if self.crowded else []),
+        )
+
+    def rows(self) -> Iterator[list[Any]]:
+        """The wide table: one row per participant."""
+        shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
+        self.scrubbed = self.finished = 0
+        for person, found in self._people():
+            fields = {step: _fields(answers) for step, answers in found.items()}
+            link = texts(person.document.get("link"))
+            finished = self._finished(found)
+            self.finished += bool(finished)
+            row: list[Any] = [person.number, _group(person.document), when(person.document.get("arrived")), finished]
+            row += _membership(person) if self.in_sessions else ()
+            if not self._apart:
+                row.append(scrub.completion_code(person))
+                row += [clean(link[name]) if name in link else None for name in self.links]
+            row += [
+                fit(fields[step][name], column.type) if name in fields.get(step, ()) else None
+                for (step, name), column in self.fields.items()
+            ]
+            row += [when(found[step].get("answered")) if step in found else None for step in shown]
+            if self.crowded:
+                row.append(self._rest(fields, {} if self._apart else link))
+            yield row
+
+    def _rest(self, fields: Mapping[str, Mapping[str, Any]], link: Mapping[str, str]) -> str | None:
+        """What has no column, as JSON."""
+        rest = {
+            f"{step}.{name}": value
+            for step, named in fields.items()
+            for name, value in named.items()
+            if (step, name) not in self.fields
+        }
+        rest |= {f"link.{name}": value for name, value in link.items() if name not in self.links}
+        return clean(json_text(rest)) if rest else None
+
+    LONG = (
+        Column("participant"),
+        Column("step"),
+        Column("page"),
+        Column("group", "whole"),
+        Column("answered", "time"),
+        Column("field"),
+        Column("value"),
+    )
+
+    def long_rows(self) -> Iterator[list[Any]]:
+        """The long table: one row per text that was sent; of a list one for each."""
+        order = {step: place for place, step in enumerate(self.steps)}
+        for person, found in self._people():
+            for step in sorted(found, key=lambda step: order[step]):
+                answers = found[step]
+                page = answers.get("page")
+                fixed = [
+                    person.number,
+                    step,
+                    clean(page) if isinstance(page, str) else None,
+                    _group(answers),
+                    when(answers.get("answered")),
+                ]
+                for name, value in _fields(answers).items():
+                    values = value if isinstance(value, list) and _kind(value) == "texts" else [value]
+                    for one in values:
+                        yield [*fixed, clean(name), fit(one, "text")]
+
+
+_MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "truth"), Column("waited", "number"))
+
+
+def _membership(person: Person) -> list[Any]:
+    """In which session a participant plays and at which seat, or that in none; seconds that they waited for others."""
+    about = person.membership
+    session, seat, unmatched = about.get("session"), about.get("seat"), about.get("unmatched")
+    fits = isinstance(seat, int) and not isinstance(seat, bool) and seat >= 0 and is_session_id(session)
+    truth = unmatched if isinstance(unmatched, bool) else None
+    waited = about.get("waited")
+    number = waited if isinstance(waited, int | float) and not isinstance(waited, bool) and waited >= 0 else None
+    return [session if is_session_id(session) else None, seat if fits else None, truth, number]
+
+
+def _distinct(*columns: Column) -> list[Column]:
+    """No two columns by one name: hostile names may become the same when they are made fit for UTF-8."""
+    names: set[str] = set()
+    made = []
+    for column in columns:
+        name, count = column.name, 1
+        while name in names:
+            count += 1
+            name = f"{column.name}~{count}"
+        names.add(name)
+        made.append(column._replace(name=name))
+    return made
+
+
+def _fields(answers: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The fields of an answer's document; those without a value are not there."""
+    found = answers.get("answers")
+    return {str(n): value for n, value in found.items() if value is not None} if isinstance(found, dict) else {}
+
+
+def _group(document: Mapping[str, Any]) -> int | None:
+    group = document.get("group")
+    fits = isinstance(group, int) and not isinstance(group, bool) and abs(group) < 2**63
+    return group if fits else None
+
+
+_SENT_NUMBERS = ("whole as text", "number as text")
+_EMPTY = "empty text"
+_WHOLE = re.compile(r"-?[1-9][0-9]{0,15}|0", re.ASCII)
+_DECIMAL = re.compile(r"-?[0-9]{1,16}\.[0-9]{1,17}", re.ASCII)
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, str):
+        return _kind_of_text(value)
+    if isinstance(value, bool):
+        return "truth"
+    if isinstance(value, int):
+        return "whole" if -(2**53) <= value <= 2**53 else "other"  # a column may become one of floats
+    if isinstance(value, float):
+        return "number"
+    return "texts" if isinstance(value, list) and all(isinstance(item, str) for item in value) else "other"
+
+
+def _kind_of_text(text: str) -> str:
+    """Forms send texts. A text is a number only if the number, written by Python, is that very text again: `007`,
+    `+1`, `1e3` and `2.50` stay texts, because they may be codes and not quantities."""
+    if not text:
+        return _EMPTY
+    if _WHOLE.fullmatch(text):
+        return "whole as text" if abs(int(text)) <= 2**53 else "text"
+    if _DECIMAL.fullmatch(text) and repr(float(text)) == text != "-0.0":
+        return "number as text"
+    return "text"
+
+
+def _only_common(fields: dict[tuple[str, str], Field]) -> None:
+    """Forget the rarest if there are too many: they come from a participant's requests, and end in `other`."""
+    if len(fields) > _MAX_COUNTED:
+        rarest = sorted(fields, key=lambda key: fields[key].count)[: _MAX_COUNTED // 2]
+        for key in rarest:
+            del fields[key]

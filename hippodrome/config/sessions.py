@@ -1,0 +1,139 @@
+"""Several participants in one environment (`project.players`): how the keys that say it go together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from hippodrome.config.config import Config
+from hippodrome.config.diagnostics import Keys, Mistake, Remark
+from hippodrome.config.each_value import Checked
+from hippodrome.model.step_types import type_of
+from protocol import players as who
+from protocol.players import HUMAN
+from protocol.trial import SESSION_KEYS, Trial
+from protocol.values import printable
+
+PLAYERS: Keys = ("project", "players")
+MATCHING: Keys = ("project", "matching")
+WHO_PLAYS: Keys = ("trial", "players")
+
+OF_SESSIONS: tuple[Keys, ...] = (
+    MATCHING,
+    ("project", "patience"),
+    ("project", "afterPatience"),
+    *(("trial", key) for key in SESSION_KEYS),
+)
+"""The keys that matter with `project.players` only."""
+NO_EFFECT = "no effect: project.players is 1, so each participant plays alone; write players: 2 under project"
+
+
+def mistakes(checked: Checked) -> Iterator[Mistake]:
+    """What does not go together with `project.players`. Nothing if each participant plays alone."""
+    if not checked.root.project.has_sessions or not checked.valid(PLAYERS):
+        return
+    yield from _humans(checked)
+    yield from _one_game_for_all(checked)
+    yield from _empty_places(checked)
+    yield from _names(checked)
+
+
+def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
+    """What does not go together with the number of groups, which the versions of pages make; 0 if there are none."""
+    project = checked.root.project
+    if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or project.matching not in ("group", "mixed"):
+        return
+    if not groups:
+        pages = "write two versions of a page, such as rules-0.html and rules-1.html"
+        yield Mistake(MATCHING, f"{project.matching}, and there are no groups; {pages}, or matching: arrival")
+
+
+def _humans(checked: Checked) -> Iterator[Mistake]:
+    """As many players are human, in each group, as participants play together."""
+    wanted, trial = checked.root.project.players, checked.trial
+    has_game = any(type_of(page).on_server for page in checked.root.project.steps.values())
+    if not checked.valid(WHO_PLAYS) or not has_game:
+        return
+    if not trial.players:
+        example = ", ".join(f"player_{index}: {HUMAN}" for index in range(min(wanted, 2)))
+        more = ", …" if wanted > 2 else ""
+        said = f"missing; project.players is {wanted}, so name the environment's players, {wanted} of them human"
+        yield Mistake(WHO_PLAYS, f"{said}, such as {{{example}{more}}}")
+        return
+    for path, humans in trial.humans():
+        if len(humans) == wanted:
+            continue
+        are = f"{len(humans)} players are human" if len(humans) > 1 else "1 player is human"
+        advice = f"write human for {wanted} of them, or players: {len(humans)} under project"
+        names = printable(", ".join(humans), 100)
+        yield Mistake((*WHO_PLAYS, *path), f"{are} ({names}), and project.players is {wanted}; {advice}")
+
+
+def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
+    """Who plays whom is one thing for all participants of a game."""
+    project = checked.root.project
+    if who.by_group(checked.trial.players) and project.matching != "group" and checked.valid(MATCHING, WHO_PLAYS):
+        said = "is given group by group, and a game may have participants of several groups"
+        yield Mistake(WHO_PLAYS, f"{said}; write matching: group under project, or one map for all")
+
+
+def _empty_places(checked: Checked) -> Iterator[Mistake]:
+    """Something plays in an empty place. (`afterAbsent` is compared in `protocol/trial_rules.py`.)"""
+    trial = checked.trial
+    needs = checked.root.project.after_patience == "policies" and trial.after_absent != "policy"
+    path: Keys = ("trial", "substitute")
+    if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
+        what = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
+        yield Mistake(path, f"missing; {what}")
+
+
+def _names(checked: Checked) -> Iterator[Mistake]:
+    """What is one participant's alone cannot be a game's."""
+    project = checked.root.project
+    if project.plain_clients:
+        said = "HIPPO's front end opens the game of one participant: write plainClients: false, or players: 1"
+        yield Mistake(("project", "plainClients"), said)
+    elif project.subdomain == "userId":
+        said = "a server is several participants', so it cannot be called after one: use subdomain: hash"
+        yield Mistake(("project", "subdomain"), said)
+    if project.cluster == "participant":
+        said = "a server is several participants', so no cluster is one participant's: use cluster: installation"
+        yield Mistake(("project", "cluster"), said)
+
+
+def remarks(config: Config) -> Iterator[Remark]:
+    """What to say about a study in which several participants play together."""
+    project, trial = config.project, config.trial
+    if not project.has_sessions:
+        return
+    if not config.game_steps:
+        yield Remark(PLAYERS, "no effect: no step is game, so no participant plays")
+        return
+    if project.max_participants is not None and project.max_participants < project.players:
+        said = f"below players, which is {project.players}: a participant finds no other to play with"
+        yield Remark(("project", "maxParticipants"), said)
+    yield from _one_for_all(trial)
+    yield from _too_short(config)
+    if trial.pace == "turns" and not trial.turn_seconds:
+        said = "0: a participant who does nothing keeps the others waiting without end; write turnSeconds: 20"
+        yield Remark(("trial", "turnSeconds"), said)
+    if trial.absent == 0 and trial.after_absent == "end":
+        said = "0: a connection that is lost for a moment ends the game for all; write absent: 30"
+        yield Remark(("trial", "absent"), said)
+
+
+def _too_short(config: Config) -> Iterator[Remark]:
+    """All episodes and the breaks between them take longer than a server runs."""
+    trial, most = config.trial, config.project.max_runtime
+    between = trial.between_seconds if math.isfinite(trial.between_seconds) else 0
+    takes = math.ceil((trial.max_episodes * trial.episode_seconds + (trial.max_episodes - 1) * between) / 60)
+    if trial.episode_seconds and takes > most:
+        episodes = f"{trial.max_episodes} episodes" if trial.max_episodes > 1 else "an episode"
+        said = f"the server ends then, and {episodes} of {trial.episode_seconds:g} seconds can take {takes}"
+        yield Remark(("project", "maxRuntime"), f"{most} minute{'' if most == 1 else 's'}: {said}")
+
+
+def _one_for_all(trial: Trial) -> Iterator[Remark]:
+    for control, does in (("stop", "ends the game"), ("reset", "ends the episode")):
+        if getattr(trial.ui, control):
+            yield Remark(("trial", "ui", control), f"one participant who presses it {does} for all of them")

@@ -1,0 +1,1 @@
+"""Where participants who play together wait for each other, and who plays with whom (`project.players`)."""

@@ -1,0 +1,113 @@
+"""Asks the function `match` of agent.py who plays with whom (`questions.py`), by documents that servers read and write.
+
+A server without members answers (`trial/server/matching.py`). It may be anyone's code: an answer is only a wish, of
+which the rules take what is possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+
+from hippodrome.lobby import questions, rules
+from hippodrome.lobby.decisions import Decisions
+from hippodrome.lobby.entries import Entries
+from hippodrome.lobby.questions import Answer, Person, Question
+from hippodrome.log import failure, logger
+from hippodrome.model.project import Project
+from hippodrome.ports import Platform
+from hippodrome.storage.compare_and_swap import SharedDocuments
+from hippodrome.storage.errors import RetryLater
+from protocol.keys import groups_folder, groups_key, questions_folder, waiting_key
+
+FORGOTTEN = timedelta(minutes=5)
+"""Questions and answers that are older are deleted: a question is asked anew after seconds."""
+
+
+class Matcher:
+    """The questions of all projects."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+        self._documents = platform.documents
+        self._shared = SharedDocuments(platform.documents)
+
+    def wished(
+        self,
+        project: Project,
+        label: str,
+        come: Callable[[], Person],
+        document: Decisions,
+        entries: Entries,
+    ) -> Sequence[Sequence[str]]:
+        """Sessions that `match` has chosen, by their members' labels; and ask it again if it is time.
+
+        The participant with this label asks, and is written down if they are new: then `come` says who they are. Two
+        reads; two calls more if something is written.
+        """
+        try:
+            return self._wished(project, label, come, document, entries)
+        except RetryLater:  # many come at once; the next request does it
+            logger.info("the question to match keeps changing", extra={"project": project.id})
+            return ()
+
+    def forget(self, project: Project) -> None:
+        """Delete questions and answers that are old. Two listings. Nothing is lost: who waits is written down again."""
+        now = self._platform.now()
+        for folder in (questions_folder(project.id), groups_folder(project.id)):
+            for entry in self._documents.list(folder):
+                if now - entry.modified > FORGOTTEN:
+                    self._documents.delete(entry.key)
+
+    def _wished(
+        self,
+        project: Project,
+        label: str,
+        come: Callable[[], Person],
+        document: Decisions,
+        entries: Entries,
+    ) -> Sequence[Sequence[str]]:
+        now, key = self._platform.now(), waiting_key(project.id)
+        question = self._read(key, project)
+        answer = self._answer(project, question)
+        free = rules.free(document, entries, now)
+        labels = {one.label for one in free}
+        chosen = [each for each in answer.sessions if labels.issuperset(each)] if answer else []
+        matched = {one for each in chosen for one in each}
+        new: Person | None = None
+        if label in entries.waiting and label not in question.people() and not questions.is_full(question):
+            new = come()
+
+        def change(current: Question) -> Question:
+            late = current.people().keys() - question.people().keys()  # who came after the listing was made
+            if new is not None:
+                current = questions.with_person(current, new)
+            return questions.next_question(
+                current,
+                project,
+                entries.waiting.keys() | late,
+                free,
+                answered=answer is not None and current.id == question.id,
+                matched=matched if current.id == question.id else (),
+                now=now,
+            )
+
+        if change(question) != question:
+            changed = self._shared.change(key, Question, change, renew=True)
+            if answer and answer.problem and changed.before.id == question.id != changed.after.id:
+                logger.warning("%s; it is left out", answer.problem, extra={"project": project.id})
+        return chosen
+
+    def _read(self, key: str, project: Project) -> Question:
+        try:
+            return self._shared.read(key, Question)
+        except (ValueError, RecursionError) as error:
+            failure("the question to match cannot be read and is made anew", error, project=project.id)
+            return Question()
+
+    def _answer(self, project: Project, question: Question) -> Answer | None:
+        """The answer to the question; None if it has none yet, or none is to be had."""
+        if len(question.waiting) < project.players:
+            return None
+        found = self._documents.get(groups_key(project.id, question.id))
+        return questions.read(found.body, question) if found else None

@@ -1,0 +1,206 @@
+"""When a session is proposed, falls apart, or is formed, and when a participant is unmatched. Pure: no clock, no I/O.
+
+Each rule makes the next version of the document of decisions (`decisions.py`) of the one before.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
+from datetime import datetime, timedelta
+
+import msgspec
+
+from hippodrome.lobby.decisions import Ahead, Decisions, Formed, Matched, Proposal, Unmatched, by_age
+from hippodrome.lobby.entries import Entries, Waiting
+from hippodrome.lobby.matchmaking import around, choose, patience_is_over
+from hippodrome.model.project import Project
+
+CONFIRMED_WITHIN = timedelta(seconds=10)
+"""A proposal that not all have confirmed by then falls apart."""
+
+
+def decide(
+    document: Decisions,
+    entries: Entries,
+    project: Project,
+    now: datetime,
+    new_id: Callable[[], str],
+    *,
+    open_for: timedelta,
+    known: Decisions | None = None,
+    wished: Sequence[Sequence[str]] = (),
+) -> Decisions:
+    """Drop proposals that have fallen apart, and propose sessions of those who are there and in no other.
+
+    `known` is the document as it was read before the listing `entries` was made; without it, `document` is. What was
+    proposed after that stays, and who stood there then is not proposed now: the listing is too old to tell.
+    `wished` are sessions, by labels, that a function of the researcher's has chosen (`matching: match`): those of them
+    are proposed that can be; the rules choose none then. `new_id` makes the id of a proposal, and of its session unless
+    its server was started ahead. Such a session is used for `open_for`.
+    """
+    seen = known if known is not None else document
+    settled = _without_fallen(document, entries, seen, now)
+    if document.renewed is not None:
+        return settled
+    before = seen.labels()
+    among = [one for one in free(settled, entries, now) if one.label not in before]
+    sessions = choose(among, project, now, wished)
+    return _with_proposals(settled, sessions, now, new_id, players=project.players, open_for=open_for)
+
+
+def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
+    """Those who are there and stand in no session, in the order of arrival."""
+    busy = document.labels()
+    found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
+    return sorted(found, key=lambda one: one.order)
+
+
+def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
+    """The proposals that all members have confirmed, of whom none has left."""
+    return [
+        each
+        for each in document.proposed
+        if entries.confirmed.get(each.id, frozenset()) >= set(each.labels)
+        and all(label in entries.waiting for label in each.labels)
+    ]
+
+
+def here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
+    """How many could play together with this participant, who counts; at most `players`."""
+    proposal = document.proposal_of(label)
+    if proposal is not None:
+        return len(proposal.labels)
+    formed = document.formed_of(label)
+    if formed is not None:
+        return len(formed.members)
+    me = entries.waiting.get(label)
+    if me is None:
+        return 1
+    among = [
+        one
+        for one in free(document, entries, now)
+        if project.after_patience == "policies" or not patience_is_over(one.joined, project, now)
+    ]
+    return len(around(me, among, project))
+
+
+def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
+    """Without the proposals that have fallen apart, of those that stood in `seen`."""
+    before = {each.id for each in seen.proposed}
+    fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
+    return without_proposals(document, fallen)
+
+
+def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
+    """Whether its time is over, a member has left, or one who has not confirmed has not asked lately."""
+    if now - proposal.at >= CONFIRMED_WITHIN:
+        return True
+    yes = entries.confirmed.get(proposal.id, frozenset())
+    found = (entries.waiting.get(label) for label in proposal.labels)
+    return any(one is None or not (one.label in yes or one.is_present(now)) for one in found)
+
+
+def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
+    """Without these proposals; sessions whose servers were started ahead are open again."""
+    if not any(each.id in ids for each in document.proposed):
+        return document
+    back = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
+    return msgspec.structs.replace(
+        document,
+        proposed=tuple(each for each in document.proposed if each.id not in ids),
+        open=by_age([*document.open, *back]),
+    )
+
+
+def _with_proposals(
+    document: Decisions,
+    sessions: Iterable[Sequence[Waiting]],
+    now: datetime,
+    new_id: Callable[[], str],
+    *,
+    players: int,
+    open_for: timedelta,
+) -> Decisions:
+    """With these sessions proposed, by their members. The server that was started first is used first."""
+    usable = deque(each for each in document.open if each.is_usable(players, now, open_for))
+    added = []
+    for members in sessions:
+        ahead = usable.popleft() if usable else None
+        labels = tuple(one.label for one in members)
+        added.append(Proposal(new_id(), labels, now, ahead, players))
+    if not added:
+        return document
+    used = {each.ahead.id for each in added if each.ahead}
+    return msgspec.structs.replace(
+        document,
+        proposed=(*document.proposed, *added),
+        open=tuple(each for each in document.open if each.id not in used),
+    )
+
+
+# Decisions for good
+
+
+def form(document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime) -> Decisions:
+    """Form the proposed session with these members, unless it stands no longer as it was proposed to them.
+
+    Seats are drawn by lot, from the session's random id: else who comes first, and is perhaps more eager, would always
+    play the same player.
+    """
+    found = next((each for each in document.proposed if each.id == proposal_id), None)
+    if found is None or found.labels != tuple(member.label for member in members):
+        return document
+    lot = found.session_id
+    drawn = sorted(members, key=lambda member: hashlib.sha256(f"{lot}\0{member.label}".encode()).digest())
+    formed = Formed(lot, tuple(drawn), now, found.ahead is not None, found.ahead, found.players)
+    return msgspec.structs.replace(
+        document,
+        proposed=tuple(each for each in document.proposed if each is not found),
+        formed=(*document.formed, formed),
+    )
+
+
+def give_up(document: Decisions, one: Unmatched) -> Decisions:
+    """The participant is unmatched, unless they stand in the document."""
+    if document.renewed is not None or one.label in document.labels():
+        return document
+    return msgspec.structs.replace(document, unmatched=(*document.unmatched, one))
+
+
+def without_done(document: Decisions, done: Collection[str]) -> Decisions:
+    """Without the formed sessions, by id, and unmatched participants, by label, of whom everything is written."""
+    if not any(each.id in done for each in document.formed) and not any(
+        each.label in done for each in document.unmatched
+    ):
+        return document
+    return msgspec.structs.replace(
+        document,
+        formed=tuple(each for each in document.formed if each.id not in done),
+        unmatched=tuple(each for each in document.unmatched if each.label not in done),
+    )
+
+
+def without(document: Decisions, label: str) -> Decisions:
+    """Without anything of this participant, whose data are erased. In a session that is formed their seat is empty."""
+
+    def unnamed(ahead: Ahead | None) -> Ahead | None:
+        return msgspec.structs.replace(ahead, by="") if ahead and ahead.by == label else ahead
+
+    formed = (
+        msgspec.structs.replace(
+            each,
+            members=tuple(Matched("", "") if member.label == label else member for member in each.members),
+            waits_for=unnamed(each.waits_for),
+        )
+        for each in document.formed
+    )
+    kept = without_proposals(document, [each.id for each in document.proposed if label in each.labels])
+    return msgspec.structs.replace(
+        kept,
+        open=tuple(found for each in kept.open if (found := unnamed(each))),
+        proposed=tuple(msgspec.structs.replace(each, ahead=unnamed(each.ahead)) for each in kept.proposed),
+        formed=tuple(each for each in formed if any(member.label for member in each.members)),
+        unmatched=tuple(each for each in kept.unmatched if each.label != label),
+    )

@@ -1,0 +1,76 @@
+"""What a run of the lobby (`lobby.py`) has read, and what it makes of any later version of the document. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from hippodrome.lobby import rules, servers_ahead
+from hippodrome.lobby.decisions import Decisions, Matched
+from hippodrome.lobby.entries import Entries
+from hippodrome.model import ids
+from hippodrome.model.project import Project
+from hippodrome.model.server import Server, State, next_attempt
+
+
+@dataclass(frozen=True)
+class Servers:
+    """Records of servers that were started ahead, by their sessions' ids; None where there is none."""
+
+    records: Mapping[str, Server | None]
+
+    @property
+    def ready(self) -> frozenset[str]:
+        """Those that can be used."""
+        return frozenset(name for name, each in self.records.items() if each and each.state is State.READY)
+
+    @property
+    def over(self) -> frozenset[str]:
+        """Those that have ended, and are not replaced."""
+        closed = ((name, each) for name, each in self.records.items() if each and each.is_closed)
+        return frozenset(name for name, each in closed if next_attempt(each) is None)
+
+    @property
+    def coming(self) -> frozenset[str]:
+        """Those that will be ready: they start, or are replaced."""
+        return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
+
+    def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:
+        """The document with these servers given to the sessions that wait for one."""
+        return servers_ahead.with_ready_servers(
+            document, self.ready, self.over, now, coming=self.coming, open_for=open_for
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run has read, and what it makes of any later version of the document."""
+
+    project: Project
+    known: Decisions
+    entries: Entries
+    members: Mapping[str, Sequence[Matched]]  # of the sessions that it can form, by the proposal's id
+    broken: Collection[str]  # the proposals of sessions that cannot be formed
+    now: datetime
+    open_for: timedelta
+    servers: Servers
+    wished: Sequence[Sequence[str]] = ()  # what the function `match` has chosen, by labels
+
+    def decided(self, document: Decisions) -> Decisions:
+        """The document with everything that this run can decide."""
+        document = rules.without_done(document, self.entries.done)
+        document = rules.without_proposals(document, self.broken)
+        for proposal_id, found in self.members.items():
+            document = rules.form(document, proposal_id, found, self.now)
+        document = rules.decide(
+            document,
+            self.entries,
+            self.project,
+            self.now,
+            ids.new_session_id,
+            open_for=self.open_for,
+            known=self.known,
+            wished=self.wished,
+        )
+        return self.servers.given(document, self.now, self.open_for)

@@ -1,0 +1,122 @@
+"""Sessions without members, whose servers are started ahead: how many, and which session gets which server. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from datetime import datetime, timedelta
+
+import msgspec
+
+from hippodrome.lobby.decisions import Ahead, Decisions, Formed, by_age
+from hippodrome.lobby.entries import Entries
+from hippodrome.model.project import Project
+
+SERVER_WITHIN = timedelta(minutes=5)
+"""A session that has waited for so long, and for which no server is ready, keeps the one that it was given."""
+
+
+def sessions_wanted(document: Decisions, entries: Entries, project: Project, also: Collection[str] = ()) -> int:
+    """How many sessions without members should have a server: one for every `players` who are under way or wait.
+
+    `also` are the labels of further ones who are under way. Not more than `maxServers`, of which more could not run;
+    none in a project that is closed.
+    """
+    if not project.live:
+        return 0
+    people = {*entries.under_way, *entries.waiting, *also} - document.labels()
+    needed = math.ceil(len(people) / project.players)
+    return needed if project.max_servers is None else min(needed, project.max_servers)
+
+
+def open_sessions(
+    document: Decisions,
+    wanted: int,
+    by: str,
+    now: datetime,
+    new_id: Callable[[], str],
+    *,
+    players: int,
+    open_for: timedelta,
+) -> Decisions:
+    """With as many sessions more as it takes until `wanted`, of so many players, can be used."""
+    usable = sum(each.is_usable(players, now, open_for) for each in document.open)
+    added = [Ahead(new_id(), now, by, players) for _ in range(wanted - usable)]
+    return msgspec.structs.replace(document, open=by_age([*document.open, *added])) if added else document
+
+
+def with_ready_servers(
+    document: Decisions,
+    ready: Collection[str],
+    over: Collection[str],
+    now: datetime,
+    *,
+    coming: Collection[str] = (),
+    open_for: timedelta,
+) -> Decisions:
+    """Give servers that are ready to the sessions that were formed first, whichever they had been given before.
+
+    `ready` are ids of servers that are ready; one of an open session is taken first, then that of the session that was
+    formed last, which gets the other's instead. `over` are those that have ended and are not replaced, and `coming`
+    those that start: a session whose own is over waits for one that starts, if an open session has it. A session that
+    finds no other keeps its own, and its members are told why. So does one that has waited for `SERVER_WITHIN`. A
+    server is only given to a session of as many players as it was started for.
+    """
+    sessions = document.without_server()
+    if not ready and not over and not (sessions and now - sessions[0].at >= SERVER_WITHIN):
+        return document
+    servers = [each.waits_for for each in sessions if each.waits_for]
+    opened = list(document.open)
+    usable = {each.id for each in opened if each.is_usable(each.players, now, open_for)}
+    left = len({*usable, *(each.id for each in servers)} & set(ready))  # of those that are ready
+    given: dict[tuple[str, ...], str] = {}  # to the session of these labels
+    for at, session in enumerate(sessions):
+        players = servers[at].players
+        fits = [n for n, each in enumerate(opened) if each.id in usable and each.players == players]
+        if left and servers[at].id not in ready:
+            fresh = (n for n in fits if opened[n].id in ready)
+            later = (n for n in range(len(servers) - 1, at, -1) if servers[n].id in ready)
+            later = (n for n in later if servers[n].players == players)
+            if (n := next(fresh, None)) is not None:
+                servers[at], opened[n] = opened[n], servers[at]
+            elif servers[at].id not in over and (n := next(later, None)) is not None:
+                servers[at], servers[n] = servers[n], servers[at]
+        if servers[at].id in over and (n := next((n for n in fits if opened[n].id in coming), None)) is not None:
+            servers[at], opened[n] = opened[n], servers[at]
+        is_ready = servers[at].id in ready
+        left -= is_ready
+        if is_ready or servers[at].id in over or now - session.at >= SERVER_WITHIN:
+            given[session.labels] = servers[at].id
+    if not given and servers == [each.waits_for for each in sessions]:
+        return document
+    having = {each.labels: server for each, server in zip(sessions, servers, strict=True)}
+
+    def bound(each: Formed) -> Formed:
+        server = having.get(each.labels) if each.waits_for else None
+        if server is None:
+            return each
+        return msgspec.structs.replace(each, id=server.id, waits_for=None if each.labels in given else server)
+
+    return msgspec.structs.replace(document, open=by_age(opened), formed=tuple(bound(each) for each in document.formed))
+
+
+def surplus(
+    document: Decisions,
+    wanted: int,
+    over: Collection[str],
+    now: datetime,
+    *,
+    players: int,
+    open_for: timedelta,
+) -> frozenset[str]:
+    """The ids of the open sessions that can no longer be used, of those in `over`, and of those beyond `wanted`.
+
+    Of these, the ones that were asked for last: their servers are least far.
+    """
+    usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
+    return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])
+
+
+def without_open(document: Decisions, ids: Collection[str]) -> Decisions:
+    """Without these open sessions."""
+    return msgspec.structs.replace(document, open=tuple(each for each in document.open if each.id not in ids))

@@ -1,0 +1,180 @@
+"""The documents of the lobby: the one of decisions, the entries of those who wait, and what follows from decisions.
+
+What is written may be written again, by the same function or by others at the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from datetime import timedelta
+
+from hippodrome.lobby import decisions
+from hippodrome.lobby import entries as folder
+from hippodrome.lobby.decisions import Decisions, Formed
+from hippodrome.lobby.entries import Entries
+from hippodrome.log import failure, logger
+from hippodrome.model import participant, sessions
+from hippodrome.model.memberships import Membership
+from hippodrome.model.messages import StartServer, to_message
+from hippodrome.model.project import Project
+from hippodrome.model.records import to_json
+from hippodrome.ports import Conflict, Platform, Topic
+from hippodrome.storage.compare_and_swap import SharedDocuments
+from hippodrome.storage.repository import Repository
+from protocol import answer, session
+from protocol.keys import answer_key, membership_key, session_key, sessions_folder
+from protocol.session import BadSession, Session
+from protocol.times import time_text
+
+FORMED_LATELY = timedelta(hours=1)
+"""Sessions that were formed before have been written, or finished by a sweep."""
+
+
+class LobbyStore:
+    """The documents of all lobbies."""
+
+    def __init__(self, platform: Platform, repository: Repository) -> None:
+        self._platform = platform
+        self._documents = platform.documents
+        self._repository = repository
+        self._shared = SharedDocuments(platform.documents)
+
+    # Decisions
+
+    def read(self, project: Project) -> Decisions:
+        """The document of decisions. One that cannot be read is made anew, empty."""
+        try:
+            return self._shared.read(decisions.key(project.id), Decisions)
+        except (ValueError, RecursionError) as error:
+            failure("the lobby's document cannot be read and is made anew", error, project=project.id)
+            return self.change(project, lambda document: document)
+
+    def change(self, project: Project, change: Callable[[Decisions], Decisions]) -> Decisions:
+        """Change the document of decisions, counting its version; return what it is now. Raises `RetryLater`."""
+
+        def counted(document: Decisions) -> Decisions:
+            return decisions.next_version(document, change(document))
+
+        anew = Decisions(renewed=self._platform.now())
+        return self._shared.change(decisions.key(project.id), Decisions, counted, renew=True, anew=anew).after
+
+    # Entries
+
+    def entries(self, project: Project, label: str | None = None) -> Entries:
+        """Those in the lobby, or what there is of one participant. A listing.
+
+        A participant counts as under way for as long as the server that was started ahead for them can be used. So one
+        who never comes costs no second server.
+        """
+        prefix = folder.prefix_of(project.id, label) if label else folder.folder(project.id)
+        way = min(timedelta(minutes=project.max_runtime), sessions.open_for(project, self._platform.settings))
+        return folder.read(project.id, self._documents.list(prefix), self._platform.now(), way)
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Delete these entries."""
+        for key in keys:
+            self._documents.delete(key)
+
+    # What is decided for good
+
+    def carry_out(self, project: Project, decided: Decisions, entries: Entries) -> Mapping[str, Membership]:
+        """Write what is formed, and who is unmatched; remove their entries, mark it as done.
+
+        Return memberships by label.
+
+        The memberships come after all else that a session needs, and the mark goes last: until then any run does this
+        again. The next run that writes the document anyway drops what is marked, so that a crowd does not wait for a
+        write more. The answers of those who are unmatched are written when they ask next (`Lobby.visit`): the sweep may
+        write none.
+        """
+        made: dict[str, Membership] = {}
+        for formed in decided.formed:
+            made |= self._write_session(project, formed)
+        for one in decided.unmatched:
+            membership = Membership(unmatched=True, completion_code=one.completion_code, waited=one.waited)
+            made[one.label] = self._write_membership(project, one.user_id, membership)
+        self.delete(key for label in made for key in entries.keys.get(label, ()))
+        for name in [*(each.id for each in decided.formed), *(each.label for each in decided.unmatched)]:
+            self._documents.put(folder.done_key(project.id, name), b"")
+        return made
+
+    def finish_sessions(self, project: Project) -> None:
+        """Write the memberships that sessions lack which were formed lately, and start messages that they may lack.
+
+        For a lobby whose document was lost while they were written: a session's own document says all of them. A
+        listing of all sessions' documents and recordings, and a read for each that was formed lately.
+        """
+        since = self._platform.now() - FORMED_LATELY
+        for entry in self._documents.list(sessions_folder(project.id)):
+            session_id = entry.key.split("/")[2]
+            if entry.key != session_key(project.id, session_id) or entry.modified < since:
+                continue
+            try:
+                found = self._repository.session(project.id, session_id)
+            except BadSession as error:
+                failure("a session's document cannot be read", error, project=project.id)
+                continue
+            if found is not None:
+                self._finish_session(project, found)
+
+    def _finish_session(self, project: Project, found: Session) -> None:
+        missing = [each for each in found.members if each.user_id]
+        missing = [each for each in missing if self._repository.membership(project.id, each.user_id) is None]
+        if missing and self._repository.server_of(project.id, found.id) is None:
+            self.start_server(project, found.id)
+        for each in missing:
+            self._write_membership(project, each.user_id, Membership(found.id, each.seat, len(found.members)))
+
+    def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
+        """Remove the marks of decisions that have left the document, which must have been read after the listing."""
+        kept = {*(each.id for each in document.formed), *(each.label for each in document.unmatched)}
+        self.delete(folder.done_key(project.id, name) for name in sorted(entries.done - kept))
+
+    def answer_as_unmatched(self, project: Project, user_id: str) -> None:
+        """Store the answer of each game step, which moves the participant on. An answer that is there stays."""
+        answers = {"outcome": answer.UNMATCHED}
+        for step in project.steps:
+            if step.type.on_server:
+                record = participant.new_answer(project, user_id, step, answers, self._platform.now())
+                self._create(answer_key(project.id, user_id, step.key), answer.to_json(record))
+
+    def start_server(self, project: Project, session_id: str) -> None:
+        """Send the start message of a session."""
+        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, session_id)))
+
+    def _write_session(self, project: Project, formed: Formed) -> Mapping[str, Membership]:
+        members = tuple(session.Member(each.user_id, each.group, seat) for seat, each in enumerate(formed.members))
+        made = Session(
+            formed.id,
+            max(formed.players or project.players, len(members)),
+            members,
+            group=next((each.group for each in formed.members if each.label), None),
+            formed=time_text(formed.at),
+        )
+        self._create(session_key(project.id, formed.id), made.to_json())
+        if not formed.ahead or self._repository.server_of(project.id, formed.id) is None:
+            self.start_server(project, formed.id)
+        return {
+            each.label: self._write_membership(
+                project, each.user_id, Membership(formed.id, seat, len(members), waited=each.waited)
+            )
+            for seat, each in enumerate(formed.members)
+            if each.label
+        }
+
+    def _write_membership(self, project: Project, user_id: str, membership: Membership) -> Membership:
+        """Write the participant's membership. What is there already stays, and is returned."""
+        if self._create(membership_key(project.id, user_id), to_json(membership)):
+            return membership
+        found = self._repository.membership(project.id, user_id)
+        if found is not None and found != membership:
+            logger.error("a participant has another membership already", extra={"project": project.id})
+        return found or membership
+
+    def _create(self, key: str, body: bytes) -> bool:
+        """Create a document; return False if there is one already."""
+        try:
+            self._documents.create(key, body)
+        except Conflict:
+            return False
+        return True

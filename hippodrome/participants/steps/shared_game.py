@@ -1,0 +1,123 @@
+"""A game step that several participants play together: the lobby first, then the server of their session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import msgspec
+
+from hippodrome.lobby.lobby import Lobby, LobbyState, NoServerYet
+from hippodrome.model import participant
+from hippodrome.model.memberships import Membership
+from hippodrome.model.project import Project, Step
+from hippodrome.model.server import Server, State
+from hippodrome.participants.pages import LOBBY
+from hippodrome.participants.steps.services import StepServices
+from protocol.session import member_token
+
+UNMATCHED = "unmatched"
+"""A state beside those of a server, as `LOBBY` (docs/pages.md)."""
+
+
+class StepAnswered(Exception):
+    """The step has got its answer meanwhile, so the next one is due."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where a participant stands at the game step: in the lobby, in a session with this server's record, or nowhere."""
+
+    found: LobbyState | NoServerYet | Membership | None
+    record: Server | None = None
+
+    @property
+    def session(self) -> str | None:
+        """The id of their session, or of the server that was started ahead for it."""
+        return self.found.session if isinstance(self.found, Membership | NoServerYet) else None
+
+    @property
+    def is_unmatched(self) -> bool:
+        """Whether they were not matched with others."""
+        return isinstance(self.found, Membership) and self.found.unmatched
+
+
+class SharedGame:
+    """What the game step and its polls share."""
+
+    def __init__(self, services: StepServices) -> None:
+        self._services = services
+        self._lobby = Lobby(services.platform, services.repository)
+
+    def visit(self, project: Project, user_id: str, step: Step) -> Standing:
+        """The participant asks at this step: they wait in the lobby, if it is not decided yet where they play.
+
+        Before the step at which servers start, and from the one at which they stop, there is no lobby: they only wait.
+        """
+        if not participant.may_have_server(project, step):
+            return self.decided(project, user_id) or Standing(None)
+
+        def answers() -> Mapping[str, Any]:
+            return self._earlier_answers(project, user_id, step)
+
+        return self._standing(project, self._lobby.visit(project, user_id, project.group(user_id), answers))
+
+    def decided(self, project: Project, user_id: str) -> Standing | None:
+        """Where the participant is without having asked; None if that is not decided yet. Nothing is written."""
+        membership = self._services.repository.membership(project.id, user_id)
+        return self._standing(project, membership) if membership else None
+
+    def leave(self, project: Project, user_id: str) -> None:
+        """The participant has closed the lobby's page."""
+        if self._services.repository.membership(project.id, user_id) is None:
+            self._lobby.leave(project, user_id)
+
+    def state(
+        self, project: Project, user_id: str, step: Step | None, standing: Standing, since: datetime | None = None
+    ) -> dict[str, Any]:
+        """The state for the page. A member's page gets the member's own token, never the server's."""
+        state = self._services.state(project, user_id, step, standing.record, since)
+        found = standing.found
+        if isinstance(found, LobbyState):
+            return state | {
+                "state": LOBBY,
+                "players": project.players,
+                "here": found.here,
+                "seconds": int(found.seconds),
+                "patience": project.patience,
+                "then": project.after_patience,
+                "proposed": found.proposed,
+            }
+        if "token" in state:
+            state["token"] = member_token(state["token"], user_id)
+        if found is None:
+            return state
+        if standing.is_unmatched:
+            state["state"] = UNMATCHED
+        return state | {"session": True, "players": project.players, "members": found.members}
+
+    def _standing(self, project: Project, found: LobbyState | NoServerYet | Membership) -> Standing:
+        if isinstance(found, NoServerYet):
+            return Standing(found, _not_yet_ready(found.record))
+        standing = Standing(found)
+        if standing.session is None:
+            return standing
+        return Standing(found, self._services.repository.server_of(project.id, standing.session))
+
+    def _earlier_answers(self, project: Project, user_id: str, step: Step) -> Mapping[str, Any]:
+        """What the participant answered on the pages before this step; of a field on two pages, the later answer."""
+        at = project.index(step.key) or 0
+        pages = [each for each in project.steps[:at] if not each.type.on_server]
+        found: dict[str, Any] = {}
+        for page in pages:
+            found |= self._services.answers.read(project.id, user_id, page.key)
+        return found
+
+
+def _not_yet_ready(record: Server | None) -> Server | None:
+    """The record of a server that is not the session's for good: nobody is told its address."""
+    if record is None or record.state is not State.READY:
+        return record
+    return msgspec.structs.replace(record, state=State.NAMING)

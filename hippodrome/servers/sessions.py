@@ -1,0 +1,75 @@
+"""The servers of sessions (`project.players`): when a session is over for its members, and what a member's stop means.
+
+A session owns its server's record, so its server starts, ends and is replaced as others are. A member cannot end it for
+the others: their stop message stops it once all members have reached the stop step. A participant who is no member yet
+leaves the lobby with it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hippodrome.log import failure
+from hippodrome.model import participant
+from hippodrome.model.messages import StopServer
+from hippodrome.model.project import Project
+from hippodrome.storage.repository import Repository
+from protocol.session import BadSession, Session
+
+if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds what it imports
+    from hippodrome.servers.services import ServerServices
+
+
+def readable_session(repository: Repository, project_id: str, session_id: str) -> Session | None:
+    """The session's document; None if there is none yet, or if it cannot be read, which is logged. One read."""
+    try:
+        return repository.session(project_id, session_id)
+    except BadSession as error:
+        failure("a session's document cannot be read", error, project=project_id)
+        return None
+
+
+def members_of(repository: Repository, project_id: str, session_id: str) -> list[str]:
+    """The ids of those who play in a session; none before it is formed, or if its document cannot be read."""
+    session = readable_session(repository, project_id, session_id)
+    return session.user_ids if session else []
+
+
+class Sessions:
+    """Reads what decides about the servers of sessions."""
+
+    def __init__(self, services: ServerServices) -> None:
+        self._services = services
+        self._repository = services.repository
+
+    def has_sessions(self, project_id: str) -> bool:
+        """Whether sessions of this project have several players; False if the project is not registered."""
+        project = self._services.project_cache.project(project_id)
+        return project is not None and project.has_sessions
+
+    def stop_of(self, message: StopServer) -> StopServer | None:
+        """The stop of the session's server that a participant's stop message calls for; None if it calls for none.
+
+        Their entries in the lobby are deleted, so that no one is matched with them. The message says that its sender
+        has reached the stop step: it is published before the answer that leads there is stored.
+        """
+        project = self._services.project_cache.project(message.project_id)
+        if project is None:
+            return None
+        self._services.lobby.forget(project, message.user_id)
+        session_id = self._repository.session_id(project, message.user_id)
+        session = readable_session(self._repository, project.id, session_id) if session_id else None
+        if session is None or not self.is_over(project, session, leaves=message.user_id):
+            return None
+        return StopServer(project.id, session.id, None, message.reason)
+
+    def is_over(self, project: Project, session: Session, leaves: str = "") -> bool:
+        """Whether all members have reached the stop step. One listing for each member but `leaves`, who has.
+
+        False in a project without a stop step: there the trial ends by itself.
+        """
+        return all(self._has_left(project, user_id) for user_id in session.user_ids if user_id != leaves)
+
+    def _has_left(self, project: Project, user_id: str) -> bool:
+        step = self._repository.progress(project.id, user_id).position(project)
+        return participant.is_past_server(project, step)

@@ -1,0 +1,360 @@
+"""One task: the process of its server, followed from its start to its end.
+
+Things are written in an order in which no process leaks: the intent, then the process, then its id; an event, then that
+it was sent. If this process is killed in between, the event is repeated.
+
+Each server has a thread that follows it. If the machine refuses something, the thread tries again until it works
+(`retry.py`). So it notices the end of each server, even with a full disk, or with a data folder on another file system.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import psutil
+
+from hippodrome.config import layout
+from hippodrome.ports import TaskRequest
+from local.backend import recordings
+from local.backend.health import is_healthy, port_in
+from local.backend.processes import child_of, kill_group, mark_of, process_of, spawn
+from local.backend.retry import Retry, start_thread
+from local.backend.task_record import HOST, KILLED, Task, TaskFolder, event, folder_of, now
+from protocol import environment, handover
+from trial.recordings import disk
+
+START_TIMEOUT = 120.0  # seconds in which a server must listen
+RESCUE_TIMEOUT = 10.0  # seconds for which a server's end is held back while its recordings cannot be moved
+
+_AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it needs no credentials
+
+T = TypeVar("T")
+Emit = Callable[[Mapping[str, Any]], None]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all servers of a study share: the folders, how a server is run, and who is told of it."""
+
+    state: Path
+    logs: Path
+    spool: Path  # where servers keep recordings that are not finished
+    files: TaskFolder
+    data: Path
+    project: Path
+    command: Sequence[str]
+    stop_timeout: float
+    emit: Emit
+    say: Say
+    retry: Retry
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    closed: threading.Event = field(default_factory=threading.Event)  # this process ends
+
+    @property
+    def agent_folder(self) -> Path:
+        """Where agent.py is."""
+        return layout.agent_folder(self.project).resolve()
+
+    def log(self, name: str) -> Path:
+        """The log file of the server of this name."""
+        return self.logs / f"{name}.log"
+
+    def environment(self, request: TaskRequest) -> dict[str, str]:
+        """The environment variables of a server's process."""
+        # SESSION is a common name: a desktop may have set it for its own purposes.
+        inherited = {k: v for k, v in os.environ.items() if not k.startswith(_AWS) and k != environment.SESSION}
+        ours = str(Path(__file__).resolve().parents[2])
+        paths = [ours, *filter(None, [inherited.get("PYTHONPATH")])]
+        return {
+            **inherited,
+            **request.environment,
+            environment.STORE: str(self.data),
+            environment.SPOOL: str(self.spool),
+            environment.HOST: HOST,
+            environment.PORT: "0",
+            environment.TLS: "off",
+            environment.AGENT_DIR: str(self.agent_folder),
+            "PYTHONPATH": os.pathsep.join(paths),
+            "PYTHONUNBUFFERED": "1",
+        }
+
+
+class TaskProcess:
+    """A task, its process, and the thread that follows it."""
+
+    def __init__(self, task: Task, shared: Shared) -> None:
+        self.task = task
+        self.begun = threading.Event()  # there is a process, or there will be none
+        self.gone = threading.Event()  # the process is gone and the event is sent
+        self.forgotten = threading.Event()  # its file is not written any more
+        self.silent = False  # no more events: its record is gone, and a new server may have its name
+        self.unsaved = False  # the task has changed since it was saved
+        self._shared = shared
+        self._child: subprocess.Popen[bytes] | None = None
+        self._ending: threading.Thread | None = None
+        self._exit_code: int | None = None
+        self._over = False  # its process is gone; the event that says so may not have been sent yet
+
+    @property
+    def lives(self) -> bool:
+        """Whether it counts as running. As in ECS's lists, it does not once it was asked to stop."""
+        return not self._over and self.task.status != "STOPPED" and self.task.asked is None
+
+    # What the port does with it
+
+    def begin(self, request: TaskRequest) -> None:
+        """Start the process and the thread that follows it, which waits for `begun`.
+
+        If one of them cannot be started, there is neither. Raises `Refused` if the command can never be run, OSError if
+        it may be possible later.
+        """
+        self._save()
+        self._shared.files.remove_notes(self.task.name)
+        try:
+            self._follow()
+            self._child = self._spawn(request)
+        except BaseException:
+            self.forgotten.set()
+            self.begun.set()
+            # If the file stays, the next start sees that no process began.
+            disk.remove_if_possible(self._shared.files.file(self.task.name))
+            raise
+        # From here on there is a process, and nothing may fail. The thread saves the rest.
+        self.task, self.unsaved = replace(self.task, pid=self._child.pid), True
+
+    def take_up(self) -> None:
+        """Follow the process that an earlier `make run` has started, or send its end."""
+        self._follow()
+        self.begun.set()
+
+    def end(self, reason: str, until: float, *, surely: bool = False) -> None:
+        """Send SIGTERM; send SIGKILL at `until` (monotonic). Returns at once.
+
+        Raises OSError if the reason cannot be saved; then no signal is sent. With `surely` it is sent all the same.
+        """
+        with self._shared.lock:
+            if self.task.status == "STOPPED":
+                return
+            try:
+                self.read_handover()  # the caller removes the handover afterwards
+                self._see_out_later(until)
+                self._save(asked=self.task.asked or reason)
+            except OSError:
+                if not surely:
+                    raise
+                self.task, self.unsaved = replace(self.task, asked=self.task.asked or reason), True
+                try:
+                    self._see_out_later(until)
+                except OSError:  # no thread can be started: SIGKILL at once
+                    self.kill_at_once()
+
+    def kill_at_once(self) -> None:
+        """Send SIGKILL, if the process lives or that cannot be seen."""
+        try:
+            lives = self._lives()
+        except OSError:
+            lives = True
+        if lives:
+            kill_group(self.task.pid)
+
+    def forget(self) -> None:
+        """Remove its file, which is not written again. Raises OSError."""
+        self.forgotten.set()
+        self._shared.files.file(self.task.name).unlink(missing_ok=True)
+
+    def read_handover(self) -> None:
+        """Save to whom a warm server was assigned, if it was. Raises OSError if that cannot be read or saved."""
+        with self._shared.lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
+            task = self.task
+            if task.handover_key and not task.folder and not self.forgotten.is_set():
+                found = handover.parse((self._shared.data / task.handover_key).read_bytes())
+                project = task.handover_key.partition("/")[0]
+                self._save(folder=folder_of(project, found.user_id), server=found.server)
+
+    @property
+    def unfinished(self) -> Sequence[Path]:
+        """Its recordings that are still in the spool. Raises OSError."""
+        return recordings.unfinished(self._shared.spool, self.task)
+
+    # Its process
+
+    def _spawn(self, request: TaskRequest) -> subprocess.Popen[bytes]:
+        return spawn(
+            self._shared.command,
+            self._shared.files.path / self.task.name,
+            self._log,
+            mark=self._mark,
+            folder=self._shared.agent_folder,
+            environment=self._shared.environment(request),
+        )
+
+    def _follow(self) -> None:
+        start_thread(self._life, name=f"task {self.task.name}")
+
+    def _life(self) -> None:
+        """Follow a process from its start to its end: send an event for each change, and save that it was sent."""
+        self.begun.wait()
+        if self.task.status != "STOPPED":
+            self._retry(self._see_start)
+            self._retry(self._wait)
+            self._rescue_in_time()
+            self._retry(self._tell_end)
+        self._retry(self._clear)
+        self.gone.set()
+
+    def _retry(self, act: Callable[[], T], seconds: float | None = None) -> T | None:
+        """The result of `act`, tried again until it works; None if this process ends or the server is forgotten."""
+
+        def over() -> bool:
+            return self._shared.closed.is_set() or self.forgotten.is_set()
+
+        def wait(pause: float) -> bool:
+            return self.forgotten.wait(pause) or over()
+
+        return None if over() else self._shared.retry.run(act, wait, seconds)
+
+    def _see_start(self) -> None:
+        if self.task.version == 0:
+            self._tell()
+        elif self.unsaved:
+            self._save()
+        if self.task.asked:  # by a process that was killed before it had ended the server
+            self.end(self.task.asked, time.monotonic() + self._shared.stop_timeout)
+        if self.task.status == "PROVISIONING" and self._listens():
+            self._tell(status="RUNNING", started=now())
+
+    def _listens(self) -> bool:
+        """Wait until the server answers; return False if it is gone. Kill it after `START_TIMEOUT`. Raises OSError."""
+        until = time.monotonic() + START_TIMEOUT
+        while self._lives():
+            port = port_in(self._log)
+            if port and is_healthy(port):
+                self._save(port=port)
+                return True
+            if time.monotonic() > until:
+                self._shared.say(f"server {self.task.name} does not answer and is ended; see {self._log}")
+                self._kill()
+                return False
+            time.sleep(0.05)
+        return False
+
+    def _lives(self) -> bool:
+        if self._child:
+            return self._child.poll() is None
+        return process_of(self.task.pid, self._mark) is not None
+
+    def _wait(self) -> None:
+        """Wait until it is gone; then kill what it has left running, as the end of a container does."""
+        process = self._child or process_of(self.task.pid, self._mark)
+        if process:
+            process.wait()
+            kill_group(process.pid)
+
+    def _tell_end(self) -> None:
+        if self.task.status == "STOPPED":  # the event was sent, but that is not saved yet
+            self._save()
+            return
+        self._exit_code = self._find_exit_code()
+        self._over = True  # before the event is sent: its receiver must not find the task in `list`
+        self._tell(status="STOPPED", stopped=now())
+
+    def _find_exit_code(self) -> int | None:
+        note = self._shared.files.note(self.task.name, "exit")
+        if note.isdecimal():
+            return int(note)
+        if self._child and self._child.returncode is not None and self._child.returncode >= 0:
+            return self._child.returncode  # the shell's, which is that of the server: it could not write it down
+        return KILLED if self.task.pid else None  # the shell was killed with it
+
+    def _clear(self) -> None:
+        """Do what is left when the event of its end has been sent."""
+        try:
+            self._rescue()
+            self._shared.files.remove_notes(self.task.name)
+        finally:
+            self.gone.set()  # no caller waits for what cannot be done at once
+
+    # Its end
+
+    def _see_out_later(self, until: float) -> None:
+        if not (self._ending and self._ending.is_alive()):
+            self._ending = start_thread(self._see_out, until, name=f"end {self.task.name}")
+
+    def _see_out(self, until: float) -> None:
+        with self._shared.lock:  # held by `end` until the reason is saved
+            if not self.task.asked:
+                return
+        self._retry(lambda: self._ask_soon(until))
+        if not self.gone.wait(max(0.0, until - time.monotonic())):
+            self._retry(self._kill)
+
+    def _ask_soon(self, until: float) -> None:
+        """Send SIGTERM to the server as soon as there is one."""
+        while not self.gone.is_set() and time.monotonic() < until:
+            if self._ask():
+                break
+            self.gone.wait(0.02)  # the shell has not started it yet
+
+    def _ask(self) -> bool:
+        """Send SIGTERM to the server; return whether it is there. Raises OSError."""
+        note, mark = self._shared.files.note(self.task.name, "pid"), self._mark
+        server = process_of(int(note), mark) if note.isdecimal() else child_of(self.task.pid, mark)
+        if server is None:
+            return False
+        with contextlib.suppress(psutil.NoSuchProcess):
+            server.terminate()
+        return True
+
+    def _kill(self) -> None:
+        if not self.gone.is_set() and self._lives():
+            kill_group(self.task.pid)
+
+    # Its recordings
+
+    def _rescue_in_time(self) -> None:
+        """Move the recordings before the end is sent: the next server resumes from them. Give up in time."""
+        try:
+            self._retry(self._rescue, RESCUE_TIMEOUT)
+        except Exception:  # noqa: BLE001 - `_clear` tries again
+            name = self.task.name
+            self._shared.say(f"a recording of server {name} cannot be moved to the data yet; it is tried again")
+
+    def _rescue(self) -> None:
+        """Move recordings that a killed server left unfinished to the data folder. Raises OSError."""
+        self.read_handover()
+        recordings.move_to_data(self._shared.spool, self._shared.data, self.task)
+
+    # What is written down
+
+    def _save(self, **changes: Any) -> None:
+        """Write the changed task to disk, then use it. Raises OSError."""
+        with self._shared.lock:
+            task = replace(self.task, **changes)
+            if not self.forgotten.is_set():
+                self._shared.files.save(task)
+            self.task, self.unsaved = task, False
+
+    def _tell(self, **changes: Any) -> None:
+        task = replace(self.task, version=self.task.version + 1, **changes)
+        if not self.silent:
+            self._shared.emit(event(task, self._exit_code))
+        with self._shared.lock:
+            self.task, self.unsaved = replace(self.task, version=task.version, **changes), True
+            self._save()
+
+    @property
+    def _log(self) -> Path:
+        return self._shared.log(self.task.name)
+
+    @property
+    def _mark(self) -> str:
+        return mark_of(self._shared.state, self.task.name)

@@ -1,0 +1,65 @@
+"""What several participants in one environment (`project.players`) need of the pages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from hippodrome.config import Config, Diagnostic, sessions
+from hippodrome.config.folder import read_source
+from hippodrome.config.step_files import StepFileError, open_folder
+from hippodrome.model.matching import field_of
+from local.check.earlier_answers import EarlierAnswers, source_of
+from local.check.wording import nearest, short
+
+
+def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
+    """What is lacking for the participants to find each other, or for those who do not."""
+    if not config.project.has_sessions or not config.game_steps:
+        return
+    try:
+        pages = open_folder(folder).path
+    except StepFileError:
+        return
+    asked = _asked(pages, folder, config)
+    if asked:
+        yield asked
+    if config.project.after_patience == "unmatched":
+        yield from _unmatched(pages, config)
+
+
+def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
+    """The field by which people are matched is on a page before the game. A page's script may make fields too."""
+    field = field_of(config.project.matching)
+    if field is None:
+        return None
+    earlier = EarlierAnswers.before_the_game(pages, config)
+    names, text = earlier.fields()
+    if field in names or re.search(rf"""["'`]{re.escape(field)}["'`]""", text):
+        return _too_alike(earlier, folder, config, field)
+    there = f"; there are the fields {short(', '.join(names))}" if names else ", and none asks anything"
+    said = f"no page before the game asks {short(field)}{nearest(field, names) or there}"
+    return read_source(folder).diagnostic(sessions.MATCHING, said)
+
+
+def _too_alike(earlier: EarlierAnswers, folder: Path, config: Config, field: str) -> Diagnostic | None:
+    """As many different answers can be given as participants play together, if theirs are to be different."""
+    choices, players = earlier.choices(field), config.project.players
+    if "different" not in config.project.matching or choices is None or choices >= players:
+        return None
+    can = "one answer" if choices == 1 else f"{choices} different answers"
+    said = f"{short(field)} can have {can} only, and {players} players need different ones: no participant finds others"
+    return read_source(folder).diagnostic(sessions.MATCHING, said)
+
+
+def _unmatched(pages: Path, config: Config) -> Iterator[Diagnostic]:
+    """The page after the game may speak to those who found no other to play with."""
+    last = max(index for index, step in enumerate(config.steps) if step.type.on_server)
+    after = [file for step in config.steps[last + 1 :] for file in step.files]
+    if after and not any("unmatched" in source_of(file) for file in after):
+        said = (
+            "participants who find no other to play with come here too, without having played; "
+            "{% if participant.unmatched %} … {% else %} … {% endif %} tells them apart"
+        )
+        yield Diagnostic(f"{pages.name}/{after[0].name}", None, "", said, remark=True)

@@ -1,0 +1,43 @@
+"""Ids of participants with which one researcher can play in all places of a game (`project.players`). Pure."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+from hippodrome.model import ids
+
+MOST_TRIED = 10_000
+
+
+def user_ids(
+    project_id: str, players: int, matching: str | dict[str, Any], groups: int, new: Callable[[int], str]
+) -> list[str]:
+    """An id for each place, made by `new` of a number, so that `matching` by groups lets them play together.
+
+    With `group` all are of one group; with `mixed` their groups differ, as far as there are as many.
+    """
+    made = (new(number) for number in itertools.count(1))
+    if not groups or matching not in ("group", "mixed"):
+        return list(itertools.islice(made, players))
+    found: list[str] = []
+    first: int | None = None
+    for user_id in itertools.islice(made, MOST_TRIED):
+        group = ids.group(project_id, user_id, groups)
+        first = group if first is None else first
+        step = len(found) if matching == "mixed" else 0
+        if group == (first + step) % groups:
+            found.append(user_id)
+        if len(found) == players:
+            break
+    return found
+
+
+def advice(matching: str | dict[str, Any]) -> str:
+    """What the researcher has to answer, if answers say who plays together; else nothing."""
+    if not isinstance(matching, dict):
+        return ""
+    how, field = next(iter(matching.items()))
+    answers = "the same answer" if how == "same" else "a different answer"
+    return f"Give {answers} to the question {field} in each."

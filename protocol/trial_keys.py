@@ -1,0 +1,104 @@
+"""How a key of the section `trial` is declared: its check, its default, its meaning and its JSON Schema.
+
+The fields of `Trial`, and of the sections in it, are made by these functions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from protocol import values
+from protocol.values import Check, Keys, Problem
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a section: its name in the file, and the attribute that holds its value."""
+
+    name: str
+    attribute: str
+    check: Check
+    default: Any
+    """What it is if it is not given; None if that is no plain value."""
+    meaning: str
+    schema: Mapping[str, Any]
+    """JSON Schema of the value, for editors."""
+    each: Check | None = None
+    """If the value is a list: the check of each item."""
+    section: type[Any] | None = None
+    """If the value is a section of its own: the class of its keys."""
+    entries: Callable[[Any, Keys], tuple[Any, list[Problem]]] | None = None
+    """If the value is a map of names of the project's own: what is good of it at this path, and what is wrong."""
+
+
+def about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    """What a field says of its key, as its metadata; `more` are further attributes of `Key`."""
+    return {"check": check, "meaning": meaning, "schema": schema, **more}
+
+
+def key(check: Check, default: Any, meaning: str, schema: Mapping[str, Any], **more: Any) -> Any:
+    """A field with a plain default."""
+    return field(default=default, metadata=about(check, meaning, schema, **more))
+
+
+def flag(default: bool, meaning: str) -> Any:
+    """True or false."""
+    return key(values.flag, default, meaning, {"type": "boolean"})
+
+
+def whole(low: int, high: int, default: int | None, meaning: str) -> Any:
+    """A whole number between these two."""
+    schema = {"type": "integer", "minimum": low, "maximum": high}
+    return key(values.whole(low, high), default, meaning, schema)
+
+
+def seconds(most: int, default: float, meaning: str, *, least: float = 0) -> Any:
+    """Seconds, from `least` on."""
+    return key(values.number(least, most), default, meaning, {"type": "number", "minimum": least, "maximum": most})
+
+
+def choice(words: tuple[str, ...], meaning: str) -> Any:
+    """One of these words; the first is the default."""
+    return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
+
+
+def texts(example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[Problem]]]) -> dict[str, Any]:
+    """As `about`: a map of names of the project's own to texts."""
+    schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
+    return about(values.section(example), meaning, schema, entries=entries)
+
+
+def document(section: Any) -> dict[str, Any]:
+    """A section with every default filled in, as JSON has it; with the project's own keys, if it has such."""
+    found = {key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))}
+    return found | dict.fromkeys(getattr(section, "own", ()), True)
+
+
+def _plain(value: Any, section: bool) -> Any:
+    if section and value is not None:
+        return document(value)
+    return list(value) if isinstance(value, tuple) else value
+
+
+def keys(section: type[Any]) -> tuple[Key, ...]:
+    """The keys of a section, in order."""
+    found = []
+    for each in dataclasses.fields(section):
+        if not each.metadata:
+            continue
+        default = None if each.default is dataclasses.MISSING else each.default
+        found.append(Key(name=_camel(each.name), attribute=each.name, default=default, **each.metadata))
+    return tuple(found)
+
+
+def names(section: type[Any]) -> frozenset[str]:
+    """The names of the keys as they stand in the file."""
+    return frozenset(key.name for key in keys(section))
+
+
+def _camel(name: str) -> str:
+    first, *others = name.split("_")
+    return first + "".join(other.capitalize() for other in others)

@@ -1,0 +1,92 @@
+"""The sections in `trial` of config.yml: which controls the page shows, and how a game is drawn by objects."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from protocol import trial_keys as keyed
+from protocol import values
+
+
+def _control() -> Any:
+    return keyed.key(values.flag, False, "", {"type": "boolean"})
+
+
+@dataclass(frozen=True, slots=True)
+class Ui:
+    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
+
+    left: bool = _control()
+    right: bool = _control()
+    up: bool = _control()
+    down: bool = _control()
+    start: bool = _control()
+    stop: bool = _control()
+    pause: bool = _control()
+    reset: bool = _control()
+    train_offline: bool = _control()
+    train_online: bool = _control()
+    good: bool = _control()
+    bad: bool = _control()
+    fps_set: bool = _control()
+    fps_up: bool = _control()
+    fps_down: bool = _control()
+    own: tuple[str, ...] = ()
+    """The project's own controls: all other keys that are true. A press is a word for the agent."""
+
+    def shown(self) -> tuple[str, ...]:
+        """The names of all controls that are shown, the project's own last."""
+        return tuple(name for name, shown in keyed.document(self).items() if shown)
+
+
+_COLOR = re.compile(r"#[0-9a-fA-F]{6}")
+_FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+
+
+def _color(value: object) -> str:
+    """A color of the form `#rrggbb`, in small letters."""
+    found = values.as_text(value, 'a color such as "#ffffff", in quotes')
+    if not _COLOR.fullmatch(found):
+        raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
+    return found.lower()
+
+
+def _folder(value: object) -> str:
+    """A folder below the project's."""
+    found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
+    if len(found) > 200 or not _FOLDER.fullmatch(found):
+        raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
+    return found
+
+
+def _pixels(default: int, meaning: str) -> Any:
+    return keyed.whole(1, 4096, default, meaning)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """How a game is shown that is drawn by objects (docs/objects.md)."""
+
+    width: int = _pixels(600, "Width of the picture, in pixels of its own; the page makes it larger or smaller.")
+    height: int = _pixels(400, "Its height.")
+    background: str = keyed.key(
+        _color,
+        "#ffffff",
+        "Color behind all objects, as #rrggbb in quotes.",
+        {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
+    )
+    coordinates: str = keyed.choice(
+        ("relative", "pixels"),
+        "Whether x, y and points are shares of the picture, from 0 to 1, or pixels of it.",
+    )
+    pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
+    assets: str = keyed.key(
+        _folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"}
+    )
+
+
+def usual_ui() -> Ui:
+    """What is shown if the section is not given."""
+    return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)

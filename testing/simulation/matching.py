@@ -1,0 +1,59 @@
+"""The servers without members of a study with `matching: match`: they look at the question, and one answers.
+
+As `trial/server/matching.py` does: each looks every two seconds, calls `match`, and creates the answer's document; the
+first one's counts. Here `match` takes up to five seconds (`trial/agent/match.py`), and puts those together whose ids
+stand next to each other.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from hippodrome.ports import Conflict
+from protocol.keys import groups_key, waiting_key
+from testing.tasks import Life
+from trial.server.matching import LOOK_SECONDS
+
+if TYPE_CHECKING:
+    from testing.simulation.world import World
+
+TAKES = (0.05, 1.0)  # seconds of one call of `match`, and of its answer's way
+
+
+class SimMatching:
+    """All servers that wait without members. One look stands for theirs: only the first answer counts."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.answered = 0  # questions
+        self.most_waiting = 0  # in one question
+        self.largest = 0  # bytes of the document
+        self._look()
+
+    def _look(self) -> None:
+        world, clock = self._world, self._world.clock
+        found = world.platform.documents.kept.get(waiting_key(world.project.id))
+        if found and self._servers_wait():
+            question = json.loads(found[0])
+            waiting = question.get("waiting", ())
+            self.largest = max(self.largest, len(found[0]))
+            self.most_waiting = max(self.most_waiting, len(waiting))
+            if len(waiting) >= question.get("players", 0) > 0:
+                clock.after(clock.random.uniform(*TAKES), partial(self._answer, question))
+        clock.after(LOOK_SECONDS, self._look)
+
+    def _servers_wait(self) -> bool:
+        tasks = self._world.platform.tasks
+        return any(task.last is Life.RUNNING and task.session and not tasks.owner(task) for task in tasks.living())
+
+    def _answer(self, question: Any) -> None:
+        ids, players = sorted(one["id"] for one in question["waiting"]), question["players"]
+        sessions = [ids[at : at + players] for at in range(0, len(ids) - players + 1, players)]
+        key = groups_key(self._world.project.id, question["id"])
+        try:
+            self._world.platform.documents.keep(key, json.dumps({"groups": sessions}).encode())
+        except Conflict:
+            return
+        self.answered += 1

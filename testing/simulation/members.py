@@ -1,0 +1,173 @@
+"""Participants who play together: they wait in the lobby, close tabs, load the page again, come back, lose the network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+from urllib.parse import urlencode
+
+from hippodrome.model import ids
+from testing.simulation.people import Person
+from testing.simulation.trials import SimTrial, is_lost
+from testing.simulation.world import SECRET, World
+
+POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two questions of the lobby's page: web/game/
+GIVES_UP = 3900.0  # seconds in the lobby: `patience` is an hour at most
+
+
+@dataclass(frozen=True)
+class Habits:
+    """What one of them does in the lobby and in the game. Times are seconds from when they came there."""
+
+    leaves: float | None = None  # closes the page of the lobby
+    beacon: float | None = 0.1  # until the beacon arrives that says so; None: it never does
+    back: float | None = None  # from then until they open the link again; None: never. 0 is a reload
+    offline: tuple[float, float] | None = None  # when their network is gone in the lobby, and for how long
+    tabs: int = 1
+    drops: tuple[float, float] | None = None  # when their connection to the game is gone, and for how long
+    quits: float | None = None  # closes the page of the game for good
+
+
+class Quit(Exception):
+    """They have closed the page of the game."""
+
+
+class Member(Person):
+    """One participant's way through a study whose sessions have several players."""
+
+    def __init__(self, world: World, number: int, *, habits: Habits | None = None, **person: Any) -> None:
+        super().__init__(world, number, **person)
+        self.habits = habits or Habits()
+        self.asked_at: list[datetime] = []  # when their requests arrived at the game step
+        self.lobby: float | None = None  # the second at which they came to the lobby
+        self.matched: float | None = None  # at which their page first said something else
+        self.first_picture: float | None = None
+        self.polls = 0  # of the lobby's page
+        self._left = False
+        self._dropped = False
+
+    def _walk(self) -> None:
+        try:
+            super()._walk()
+        except Quit:
+            self.visit.told = "left by themselves"
+
+    def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
+        self.asked_at.append(self.clock.now())
+        return super()._request(method, query, body)
+
+    def _game(self, page: dict[str, Any]) -> bool:
+        while page.get("state") == "lobby":
+            found = self._wait_in_lobby(page)
+            if found is None:
+                return False
+            page = found
+        if self.lobby is not None and self.matched is None:
+            self.matched = self.clock.seconds
+        return super()._game(page) if "state" in page else True
+
+    def _wait_in_lobby(self, page: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The page that they get when the lobby is over; None if they have left for good, or none comes."""
+        step, since, habits = str(page["step"]), self.clock.seconds, self.habits
+        if self.lobby is None:
+            self.lobby = since
+            for _ in range(1, habits.tabs):
+                self.clock.spawn(lambda: self._second_tab(step), delay=0.5)
+        leaves = since + habits.leaves if habits.leaves is not None and not self._left else GIVES_UP + since
+        state: Mapping[str, Any] | None = page
+        while self.clock.seconds - since < GIVES_UP:
+            pause = PROPOSED_POLL if state and state.get("proposed") else POLL
+            self.clock.sleep(max(0.0, min(pause, leaves - self.clock.seconds)))
+            if self.clock.seconds >= leaves:
+                return self._leave(step)
+            if habits.offline and habits.offline[0] <= self.clock.seconds - since < sum(habits.offline):
+                self.clock.sleep(since + sum(habits.offline) - self.clock.seconds)
+            state = self._poll_lobby(step)
+            if state is not None and state.get("state") != "lobby":
+                return self._loaded()
+        self.visit.told = "waited too long: lobby"
+        return None
+
+    def _loaded(self) -> dict[str, Any] | None:
+        """The page, loaded again; None if it does not come."""
+        found = self._ask("GET")
+        if found is None:
+            self.visit.told = "no answer from the site"
+        return found
+
+    def _poll_lobby(self, step: str) -> dict[str, Any] | None:
+        self.polls += 1
+        return self._request("GET", self._poll_query(step), "")
+
+    def _poll_query(self, step: str) -> str:
+        """The poll address of a page in a study of sessions has the step's ticket, also when the lobby is over."""
+        return f"{self._query}&{urlencode({'poll': step, 'ticket': self._ticket(step)})}"
+
+    def _ticket(self, step: str) -> str:
+        """The proof that they were shown this step, as it stands in the page."""
+        return ids.ticket(SECRET.project_secret(self.world.project), self.visit.user, step)
+
+    def _leave(self, step: str) -> dict[str, Any] | None:
+        """They close the page; what they find if they come back, else None."""
+        self._left = True
+        if self.habits.beacon is not None:
+            self.clock.spawn(lambda: self._beacon(step), delay=self.habits.beacon)
+        if self.habits.back is None:
+            self.visit.told = "left by themselves"
+            return None
+        self.clock.sleep(self.habits.back)
+        return self._loaded()
+
+    def _beacon(self, step: str) -> None:
+        """What the page sends when it is closed. It is no question: who has sent it is not there."""
+        form = {"hippodrome-step": step, "hippodrome-ticket": self._ticket(step), "hippodrome-action": "leave"}
+        super()._request("POST", self._query, urlencode(form))
+
+    def _second_tab(self, step: str) -> None:
+        """Another tab at the lobby: it asks as the first one does, until one of them is through."""
+        while self.matched is None and not self.visit.told and self.visit.finished is None:
+            self._poll_lobby(step)
+            self.clock.sleep(POLL)
+
+    def _play_on(self, state: dict[str, Any]) -> str:
+        """Connect and play with the others; `done`, or `lost`, or `unreachable`."""
+        tasks, names = self.world.platform.tasks, self.world.platform.dns
+        host = names.records.get(state["url"].split("/")[2].split(":")[0])
+        task = tasks.at(host) if host else None
+        trial = self.world.trials.at(task, str(state["step"]), self._play) if task else None
+        if task is None or trial is None or not trial.connect(self.visit.user, state["token"]):
+            return "unreachable"
+        if self.first_picture is None:
+            self.first_picture = self.clock.seconds
+        try:
+            outcome = self._stay(trial, str(state["step"]))
+        finally:
+            trial.disconnect(self.visit.user)
+        if outcome == "dropped":
+            assert self.habits.drops
+            self.clock.sleep(self.habits.drops[1])
+            return "unreachable"
+        return outcome
+
+    def _stay(self, trial: SimTrial, step: str) -> str:
+        """Until the trial is over, the server is lost, or their network is gone for a while. Raises Quit."""
+        since, drops = self.clock.seconds, self.habits.drops
+        while True:
+            self.clock.sleep(1.0)
+            if trial.over == "done":
+                self.answered.append(step)
+                return "done"
+            if trial.over or is_lost(trial.task):
+                return "lost"
+            if self.habits.quits is not None and self.clock.seconds - since >= self.habits.quits:
+                raise Quit
+            if drops and not self._dropped and self.clock.seconds - since >= drops[0]:
+                self._dropped = True
+                return "dropped"
+
+    def _is_over(self) -> bool:
+        """The page that is loaded when the server is gone: whether the game is over for this participant."""
+        page = self._ask("GET")
+        return page is not None and "state" not in page

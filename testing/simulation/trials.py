@@ -1,0 +1,147 @@
+"""What the trial servers of sessions do on their simulated tasks: let the members in, play, and write their answers.
+
+They do what trial/server/ and trial/core/ do with the defaults of config.yml: the game begins when all members are
+connected, is held while one is away, ends for all when one stays away longer than `ABSENT`, and goes on where an
+earlier server has recorded it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from hippodrome.ports import Conflict
+from protocol import session as sessions
+from protocol.keys import answer_key, session_key
+from protocol.session import Session, member_token
+from testing.tasks import Life
+
+if TYPE_CHECKING:
+    from testing.simulation.ports import TimedTask
+    from testing.simulation.world import World
+
+TICK = 1.0  # seconds between two looks of a trial at who is there
+COUNTDOWN, ABSENT = 3.0, 30.0  # seconds: `trial.countdown` and `trial.absent`
+LINGER = 3.0  # seconds from a trial's stored answers to its end
+
+
+_parsed = functools.lru_cache(maxsize=1000)(sessions.parse)  # a document is read every second, and seldom changes
+
+
+class SimTrial:
+    """The trial of one task. `over` is why it has ended: `done`, `lost` (its server), or empty while it goes on."""
+
+    def __init__(self, world: World, task: TimedTask, session_id: str, step: str, play: float) -> None:
+        self.world, self.task, self.session_id = world, task, session_id
+        self.over = ""
+        self.began: float | None = None  # when all members were here for the first time
+        self._step, self._play = step, play
+        self._here: Counter[str] = Counter()  # connections, by member
+        self._away: defaultdict[str, float] = defaultdict(float)  # seconds, by member
+        self._countdown = COUNTDOWN
+        world.clock.spawn(self._run)
+
+    @property
+    def session(self) -> Session | None:
+        """The session's document, which the trial reads until it is there."""
+        found = self.world.platform.documents.kept.get(session_key(self.world.project.id, self.session_id))
+        return _parsed(found[0]) if found else None
+
+    def connect(self, user: str, token: str) -> bool:
+        """Whether it lets this participant in: a member, with the token of this member."""
+        session = self.session
+        if session is None or session.member(user) is None:
+            return False
+        if token != member_token(self.task.request.environment["TOKEN"], user):
+            return False
+        self.task.guests += 1
+        self._here[user] += 1
+        return True
+
+    def disconnect(self, user: str) -> None:
+        """One connection of the member is gone."""
+        self._here[user] -= 1
+
+    def _run(self) -> None:
+        """The game, a look a second; then the answers, and the end of the task."""
+        alone, conditions = 0.0, self.world.conditions
+        while not self.over:
+            self.world.clock.sleep(TICK)
+            if is_lost(self.task):
+                self.over = "lost"
+                return
+            session = self.session
+            here = {user for user, connections in self._here.items() if connections > 0}
+            if session is None or not here:
+                alone += TICK
+                if alone > conditions.idle:
+                    self._end("idle")
+                continue
+            alone = 0.0
+            self._go_on(session, here)
+
+    def _go_on(self, session: Session, here: set[str]) -> None:
+        """One look of the trial while some members are here."""
+        members = {member.user_id for member in session.members}
+        if members <= here:
+            self._all_here()
+            if self.world.played[self.session_id] >= self._play:
+                self._store(session, dict.fromkeys(members, "finished"))
+            return
+        self._countdown = COUNTDOWN
+        for user in members - here:
+            self._away[user] += TICK
+        gone = {user for user in members if self._away[user] > ABSENT}
+        if gone:
+            self._store(session, {user: "left" if user in gone else "partnerLeft" for user in members})
+
+    def _all_here(self) -> None:
+        self._away.clear()
+        if self._countdown > 0:
+            self._countdown -= TICK
+            return
+        if self.began is None:
+            self.began = self.world.clock.seconds
+        self.world.played[self.session_id] += TICK  # it is recorded
+
+    def _store(self, session: Session, outcomes: Mapping[str, str]) -> None:
+        """An answer for each member. What is there stays: an earlier server may have written it."""
+        project, documents = self.world.project.id, self.world.platform.documents
+        for member in session.members:
+            answers = {"score": 10, "outcome": outcomes[member.user_id], "session": session.id}
+            record = {"step": self._step, "page": "game", "answers": answers, "schema": 1}
+            with contextlib.suppress(Conflict):
+                documents.keep(answer_key(project, member.user_id, self._step), json.dumps(record).encode())
+        self.over = "done"
+        self.world.clock.after(LINGER, lambda: self._end("done"))
+
+    def _end(self, why: str) -> None:
+        self.over = self.over or why
+        self.world.platform.tasks.end(self.task.arn, "EssentialContainerExited", "Essential container exited", 0)
+
+
+def is_lost(task: TimedTask) -> bool:
+    """Whether its players have lost the server. Between Spot's warning and its end it goes on."""
+    warned = task.stop_code == "SpotInterruption"
+    return task.last is not Life.RUNNING or (task.desired is Life.STOPPED and not warned)
+
+
+class SimTrials:
+    """The trials of all tasks of a world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._trials: dict[str, SimTrial] = {}  # by task
+
+    def at(self, task: TimedTask, step: str, play: float) -> SimTrial | None:
+        """The trial of a session's task; None if it is no session's, or of one that is not formed yet."""
+        session_id = self._world.platform.tasks.owner(task)
+        if not sessions.is_session_id(session_id):
+            return None
+        if task.arn not in self._trials:
+            self._trials[task.arn] = SimTrial(self._world, task, session_id, step, play)
+        return self._trials[task.arn]

@@ -1,0 +1,442 @@
+"""`deploy erase` of a participant who played with others: nothing of them stays, and the others' data stay whole."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import sys
+import zlib
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from botocore.client import BaseClient
+
+from console.problem import Exit
+from deploy.aws.account import find_installation, open_account
+from deploy.core import stages
+from deploy.core.stages import Executor
+from deploy.operate.eraser import SIGNING, Eraser
+from hippodrome.lobby import decisions, entries
+from hippodrome.lobby.decisions import Ahead, Decisions, Formed, Matched, Proposal, Unmatched
+from hippodrome.lobby.lobby import Lobby
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer, parse_task_changed
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import State
+from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
+from hippodrome.storage.repository import Repository
+from protocol.keys import groups_key, session_key, sessions_folder, waiting_key
+from protocol.session import parse
+from testing.servers import Servers
+from testing.studies import study
+from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
+from tests.export.session_world import (
+    ANN,
+    BOB,
+    OTHER,
+    SID,
+    lines,
+    packed,
+    pair,
+    recording_key,
+    round_trip,
+    said,
+    session,
+)
+from tests.test_docs import code
+from trial.recordings import recording
+
+STUDY = msgspec.structs.replace(study(), task_definition="hippodrome", players=2)
+LABEL = ids.server_label("maze", ANN)
+
+
+@pytest.fixture
+def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed:  # noqa: F811
+    installed.register(STUDY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(stages, "PAUSE", 0)
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", -VALID_SECONDS - STORE_AFTER_CLOSE.total_seconds())
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    return installed
+
+
+def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> Ran:
+    return world.run(capsys, "erase", user, "--project", "maze", "--yes", *more)
+
+
+def contents(world: Installed) -> dict[tuple[str, str], bytes]:
+    """Every version of every document by its key and id; recordings unpacked."""
+    s3, bucket = world.client("s3"), world.env["BUCKET"]
+    found = {}
+    for page in s3.get_paginator("list_object_versions").paginate(Bucket=bucket):
+        for line in page.get("Versions", ()):
+            body = s3.get_object(Bucket=bucket, Key=line["Key"], VersionId=line["VersionId"])["Body"].read()
+            unpack = zlib.decompressobj(31)  # also of one that was cut off
+            found[line["Key"], line["VersionId"]] = unpack.decompress(body) if line["Key"].endswith(".gz") else body
+        for line in page.get("DeleteMarkers", ()):
+            found[line["Key"], line["VersionId"]] = b""
+    return found
+
+
+def traces(world: Installed, user: str = ANN) -> list[str]:
+    """Keys of documents that hold anything of this participant, in any version."""
+    told = [user, said(user), ids.server_label("maze", user), f":{round_trip(user)}"]
+    return [
+        key for (key, _), body in contents(world).items() if any(each in key or each.encode() in body for each in told)
+    ]
+
+
+def of(world: Installed, user: str) -> dict[tuple[str, str], bytes]:
+    return {each: body for each, body in contents(world).items() if each[0].startswith(f"maze/users/{user}/")}
+
+
+def start(world: Installed, session_id: str = SID) -> str:
+    """The session's server runs; its task."""
+    servers, before = Servers(world.platform), set(world.task_arns())
+    servers.start(StartServer("maze", session_id))
+    (task,) = set(world.task_arns()) - before
+    event = parse_task_changed(world.task_event(task, "RUNNING"))
+    assert event is not None
+    assert servers.tasks_changed([event]) == []
+    return task
+
+
+def eraser(world: Installed, user: str = ANN, **how: Any) -> Eraser:
+    account = open_account()
+    return Eraser(account, find_installation(account), "maze", user, **how)
+
+
+def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    pair(world.put, tmp_path)
+    pair(world.put, tmp_path, members=("dora-0001", "emil-0001"), session_id=OTHER)
+    world.put(session_key("maze", SID), session(ANN, BOB).to_json())  # an older version stays in the bucket
+    world.put(recording_key(attempt=2), packed(tmp_path, lines()[:9], close=False)[:-3])
+    world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=recording_key(name="3-episode-0002"))
+    world.client("s3").create_multipart_upload(Bucket=world.env["BUCKET"], Key=recording_key(name="3-episode-0009"))
+    before, theirs = recording.read(world.get(recording_key())), of(world, BOB)
+    another = {each: body for each, body in contents(world).items() if each[0].startswith(f"maze/sessions/{OTHER}/")}
+
+    ran = erase(world, capsys, ANN, "--receipt", "receipt.json", "--json")
+
+    assert ran.code == Exit.DONE, ran.err
+    assert traces(world) == []
+    assert of(world, BOB) == theirs
+    assert another.items() <= contents(world).items()
+    left = parse(world.get(session_key("maze", SID)))
+    assert [(each.user_id, each.seat) for each in left.members] == [("", 0), (BOB, 1)]
+    after = recording.read(world.get(recording_key()))
+    assert [line["action"] for line in before if line["kind"] == "step"] == [
+        line["action"] for line in after if line["kind"] == "step"
+    ]
+    assert said(BOB) in json.dumps(after)
+    assert not world.client("s3").list_multipart_uploads(Bucket=world.env["BUCKET"]).get("Uploads")
+    receipt = json.loads(Path("receipt.json").read_text())
+    for hidden in (ANN, LABEL):
+        assert hidden not in json.dumps(receipt) + ran.err
+    (project,) = receipt["projects"]
+    assert (receipt["complete"], project["rewritten"], set(project["remains"].values())) == (True, 2, {0})
+    assert project["deleted"]["sessions"]["versions"] == 4  # two of the recordings, two of the session's document
+
+
+def test_data_are_made_of_what_is_left(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    from tests.export.test_run import rows
+
+    pair(world.put, tmp_path, observe=True)
+    out = tmp_path / "out"
+    made = ["data", str(out), "--project", "maze", "--aws", "--format", "csv,parquet,minari"]
+    assert world.run(capsys, *made).code == Exit.DONE
+    assert erase(world, capsys).code == Exit.DONE
+    for folder in (out, tmp_path / "anew"):
+        ran = world.run(capsys, "data", str(folder), *made[2:])
+        assert ran.code == Exit.DONE, ran.err
+        assert [row["participant"] for row in rows(folder / "answers.csv")] == [BOB]
+        assert [(row["participant"], row["score"]) for row in rows(folder / "episodes.csv")] == [
+            ("", "6.0"),
+            (BOB, "3.0"),
+        ]
+        assert rows(folder / "problems.csv") == []
+        assert [path.name for path in (folder / "minari").iterdir()] == ["maze-3-right-v0"]
+        for path in folder.rglob("*"):
+            assert not path.is_file() or ANN.encode() not in path.read_bytes(), path
+
+
+def test_a_second_time_there_is_nothing_and_nothing_changes(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    pair(world.put, tmp_path)
+    assert erase(world, capsys).code == Exit.DONE
+    before = contents(world)
+    again = erase(world, capsys, ANN)
+    assert again.code == Exit.DONE
+    assert "nothing of this person" in again.err
+    assert contents(world) == before
+
+
+class Cut(BaseException):
+    """The process ends here."""
+
+
+def cut_off(monkeypatch: Any, at: int, after: bool) -> None:
+    """End the process before or after the n-th call that changes something."""
+    count = [0]
+    whole = BaseClient._make_api_call
+
+    def call(self: BaseClient, operation: str, params: Any) -> Any:
+        changes = operation.startswith(("Put", "Delete", "Abort", "Upload", "Complete", "Create"))
+        count[0] += changes
+        if changes and count[0] == at and not after:
+            raise Cut
+        answer = whole(self, operation, params)
+        if changes and count[0] == at:
+            raise Cut
+        return answer
+
+    monkeypatch.setattr(BaseClient, "_make_api_call", call)
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+@pytest.mark.explores
+def test_cut_off_at_any_call_it_goes_on_from_there(world: Installed, tmp_path: Path, after: bool) -> None:
+    """Each call that changes something is the last one of a run; the next run finishes the work."""
+    for at in range(1, 40):
+        user, other = f"annabel-{at:04}", f"bobby-{at:04}"
+        sid = f"s.{at:020x}"
+        pair(world.put, tmp_path, members=(user, other), session_id=sid)
+        label = ids.server_label("maze", user)
+        world.put(f"_lobby/maze/{label}.way", b"{}")
+        world.put(decisions.key("maze"), to_json(Decisions(at, open=(Ahead("s.0", datetime.now(UTC), label),))))
+        theirs = of(world, other)
+        with pytest.MonkeyPatch.context() as patch:
+            cut_off(patch, at, after)
+            try:
+                assert not eraser(world, user).run()
+                whole = True
+            except Cut:
+                whole = False
+        if not whole:
+            assert not eraser(world, user).run()
+        left = [
+            key for (key, _), body in contents(world).items() if user in key or user.encode() in body or label in key
+        ]
+        assert left == [], at
+        assert of(world, other) == theirs
+        body = world.get(recording_key(sid))
+        words = gzip.decompress(body)
+        assert (said(user).encode() in words, said(other).encode() in words) == (False, True)
+        assert {m["player"] for line in recording.read(body) for m in line.get("messages", ())} == {"right"}
+        if whole:
+            break
+        bucket = eraser(world)._bucket
+        bucket.delete(bucket.versions("maze/"))
+    else:
+        pytest.fail("there were more calls than that")
+    assert at > 8
+
+
+def test_a_session_that_plays_is_stopped_first(world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+    """As a server of one's own is: the trial stores what it has before anything is touched."""
+    pair(world.put, tmp_path)
+    start(world)
+    order: list[str] = []
+    rewrite = Eraser._leave_session
+
+    def leave(self: Eraser, found: Any, advance: Any) -> None:
+        order.append("while it ran" if list(world.platform.tasks.list()) else "rewritten")
+        rewrite(self, found, advance)
+
+    monkeypatch.setattr(Eraser, "_leave_session", leave)
+    ran = erase(world, capsys)
+    assert ran.code == Exit.DONE, ran.err
+    assert "1 session will be stopped, for all who play there" in ran.err
+    assert order == ["rewritten"]
+    assert traces(world) == []
+    record = from_json(world.get(server.key(ids.server_label("maze", SID))), server.Server)
+    assert (record.state, record.user_id) == (State.CLOSED, SID), "what the others' page needs to go on"
+    assert not [*world.platform.tasks.list()]
+    assert not world.timers()
+    assert not world.records()
+
+
+def test_what_the_sessions_server_may_still_store_is_waited_for(
+    world: Installed, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Its record stays, for the others: it may get requests for a while after its end."""
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
+    pair(world.put, tmp_path)
+    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now())
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        world.put(recording_key(name="3-episode-0002"), packed(tmp_path, lines()))
+
+    assert not eraser(world, executor=Executor(sleep)).run()
+    (seconds,) = slept
+    assert seconds == pytest.approx(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING, abs=20)
+    assert traces(world) == []
+
+
+def test_a_session_that_was_over_long_ago_is_not_waited_for(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
+    pair(world.put, tmp_path)
+    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(minutes=10))
+    slept: list[float] = []
+    assert not eraser(world, executor=Executor(slept.append)).run()
+    assert slept == []
+
+
+def test_a_session_that_plays_again_meanwhile_is_stopped_again(
+    world: Installed, tmp_path: Path, monkeypatch: Any
+) -> None:
+    pair(world.put, tmp_path)
+    made, times = eraser(world), iter(range(1))
+    take_out = made._sessions.take_out
+
+    def take_out_while_it_starts(found: Any, note: Any) -> None:
+        take_out(found, note)
+        if next(times, None) is not None:
+            start(world)
+            world.put(recording_key(attempt=1, name="3-episode-0002"), packed(tmp_path, lines()))
+
+    monkeypatch.setattr(made._sessions, "take_out", take_out_while_it_starts)
+    assert not made.run()
+    assert made.receipt.rounds == 2
+    assert traces(world) == []
+
+
+def test_when_all_members_are_erased_the_session_is_gone(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    pair(world.put, tmp_path)
+    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(hours=1))
+    assert erase(world, capsys, ANN).code == Exit.DONE
+    assert [key for key, _ in contents(world) if SID in key or ids.server_label("maze", SID) in key]
+    assert erase(world, capsys, BOB).code == Exit.DONE
+    kept = {key for key, _ in contents(world)}
+    assert not [key for key in kept if SID in key or ids.server_label("maze", SID) in key or "/users/" in key]
+    assert not [key for key in kept if key.startswith(sessions_folder("maze"))]
+
+
+def test_who_waits_in_the_lobby_leaves_it(world: Installed, capsys: Any) -> None:
+    now = datetime.now(UTC)
+    other = ids.server_label("maze", BOB)
+    world.participant(ANN, answered=1)
+    for name in (f"{LABEL}.1790000000000.-", f"{LABEL}.yes.{SID}", f"{LABEL}.left.1790000000000", f"{LABEL}.way"):
+        for _ in range(2):
+            world.put(f"_lobby/maze/{name}", to_json(entries.Person(ANN)))
+    world.put(f"_lobby/maze/{other}.1790000000000.-", to_json(entries.Person(BOB)))
+    decided = Decisions(
+        3,
+        open=(Ahead("s.1", now, LABEL),),
+        proposed=(Proposal("s.2", (LABEL, other), now),),
+        formed=(Formed("s.3", (Matched(LABEL, ANN), Matched("slabel-of-another", "dora-0001")), now),),
+        unmatched=(Unmatched(LABEL, ANN, now),),
+    )
+    for version in (2, 3):
+        world.put(decisions.key("maze"), to_json(msgspec.structs.replace(decided, version=version)))
+    assert erase(world, capsys).code == Exit.DONE
+    assert traces(world) == []
+    left = from_json(world.get(decisions.key("maze")), Decisions)
+    assert (left.version, [each.id for each in left.open], left.proposed, left.unmatched) == (4, ["s.1"], (), ())
+    assert [member.user_id for member in left.formed[0].members] == ["", "dora-0001"]
+    assert world.keys("_lobby/") == [f"_lobby/maze/{other}.1790000000000.-"]
+
+
+def test_the_question_to_match_and_its_answers_forget_them(world: Installed, capsys: Any) -> None:
+    other = ids.server_label("maze", BOB)
+    theirs, others = ({"waiting": [{"id": each}], "groups": [[each]]} for each in (LABEL, other))
+    world.participant(ANN, answered=1)
+    for said_of in (others, theirs, others):
+        world.put(waiting_key("maze"), json.dumps(said_of).encode())
+    world.put(groups_key("maze", "0" * 20), json.dumps(theirs).encode())
+    world.put(groups_key("maze", "1" * 20), json.dumps(others).encode())
+    assert erase(world, capsys, ANN, "--receipt", "receipt.json").code == Exit.DONE
+    assert traces(world) == []
+    assert [key for key, _ in contents(world) if key == waiting_key("maze")] == [waiting_key("maze")] * 2
+    assert world.keys("maze/lobby/groups/") == [groups_key("maze", "1" * 20)]
+    (project,) = json.loads(Path("receipt.json").read_text())["projects"]
+    assert {kind for kind, counts in project["deleted"].items() if counts["versions"]} == {
+        "lobby",
+        "participant",
+        "answers",
+    }
+
+
+@pytest.mark.parametrize("written", [True, False], ids=["carried out", "not carried out"])
+def test_the_lobby_does_not_bring_back_who_was_erased(world: Installed, tmp_path: Path, written: bool) -> None:
+    """A decision may stand in its document for a while after it was carried out, or be carried out later."""
+    then = datetime.now(UTC) - timedelta(minutes=1)
+    other = ids.server_label("maze", BOB)
+    formed = Formed(SID, (Matched(LABEL, ANN), Matched(other, BOB)), then)
+    world.put(decisions.key("maze"), to_json(Decisions(3, formed=(formed,))))
+    world.participant(ANN, answered=1)
+    if written:
+        pair(world.put, tmp_path)
+    assert not eraser(world).run()
+    Lobby(world.platform, Repository(world.platform.documents)).repair(STUDY)
+    assert traces(world) == []
+    assert [each.user_id for each in parse(world.get(session_key("maze", SID))).members] == ["", BOB]
+
+
+def test_a_lobby_that_is_written_meanwhile_is_left_in_the_next_round(world: Installed, monkeypatch: Any) -> None:
+    world.participant(ANN, answered=1)
+    world.put(decisions.key("maze"), to_json(Decisions(1, open=(Ahead("s.1", datetime.now(UTC), LABEL),))))
+    made, times = eraser(world), iter(range(1))
+    replace = made._bucket.replace
+
+    def replace_too_late(key: str, before: bytes, after: bytes) -> bool:
+        if next(times, None) is not None:
+            world.put(key, to_json(msgspec.structs.replace(from_json(before, Decisions), version=2)))
+        return replace(key, before, after)
+
+    monkeypatch.setattr(made._bucket, "replace", replace_too_late)
+    assert not made.run()
+    assert traces(world) == []
+    assert from_json(world.get(decisions.key("maze")), Decisions).version == 3
+
+
+def test_a_session_whose_document_is_lost_is_found_by_the_members_own(
+    world: Installed, tmp_path: Path, capsys: Any
+) -> None:
+    pair(world.put, tmp_path)
+    for key, version in contents(world):
+        if key == session_key("maze", SID):
+            world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=key, VersionId=version)
+    assert erase(world, capsys).code == Exit.DONE
+    assert traces(world) == []
+    assert said(BOB).encode() in gzip.decompress(world.get(recording_key()))
+
+
+def test_a_document_that_names_them_and_cannot_be_read_is_told(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    pair(world.put, tmp_path)
+    world.put(session_key("maze", OTHER), f'{{"members": "{ANN}"}}'.encode())
+    ran = erase(world, capsys)
+    assert f"maze/sessions/{OTHER}/session.json cannot be read" in ran.err
+
+
+def test_a_kept_bucket_forgets_a_member_as_documented(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    pair(world.put, tmp_path)
+    world.put(f"_lobby/maze/{LABEL}.way", b"{}")
+    world.put(waiting_key("maze"), json.dumps({"waiting": [{"id": LABEL, "answers": {"age": 41}}]}).encode())
+    theirs = of(world, BOB)
+    (program,) = [block for block in code("docs/data.md", "python") if "SessionEraser" in block]
+    for user in (ANN, BOB):
+        monkeypatch.setattr(sys, "argv", ["forget.py", world.env["BUCKET"], "maze", user])
+        capsys.readouterr()
+        exec(program, {})
+        assert capsys.readouterr().out == "0 versions are left\n"
+        assert traces(world, user) == []
+        assert of(world, BOB) == (theirs if user == ANN else {})
+    assert not [key for key, _ in contents(world) if SID in key]
+
+
+def test_a_dry_run_counts_sessions_and_changes_nothing(world: Installed, tmp_path: Path, capsys: Any) -> None:
+    pair(world.put, tmp_path)
+    before = contents(world)
+    dry = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run", "--json")
+    assert (dry.code, dry.json["found"]["maze"]["sessions"]) == (Exit.CHANGES, 1)
+    shown = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run")
+    assert "sessions" in shown.out + shown.err
+    assert contents(world) == before

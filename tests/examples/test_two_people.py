@@ -1,0 +1,73 @@
+"""The forms of examples in which two people play: with the lines that their README shows, played by two bots."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import shutil
+import textwrap
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+import yaml
+
+from bots.bot import Bot
+from local.new import LEFT_OUT
+from local.rehearsal.logs import verify
+from local.rehearsal.study_process import ROOT
+from testing.held_study import HeldStudy
+from trial.recordings.recording import read
+
+pytestmark = pytest.mark.xdist_group("examples")
+
+SHORT = {"maxEpisodes": 1, "resetFreeze": 0, "countdown": 1, "absent": 10}
+PATIENCE = 90.0
+
+
+def lines_of_readme(folder: Path) -> dict[str, Any]:
+    """The lines of config.yml that its README shows under "Two people"."""
+    section = (folder / "README.md").read_text(encoding="utf-8").partition("## Two people\n")[2].partition("\n## ")[0]
+    (block,) = re.findall(r"(?:^ {4}.*\n)+", section, re.MULTILINE)
+    found: dict[str, Any] = yaml.safe_load(textwrap.dedent(block))
+    return found
+
+
+def held(name: str, place: Path, **options: Any) -> HeldStudy:
+    folder = place / name
+    shutil.copytree(ROOT / "examples" / name, folder, ignore=LEFT_OUT)
+    config, more = yaml.safe_load((folder / "config.yml").read_text()), lines_of_readme(folder)
+    config["project"] |= more["project"]
+    config["trial"] |= more["trial"] | SHORT
+    config["trial"]["options"] |= options
+    (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
+    return HeldStudy(folder, place / "run" / "data", log=place / "local.log")
+
+
+@pytest.mark.parametrize(
+    ("name", "players", "options"),
+    [
+        ("overcooked", ("0", "1"), {"seconds": 8}),
+        ("slime-volleyball", ("agent_left", "agent_right"), {"points": 1, "seconds": 8}),
+    ],
+)
+def test_two_people_play(name: str, players: tuple[str, str], options: dict[str, Any], tmp_path: Path) -> None:
+    study = held(name, tmp_path, **options)
+    try:
+        study.start()
+        bots = [Bot(study.link, each, Random(each), play=0, patience=PATIENCE) for each in ("ada", "bo")]
+
+        async def walk() -> list[Any]:
+            return list(await asyncio.wait_for(asyncio.gather(*(bot.run() for bot in bots)), PATIENCE))
+
+        accounts = asyncio.run(walk())
+        assert [(each.errors, each.troubles, each.finished) for each in accounts] == [([], [], True)] * 2
+        assert verify(study.data, name, accounts).missing == []
+        assert [each.plays[0].outcome for each in accounts] == ["finished", "finished"]
+        (file,) = (study.data / name / "sessions").glob("*/trials/*/*.gz")
+        steps = [line for line in read(file.read_bytes()) if line["kind"] == "step"]
+        for player in players:
+            assert {step["players"][player]["by"] for step in steps} == {"human", "none"}
+    finally:
+        study.clear()

@@ -1,0 +1,236 @@
+"""examples/two-players, held by a real `make run` and played by bots: pairs, one left over, and a lost server."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import yaml
+
+from bots.account import Account
+from bots.bot import Bot
+from bots.page import Page
+from bots.verification import document
+from local.new import LEFT_OUT
+from local.rehearsal.logs import verify
+from local.rehearsal.study_process import ROOT, servers_of, sessions_not_open, sessions_of, wait_until_gone
+from testing.held_study import HeldStudy
+from trial.recordings.recording import read
+
+EXAMPLE = ROOT / "examples" / "two-players"
+PROJECT = "two-players"
+PATIENCE = 60.0  # seconds in which a bot must have passed everything
+
+Hold = Callable[..., HeldStudy]
+
+
+@pytest.fixture
+def hold(tmp_path: Path) -> Iterator[Hold]:
+    """Hold the example with other keys of its sections: `hold(project={"patience": 10}, trial={…})`.
+
+    `more` are lines at the end of its agent.py.
+    """
+    held: list[HeldStudy] = []
+
+    def start(project: dict[str, Any], trial: dict[str, Any], more: str = "") -> HeldStudy:
+        folder = tmp_path / "study"
+        shutil.copytree(EXAMPLE, folder, ignore=LEFT_OUT)
+        config = yaml.safe_load((folder / "config.yml").read_text())
+        config["project"] |= project
+        config["trial"] |= trial
+        (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
+        with (folder / "agent.py").open("a") as agent:
+            agent.write(more)
+        held.append(HeldStudy(folder, tmp_path / "run" / "data", log=tmp_path / "local.log"))
+        held[-1].start()
+        return held[-1]
+
+    yield start
+    for study in held:
+        study.clear()
+
+
+def bots_of(study: HeldStudy, *names: str) -> list[Bot]:
+    return [Bot(study.link, name, Random(name), play=0, patience=PATIENCE) for name in names]
+
+
+async def walk(bots: list[Bot]) -> list[Account]:
+    return list(await asyncio.gather(*(bot.run() for bot in bots)))
+
+
+def all_is_well(study: HeldStudy, accounts: list[Account]) -> None:
+    assert [(account.errors, account.troubles, account.finished) for account in accounts] == [([], [], True)] * len(
+        accounts
+    )
+    assert verify(study.data, PROJECT, accounts).missing == []
+    names = {account.user_id for account in accounts}
+    assert (
+        wait_until_gone(
+            study.data, names | sessions_of(study.data, PROJECT, names) | sessions_not_open(study.data, PROJECT)
+        ).words()
+        == []
+    )
+    assert study.interrupt()
+
+
+def recorded(study: HeldStudy) -> list[list[dict[str, Any]]]:
+    files = sorted((study.data / PROJECT / "sessions").glob("*/trials/*/*.gz"))
+    return [list(read(file.read_bytes())) for file in files]
+
+
+def test_two_find_each_other_and_a_third_goes_on_unmatched(hold: Hold) -> None:
+    study = hold({"patience": 10}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
+    accounts = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo", "cy")), PATIENCE))
+    all_is_well(study, accounts)
+    plays = {account.user_id: account.plays[0] for account in accounts}
+    (alone,) = (name for name, play in plays.items() if play.unmatched)
+    one, other = (name for name in plays if name != alone)
+    assert plays[one].addresses == plays[other].addresses
+    assert [plays[name].outcome for name in (one, other, alone)] == ["finished", "finished", "unmatched"]
+    assert "back" in accounts[["ada", "bo", "cy"].index(alone)].answers["4"]  # the survey asks them something else
+    (lines,) = recorded(study)
+    steps = [line["players"] for line in lines if line["kind"] == "step"]
+    assert steps
+    assert {step[who]["by"] for step in steps for who in ("red", "blue")} <= {"human", "none"}
+    assert not {one, other} & set(str(lines).replace('"', "'").split("'"))
+
+
+def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
+    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 6, "countdown": 1})
+
+    async def lose_it() -> list[Account]:
+        bots = bots_of(study, "ada", "bo")
+        walking = asyncio.ensure_future(walk(bots))
+        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
+            assert not walking.done()
+            await asyncio.sleep(0.05)
+        for server in servers_of(study.data):
+            server.kill()
+        return await walking
+
+    accounts = asyncio.run(asyncio.wait_for(lose_it(), PATIENCE))
+    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * 2
+    assert [len(account.plays[0].addresses) for account in accounts] == [2, 2]
+    assert [account.plays[0].outcome for account in accounts] == ["finished", "finished"]
+    missing = verify(study.data, PROJECT, accounts).missing
+    assert [line for line in missing if not line.endswith(" is cut off")] == []  # the killed server's recording is
+
+
+def test_after_patience_one_may_play_with_the_helper_in_the_empty_place(hold: Hold) -> None:
+    study = hold({"patience": 10, "afterPatience": "policies"}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
+    (account,) = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada")), PATIENCE))
+    all_is_well(study, [account])
+    assert (account.plays[0].outcome, account.plays[0].members) == ("finished", 1)
+    (lines,) = recorded(study)
+    steps = [line["players"] for line in lines if line["kind"] == "step"]
+    assert {step["red"]["by"] for step in steps} <= {"human", "none"}
+    assert "policy" in {step["blue"]["by"] for step in steps}
+
+
+def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(hold: Hold) -> None:
+    trial = {"maxEpisodes": 1, "episodeSeconds": 20, "countdown": 1, "absent": 3, "afterAbsent": "end"}
+    study = hold({}, trial)
+
+    async def leave() -> Account:
+        bots = bots_of(study, "ada", "bo")
+        ada, bo = (asyncio.ensure_future(bot.run()) for bot in bots)
+        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
+            await asyncio.sleep(0.05)
+        bo.cancel()
+        return await ada
+
+    account = asyncio.run(asyncio.wait_for(leave(), PATIENCE))
+    assert (account.finished, account.errors, account.plays[0].outcome) == (True, [], "partnerLeft")
+    assert ["has not come back" in trouble for trouble in account.troubles] == [True]
+    assert document(study.data / PROJECT / "users/bo/answers/3.json")["answers"]["outcome"] == "left"
+    assert verify(study.data, PROJECT, [account]).missing == []
+
+
+def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -> None:
+    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1})
+    study.port = urlsplit(study.link).port or 0
+
+    async def kill_twice() -> list[Account]:
+        ada, bo = bots_of(study, "ada", "bo")
+        first = asyncio.ensure_future(ada.run())
+        while ada.account.stage != "waits for others":
+            await asyncio.sleep(0.05)
+        study.kill()
+        await asyncio.to_thread(study.start)
+        second = asyncio.ensure_future(bo.run())
+        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in (ada, bo)):
+            await asyncio.sleep(0.05)
+        study.kill()
+        await asyncio.to_thread(study.start)
+        return [await first, await second]
+
+    accounts = asyncio.run(asyncio.wait_for(kill_twice(), PATIENCE))
+    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * 2
+    assert [(account.plays[0].outcome, account.plays[0].members) for account in accounts] == [("finished", 2)] * 2
+    assert verify(study.data, PROJECT, accounts).missing == []
+    assert len(recorded(study)) == 1
+
+
+OPPOSITES = """
+
+def match(waiting):
+    never = [one for one in waiting if one["answers"]["plays"] == "never"]
+    often = [one for one in waiting if one["answers"]["plays"] == "often"]
+    return list(zip(never, often))
+"""
+FAILS = """
+
+def match(waiting):
+    raise RuntimeError("no idea who plays")
+"""
+
+
+class Decided(Bot):
+    """A participant who answers the question on the page before the game in one way."""
+
+    plays = ""
+
+    async def post(self, address: str, pairs: list[tuple[str, str]]) -> Page:
+        for answers in self.account.answers.values():
+            if "plays" in answers:
+                answers["plays"] = self.plays
+        return await super().post(address, [(name, self.plays if name == "plays" else it) for name, it in pairs])
+
+
+def decided(study: HeldStudy, **plays: str) -> list[Bot]:
+    bots = [Decided(study.link, name, Random(name), play=0, patience=PATIENCE) for name in plays]
+    for bot in bots:
+        bot.plays = plays[bot.account.user_id]
+    return list[Bot](bots)
+
+
+def test_the_function_match_puts_opposites_together(hold: Hold) -> None:
+    study = hold(
+        {"patience": 40, "matching": "match"}, {"maxEpisodes": 1, "episodeSeconds": 3, "countdown": 1}, OPPOSITES
+    )
+    bots = decided(study, ada="never", bo="never", cy="often", di="often")
+    accounts = asyncio.run(asyncio.wait_for(walk(bots), PATIENCE))
+    all_is_well(study, accounts)
+    assert [account.plays[0].outcome for account in accounts] == ["finished"] * 4
+    sessions = [document(file) for file in (study.data / PROJECT / "sessions").glob("*/session.json")]
+    groups = [sorted(member["userId"] for member in session["members"]) for session in sessions]
+    assert len(groups) == 2
+    assert [len({"ada", "bo"}.intersection(group)) for group in groups] == [1, 1]
+
+
+def test_if_the_function_match_raises_people_go_on_unmatched_and_the_log_says_why(hold: Hold) -> None:
+    study = hold({"patience": 15, "matching": "match"}, {"maxEpisodes": 1}, FAILS)
+    accounts = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo")), PATIENCE))
+    all_is_well(study, accounts)
+    assert [account.plays[0].outcome for account in accounts] == ["unmatched"] * 2
+    logs = [file.read_text(errors="replace") for file in study.data.parent.rglob("*.log")]
+    told = [log for log in logs if "match() failed, and nobody is matched" in log]
+    assert told
+    assert all("RuntimeError: no idea who plays" in log for log in told)
+    assert all(log.count("match() failed") == 1 for log in told)

@@ -1,0 +1,195 @@
+"""Several participants in one environment: which keys go together, and what each mistake is answered with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import ConfigErrors, parse_registration, read_project
+from hippodrome.config.remarks import remarks_on
+from tests.hippodrome.config.folder import folder, mistakes, one, read, small
+
+__all__ = ["folder"]
+
+TWO = "players: {a: human, b: human}\n"
+STEPS = "1: consent\n2: game\n3: thanks\n"
+GROUPS = "1: briefing\n2: game\n3: thanks\n"  # briefing-0, briefing-1, briefing-2
+
+
+def pair(project: str = "", trial: str = TWO, steps: str = STEPS) -> str:
+    return small(project=f"players: 2\n{project}", trial=trial, steps=steps)
+
+
+def remarked(folder: Path, text: str) -> list[str]:
+    config = read(folder, text)
+    return [str(said).partition("remark: ")[2] for said in remarks_on(folder, config) if "useAWS" not in str(said)]
+
+
+def test_two_people_in_one_game(folder: Path) -> None:
+    found = read(folder, pair(project="matching: {same: language}\npatience: 60\n"))
+    assert "step 2 is the game (CartPole-v1) for 2 participants together" in found.summary()
+    registered = found.registration()
+    assert [registered[key] for key in ("players", "matching", "patience", "afterPatience")] == [
+        2, {"same": "language"}, 60, "unmatched",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("project", "trial", "said"),
+    [
+        (
+            "", "",
+            "trial.players: missing; project.players is 2, so name the environment's players, 2 of them human, such as "
+            "{player_0: human, player_1: human}",
+        ),
+        (
+            "", "players: {a: human, b: random}\n",
+            "trial.players: 1 player is human (a), and project.players is 2; write human for 2 of them, or players: 1 "
+            "under project",
+        ),
+        (
+            "", "players: {a: human, b: human, c: human}\n",
+            "trial.players: 3 players are human (a, b, c), and project.players is 2; write human for 2 of them, or "
+            "players: 3 under project",
+        ),
+        (
+            "matching: group\n", "players: {0: {a: human, b: human}, 1: {a: human, b: random}}\n",
+            "trial.players.1: 1 player is human (a), and project.players is 2; write human for 2 of them, or "
+            "players: 1 under project",
+        ),
+        (
+            "", "players: {0: {a: human, b: human}, 1: {b: human, a: human}}\n",
+            "trial.players: is given group by group, and a game may have participants of several groups; write "
+            "matching: group under project, or one map for all",
+        ),
+        (
+            "afterPatience: policies\n", TWO,
+            "trial.substitute: missing; afterPatience: policies needs a policy that plays in the empty places, such as "
+            "substitute: random",
+        ),
+        (
+            "", TWO + "afterAbsent: policy\n",
+            "trial.substitute: missing; afterAbsent: policy needs a policy that takes the place, such as substitute: "
+            "random",
+        ),
+        (
+            "afterPatience: policies\n", TWO + "afterAbsent: policy\n",
+            "trial.substitute: missing; afterAbsent: policy needs a policy that takes the place, such as substitute: "
+            "random",
+        ),
+        (
+            "", TWO + "substitute: policies/none.onnx\n",
+            "trial.substitute: there is no file policies/none.onnx beside agent.py",
+        ),
+        (
+            "plainClients: true\nsubdomain: userId\nfrontEnd: https://play.example.org\n", TWO,
+            "project.plainClients: HIPPO's front end opens the game of one participant: write plainClients: false, or "
+            "players: 1",
+        ),
+        (
+            "subdomain: userId\n", TWO,
+            "project.subdomain: a server is several participants', so it cannot be called after one: use subdomain: hash",
+        ),
+        (
+            "cluster: participant\n", TWO,
+            "project.cluster: a server is several participants', so no cluster is one participant's: use cluster: "
+            "installation",
+        ),
+    ],
+)  # fmt: skip
+def test_what_does_not_go_together(folder: Path, project: str, trial: str, said: str) -> None:
+    steps = GROUPS if "group" in project or "0:" in trial else STEPS
+    assert one(folder, pair(project, trial, steps)) == said
+
+
+def test_each_of_three_groups_has_its_players(folder: Path) -> None:
+    trial = "players: {0: {a: human, b: human}, 1: {a: human, b: human, c: random}, 2: {b: human, a: human}}\n"
+    assert read(folder, pair("matching: group\n", trial, GROUPS)).project.matching == "group"
+
+
+@pytest.mark.parametrize("matching", ["group", "mixed"])
+def test_matching_by_groups_needs_groups(folder: Path, matching: str) -> None:
+    assert one(folder, pair(f"matching: {matching}\n")) == (
+        f"project.matching: {matching}, and there are no groups; write two versions of a page, such as rules-0.html and "
+        "rules-1.html, or matching: arrival"
+    )
+    read(folder, pair(f"matching: {matching}\n", steps=GROUPS))
+
+
+@pytest.mark.parametrize("how", ["same", "different"])
+def test_the_answer_to_an_earlier_page_may_match(folder: Path, how: str) -> None:
+    assert read(folder, pair(f"matching: {{{how}: language}}\n")).project.matching == {how: "language"}
+
+
+def test_a_function_of_agent_py_may_match(folder: Path) -> None:
+    assert read(folder, pair("matching: match\n")).project.matching == "match"
+
+
+def test_a_registration_is_checked_alike(folder: Path) -> None:
+    data = read(folder, pair("matching: group\n", steps=GROUPS)).registration()
+    assert parse_registration(data)["players"] == 2
+    with pytest.raises(ConfigErrors, match="matching: group, and there are no groups"):
+        parse_registration({**data, "steps": [{**step, "variants": 0} for step in data["steps"]]})
+    with pytest.raises(ConfigErrors, match=r"trial.players: 2 players are human \(a, b\), and project.players is 3"):
+        parse_registration({**data, "players": 3})
+
+
+def test_one_value_that_is_wrong_hides_what_it_is_compared_with(folder: Path) -> None:
+    assert one(folder, pair(trial="players: {a: human, b: nobody}\n")).startswith("trial.players: b must be human,")
+    assert one(folder, pair("matching: groups\n")).startswith("project.matching: must be arrival")
+    assert len(mistakes(folder, pair(trial="").replace("players: 2", "players: many"))) == 1
+
+
+def test_nothing_is_said_of_two_people_who_wait_play_and_leave(folder: Path) -> None:
+    trial = TWO + "substitute: random\nafterAbsent: policy\ncountdown: 5\nmaxPing: 200\n"
+    trial += "episodeSeconds: 240\nbetweenEpisodes: 5\nmaxEpisodes: 3\n"
+    assert remarked(folder, pair("patience: 60\nmaxParticipants: 40\nmaxServers: 2\n", trial)) == []
+
+
+@pytest.mark.parametrize(
+    ("project", "trial", "said"),
+    [
+        (
+            "maxParticipants: 1\n", "",
+            "project.maxParticipants: below players, which is 2: a participant finds no other to play with",
+        ),
+        (
+            "maxRuntime: 10\n", "episodeSeconds: 240\nbetweenEpisodes: 5\nmaxEpisodes: 3\n",
+            "project.maxRuntime: 10 minutes: the server ends then, and 3 episodes of 240 seconds can take 13",
+        ),
+        ("", "ui: {stop: true}\n", "trial.ui.stop: one participant who presses it ends the game for all of them"),
+        ("", "ui: {reset: true}\n", "trial.ui.reset: one participant who presses it ends the episode for all of them"),
+        (
+            "", "pace: turns\n",
+            "trial.turnSeconds: 0: a participant who does nothing keeps the others waiting without end; write "
+            "turnSeconds: 20",
+        ),
+        (
+            "", "absent: 0\n",
+            "trial.absent: 0: a connection that is lost for a moment ends the game for all; write absent: 30",
+        ),
+    ],
+)  # fmt: skip
+def test_what_works_but_may_not_be_meant(folder: Path, project: str, trial: str, said: str) -> None:
+    assert remarked(folder, pair(project, TWO + trial)) == [said]
+
+
+def test_players_without_a_game_have_no_effect(folder: Path) -> None:
+    text = "project: {id: paper, players: 2, steps: {1: consent, 2: survey}}\n"
+    assert remarked(folder, text) == ["project.players: no effect: no step is game, so no participant plays"]
+
+
+def test_keys_of_sessions_have_no_effect_on_one_who_plays_alone(folder: Path) -> None:
+    text = small(project="patience: 60\nmatching: arrival\n", trial="absent: 10\nsubstitute: random\n")
+    why = "no effect: project.players is 1, so each participant plays alone; write players: 2 under project"
+    assert sorted(remarked(folder, text)) == [
+        f"{key}: {why}" for key in ("project.matching", "project.patience", "trial.absent", "trial.substitute")
+    ]
+
+
+def test_a_substitutes_file_is_found(folder: Path) -> None:
+    (folder / "policies").mkdir()
+    (folder / "policies/partner.onnx").touch()
+    read(folder, pair(trial=TWO + "substitute: sample:policies/partner.onnx\n"))
+    assert read_project(folder).trial.substitute == "sample:policies/partner.onnx"

@@ -1,0 +1,974 @@
+"""What the lobby promises its participants, on a platform in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from datetime import timedelta
+from typing import Any
+
+import pytest
+
+from hippodrome.lobby import decisions, rules
+from hippodrome.lobby import entries as folder
+from hippodrome.lobby.decisions import Ahead, Decisions
+from hippodrome.lobby.lobby import LobbyState, NoServerYet
+from hippodrome.model import ids, server, sessions
+from hippodrome.model.memberships import Membership
+from hippodrome.model.records import to_json
+from hippodrome.ports import Entry
+from protocol.keys import membership_key
+from testing.port_faults import Fault
+from tests.hippodrome.lobby.interleaved import Crossing
+from tests.hippodrome.lobby.waiting_room import WaitingRoom, pairs
+
+
+@pytest.fixture
+def room() -> WaitingRoom:
+    return WaitingRoom()
+
+
+def waits(told: LobbyState | NoServerYet | Membership) -> LobbyState:
+    assert isinstance(told, LobbyState), told
+    return told
+
+
+# Matched
+
+
+def test_two_who_are_there_play_together(room: WaitingRoom) -> None:
+    assert room.visit("ann") == LobbyState(1, 0.0, proposed=False)
+    room.wait(1)
+    assert room.visit("bob") == LobbyState(2, 0.0, proposed=True)
+    room.poll("ann", "bob", seconds=2)
+    assert room.together("ann", "bob")
+    assert room.entries() == [f"{room.session('ann').id}.done"]
+    assert room.started() == [room.session("ann").id]
+
+
+def test_what_is_done_leaves_the_document_with_the_next_write_and_then_its_mark_goes(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    assert room.document().labels() == {room.label("ann"), room.label("bob")}
+    room.poll("cem", "dan")
+    assert room.document().labels() == {room.label("cem"), room.label("dan")}
+    assert not [name for name in room.entries() if name.endswith(".done")]
+
+
+def test_the_sweep_drops_what_is_done(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    room.poll("cem", seconds=60)
+    room.lobby.repair(room.project)
+    assert room.document().labels() == frozenset()
+    assert room.entries() == []
+
+
+def test_seats_are_drawn_by_lot_so_that_who_came_first_is_not_always_the_same_player() -> None:
+    room = WaitingRoom()
+    for number in range(60):
+        room.visit(f"early{number}")
+        room.wait(1)
+        room.poll(f"late{number}", f"early{number}", seconds=4)
+    memberships = [room.membership(f"early{number}") for number in range(60)]
+    assert 12 < sum(one.seat for one in memberships if one) < 48  # one of some 10 million such rooms is beyond
+
+
+def test_a_membership_says_how_long_the_participant_had_waited(room: WaitingRoom) -> None:
+    room.visit("zoe")
+    room.wait(1)
+    room.poll("ann", "zoe", seconds=4)
+    zoe, ann = room.membership("zoe"), room.membership("ann")
+    assert zoe is not None
+    assert ann is not None
+    assert zoe.waited == pytest.approx((ann.waited or 0.0) + 1)
+
+
+def test_who_is_unmatched_has_waited_for_their_patience(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=room.project.patience + 4)
+    membership = room.membership("ann")
+    assert membership is not None
+    assert membership.waited == pytest.approx(room.project.patience, abs=2.1)
+
+
+@pytest.mark.parametrize("players", [2, 3, 5, 16])
+def test_a_session_never_has_more_members_than_players(players: int) -> None:
+    room = WaitingRoom(pairs(players=players))
+    users = [f"u{n}" for n in range(2 * players + 1)]
+    told = room.poll(*users, seconds=6)
+    memberships = [one for one in told.values() if isinstance(one, Membership)]
+    assert len(memberships) == 2 * players
+    for session_id in {one.session for one in memberships}:
+        assert sorted(one.seat for one in memberships if one.session == session_id) == list(range(players))
+    assert waits(told[users[-1]]).here == 1
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(1000, marks=pytest.mark.hunt)])
+def test_hundreds_who_join_at_once_are_all_in_pairs(count: int) -> None:
+    """Each of them lists all others, so the time grows with the square."""
+    room = WaitingRoom()
+    users = [f"u{n}" for n in range(count)]
+    told = room.poll(*users, seconds=6)
+    by_session: dict[str | None, list[str]] = {}
+    for user, membership in told.items():
+        assert isinstance(membership, Membership), user
+        by_session.setdefault(membership.session, []).append(user)
+    assert len(by_session) == count // 2
+    assert {len(users) for users in by_session.values()} == {2}
+
+
+@pytest.mark.parametrize(
+    ("matching", "groups", "answers", "together"),
+    [
+        ("group", {"a": 0, "b": 1, "c": 0, "d": 1}, {}, [{"a", "c"}, {"b", "d"}]),
+        ("mixed", {"a": 0, "b": 0, "c": 1, "d": 1}, {}, [{"a", "c"}, {"b", "d"}]),
+        (
+            {"same": "language"},
+            {},
+            {"a": {"language": "German"}, "b": {"language": "Urdu"}, "c": {"language": " german"}, "d": {"language": "urdu"}},
+            [{"a", "c"}, {"b", "d"}],
+        ),
+        (
+            {"different": "role"},
+            {},
+            {"a": {"role": "guide"}, "b": {"role": "guide"}, "c": {"role": "guest"}, "d": {}},
+            [{"a", "c"}, {"b", "d"}],
+        ),
+    ],
+)  # fmt: skip
+def test_matching_says_who_plays_with_whom(
+    matching: Any, groups: dict[str, int], answers: dict[str, Mapping[str, Any]], together: list[set[str]]
+) -> None:
+    room = WaitingRoom(pairs(matching=matching), groups=groups, answers=answers)
+    for user in "abcd":
+        room.visit(user)
+        room.wait(0.1)
+    room.poll(*"abcd", seconds=6)
+    assert [{m.user_id for m in room.session(user).members} for user in ("a", "b")] == together
+
+
+def test_those_who_do_not_fit_are_not_counted_as_there() -> None:
+    room = WaitingRoom(pairs(matching="group"), groups={"ann": 0, "bob": 1})
+    told = room.poll("ann", "bob", seconds=10)
+    assert [waits(state).here for state in told.values()] == [1, 1]
+
+
+def test_all_members_of_a_session_that_is_formed_are_counted_as_there(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    document, entries = room.document(), room.lobby._store.entries(room.project)
+    assert [each.id for each in document.formed] == [room.session("ann").id]
+    assert rules.here(document, entries, room.project, room.label("ann"), room.platform.now()) == 2
+
+
+def test_a_function_of_the_researchers_may_choose_the_groups() -> None:
+    """The rules take what it wishes, and choose none of their own."""
+    project = pairs(matching="match")
+    room = WaitingRoom(project)
+    room.poll("ann", "bob", "cem", seconds=4)
+    assert room.document().proposed == ()
+    entries = room.lobby._store.entries(project)
+    labels = {user: room.label(user) for user in ("ann", "bob", "cem")}
+    wished = [[labels["ann"], labels["cem"]], [labels["bob"], labels["cem"]], [labels["bob"]]]
+    now, open_for = room.platform.now(), sessions.open_for(project, room.platform.settings)
+    decided = rules.decide(Decisions(), entries, project, now, ids.new_session_id, open_for=open_for, wished=wished)
+    assert [set(each.labels) for each in decided.proposed] == [{labels["ann"], labels["cem"]}]
+
+
+# Ghosts
+
+
+def test_nobody_is_matched_who_has_not_asked_since_the_proposal(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.wait(2)
+    room.visit("bob")  # and closes the browser, which tells nobody
+    told = room.poll("ann", seconds=8)
+    assert waits(told["ann"]).proposed
+    assert room.membership("ann") is None
+    told = room.poll("ann", seconds=6)
+    assert not waits(told["ann"]).proposed
+    assert waits(told["ann"]).here == 1
+
+
+def test_the_request_that_proposes_confirms_nothing(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.visit("bob")
+    assert [name for name in room.entries() if ".yes." in name] == []
+
+
+def test_a_confirmation_is_of_one_proposal_though_the_server_ahead_goes_to_the_next(room: WaitingRoom) -> None:
+    """Ann confirms to be with Bob, who leaves; she is proposed again, with Cem and the same server, and asks no more."""
+    room.arrive_at_start("ann", "bob")
+    room.poll("ann", "bob")
+    room.wait(1)
+    room.visit("ann")  # confirms
+    room.lobby.leave(room.project, "bob")
+    room.wait(1)
+    room.visit("ann")
+    room.visit("cem")  # proposes the two
+    [proposal] = room.document().proposed
+    assert set(proposal.labels) == {room.label("ann"), room.label("cem")}
+    room.wait(1)
+    room.visit("cem")
+    assert room.membership("cem") is None
+    room.visit("ann")
+    assert room.together("ann", "cem")
+    assert room.session("ann").id == room.started()[0]
+
+
+def test_who_asked_last_before_ten_seconds_is_not_there(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.wait(10)
+    assert waits(room.visit("bob")).here == 1
+    assert not waits(room.visit("bob")).proposed
+
+
+@pytest.mark.parametrize("ahead", [-6, -2, 2, 6, 60])
+def test_people_meet_though_the_storages_clock_is_off(
+    room: WaitingRoom, ahead: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LastModified is of S3's clock, and is compared with the function's (docs/unproven.md)."""
+    listed = room.platform.documents.list
+
+    def elsewhere(prefix: str) -> Iterator[Entry]:
+        off = timedelta(seconds=ahead)
+        return (entry._replace(modified=entry.modified + off) for entry in list(listed(prefix)))
+
+    monkeypatch.setattr(room.platform.documents, "list", elsewhere)
+    room.poll("ann", seconds=10)
+    room.poll("ann", "bob", seconds=6)
+    assert room.together("ann", "bob")
+
+
+def test_a_member_is_not_matched_again_when_a_request_of_a_second_tab_is_late() -> None:
+    crossing = Crossing()
+    late = crossing.visit("ann")
+    while not crossing.platform.made or not crossing.platform.made[-1].startswith("list"):
+        crossing.advance(late)  # it has read that nobody is there, and will write that ann is
+    for user in ("ann", "bob", "ann", "bob", "ann"):
+        crossing.platform.wait(seconds=1)
+        crossing.finish(crossing.visit(user))
+    assert {m["userId"] for m in next(iter(crossing.sessions().values()))["members"]} == {"ann", "bob"}
+    crossing.finish(late)
+    for _ in range(20):
+        crossing.platform.wait(seconds=1)
+        for user in ("cem", "dan"):
+            crossing.finish(crossing.visit(user))
+    assert crossing.wrong(["ann", "bob", "cem", "dan"], at_rest=True) == []
+    assert {m["userId"] for m in crossing.sessions()[crossing.membership("cem")["session"]]["members"]} == {
+        "cem",
+        "dan",
+    }
+
+
+def test_a_member_who_is_back_by_a_late_request_is_not_formed_even_if_they_seem_to_confirm(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    first = room.session("ann")
+    room.lobby.repair(room.project)  # the document has forgotten her
+    one = folder.Waiting(room.label("ann"), folder.milliseconds(room.platform.now()), "-", room.platform.now())
+    room.platform.documents.put(folder.waiting_key("maze", one), folder.body(folder.Person("ann")))
+    room.visit("cem")
+    [proposal] = room.document().proposed
+    room.platform.documents.put(folder.confirmation_key("maze", room.label("ann"), proposal.id), b"")
+    told = room.poll("cem", seconds=4)
+    assert isinstance(told["cem"], LobbyState)
+    assert room.session("ann") == first
+    assert room.membership("cem") is None
+
+
+# Leaving, coming back
+
+
+def test_who_closes_the_page_is_gone_at_once(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.lobby.leave(room.project, "ann")
+    assert waits(room.visit("bob")).here == 1
+    assert not waits(room.visit("bob")).proposed
+
+
+def test_a_proposal_falls_apart_at_once_when_one_leaves(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", "cem")
+    assert set(room.document().proposed[0].labels) == {room.label("ann"), room.label("bob")}
+    room.lobby.leave(room.project, "bob")
+    room.wait(1)
+    room.poll("ann", "cem", seconds=4)
+    assert room.together("ann", "cem")
+
+
+def test_a_reload_keeps_the_time_at_which_they_came(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=20)
+    room.lobby.leave(room.project, "ann")
+    room.wait(1)
+    assert waits(room.visit("ann")).seconds == 21
+
+
+def test_the_message_of_a_reload_may_come_after_the_new_page(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=20)
+    room.visit("ann")
+    room.lobby.leave(room.project, "ann")
+    room.wait(2)
+    assert waits(room.visit("ann")).seconds == 22
+    assert waits(room.visit("bob")).here == 2
+
+
+def test_of_two_tabs_one_may_be_closed(room: WaitingRoom) -> None:
+    room.poll("ann", "ann", seconds=10)
+    room.lobby.leave(room.project, "ann")
+    told = room.poll("ann", "bob", seconds=6)
+    assert room.together("ann", "bob"), told
+
+
+def test_who_comes_back_later_begins_anew(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=20)
+    room.lobby.leave(room.project, "ann")
+    room.wait(11)
+    assert waits(room.visit("ann")).seconds == 0
+
+
+def test_who_was_away_without_a_word_begins_anew_after_half_a_minute(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=10)
+    room.wait(29)
+    assert waits(room.visit("ann")).seconds == 39
+    room.wait(31)
+    assert waits(room.visit("ann")).seconds == 0
+
+
+def test_all_leave_at_once(room: WaitingRoom) -> None:
+    users = [f"u{n}" for n in range(7)]
+    room.poll(*users)
+    for user in users:
+        room.lobby.leave(room.project, user)
+    room.wait(61)
+    room.lobby.repair(room.project)
+    room.wait(61)
+    room.lobby.repair(room.project)
+    assert room.entries() == []
+    assert room.document().labels() == frozenset()
+    assert room.document().open == ()
+    assert [room.membership(user) for user in users] == [None] * 7
+
+
+def test_leaving_means_nothing_to_one_who_is_not_there(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    before = dict(room.platform.documents.kept)
+    for user in ("ann", "nobody"):
+        room.lobby.leave(room.project, user)
+    assert room.platform.documents.kept == before
+
+
+# One participant, several pages
+
+
+def test_two_tabs_are_one_participant(room: WaitingRoom) -> None:
+    told = room.poll("ann", "ann", "ann", seconds=20)
+    assert waits(told["ann"]).here == 1
+    assert len(room.entries()) == 1
+
+
+def test_two_tabs_that_open_at_once_are_one_participant_too() -> None:
+    crossing = Crossing()
+    tabs = [crossing.visit("ann"), crossing.visit("ann")]
+    while tabs[0].calls < 3 or tabs[1].calls < 3:
+        for tab in tabs:
+            crossing.advance(tab)
+        crossing.platform.wait(seconds=0.01)
+    for tab in tabs:
+        crossing.finish(tab)
+    crossing.platform.wait(seconds=2)
+    told = crossing.finish(crossing.visit("ann")).result
+    assert (told.here, told.proposed) == (1, False)
+    assert len([key for key in crossing.platform.documents.kept if key.startswith("_lobby/")]) == 1
+
+
+def test_two_game_steps_have_one_lobby_and_one_session(room: WaitingRoom) -> None:
+    """The lobby is the project's: who polls at two steps is there once, and plays both in one session."""
+    room.poll("ann", "ann", "bob", seconds=6)
+    assert room.together("ann", "bob")
+    assert room.visit("ann") == room.membership("ann")
+
+
+def test_whoever_asks_again_gets_the_same_membership_for_ever(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    before = dict(room.platform.documents.kept)
+    for _ in range(3):
+        room.poll("ann", "bob", "ann", seconds=4)
+        room.wait(3600)
+    assert room.platform.documents.kept == before
+
+
+# Patience
+
+
+def test_patience_ends_to_the_second(room: WaitingRoom) -> None:
+    told = room.poll("ann", seconds=58)
+    assert waits(told["ann"]).seconds == 58
+    room.wait(2)
+    told = room.poll("ann")
+    assert isinstance(told["ann"], Membership)
+    assert told["ann"].unmatched
+    assert room.stored("users/ann/answers/3.json")["answers"] == {"outcome": "unmatched"}
+    assert room.entries() == [f"{room.label('ann')}.done"]
+
+
+def test_nobody_is_matched_after_the_end_of_patience_however_late_the_page_asks(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=58)
+    room.wait(3)  # the patience of ann is over; her page has not asked since
+    told = room.poll("bob", seconds=4)
+    assert waits(told["bob"]).here == 1
+    told = room.poll("ann", "bob")
+    assert told["ann"] == room.membership("ann")
+    assert isinstance(told["bob"], LobbyState)
+
+
+def test_a_proposal_made_in_time_holds_beyond_the_end_of_patience(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=58)
+    room.wait(1)
+    room.visit("bob")
+    room.wait(1.5)
+    room.poll("ann", "bob", seconds=2)
+    assert room.together("ann", "bob")
+
+
+def test_all_game_steps_of_the_unmatched_have_an_answer() -> None:
+    steps = [*pairs().steps[:4], pairs().steps[2].__class__("5", "game"), pairs().steps[4]]
+    room = WaitingRoom(pairs(steps=steps, patience=10))
+    room.poll("ann", seconds=10)
+    assert [room.stored(f"users/ann/answers/{step}.json")["answers"] for step in ("3", "5")] == [
+        {"outcome": "unmatched"}
+    ] * 2
+
+
+def test_an_answer_that_was_lost_is_written_when_they_ask_again(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=60)
+    room.platform.documents.delete("maze/users/ann/answers/3.json")
+    room.visit("ann")
+    assert room.stored("users/ann/answers/3.json")["answers"] == {"outcome": "unmatched"}
+
+
+def test_a_lobby_of_one_for_an_hour() -> None:
+    room = WaitingRoom(pairs(patience=3600))
+    told = room.poll("ann", seconds=3598)
+    assert waits(told["ann"]) == LobbyState(1, 3598.0, proposed=False)
+    room.wait(2)
+    room.visit("ann")
+    membership = room.membership("ann")
+    assert membership is not None
+    assert membership.unmatched
+
+
+@pytest.mark.parametrize("there", [1, 2, 3])
+def test_with_policies_they_play_with_those_who_are_there(there: int) -> None:
+    room = WaitingRoom(pairs(players=4, after_patience="policies", patience=20))
+    users = ["ann", "bob", "cem"][:there]
+    room.visit("ann")
+    room.wait(1)
+    told = room.poll(*users, seconds=24)
+    assert room.together(*users), told
+    assert room.session("ann").players == 4
+
+
+# Hostile or broken clients
+
+
+def test_a_page_that_asks_a_hundred_times_a_second_writes_once_a_second(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.platform.documents.calls.clear()
+    for _ in range(500):
+        room.wait(0.01)
+        room.visit("ann")
+    assert 4 <= room.platform.documents.calls.count("put") <= 5
+
+
+def test_while_a_proposal_waits_for_the_other_a_page_that_asks_often_writes_once(room: WaitingRoom) -> None:
+    room.poll("ann", "bob")
+    room.platform.documents.calls.clear()
+    for _ in range(500):
+        room.wait(0.01)
+        room.visit("ann")
+    assert room.platform.documents.calls.count("put") == 1
+
+
+@pytest.mark.parametrize("name", ["x", "..", "sxx.1.-", "s" + "a" * 20 + ".way.way", "s" + "a" * 20 + ".yes.s.0", ""])
+def test_strange_entries_in_the_folder_are_left_alone(room: WaitingRoom, name: str) -> None:
+    room.platform.documents.put(folder.folder("maze") + name, b"[")
+    room.poll("ann", "bob", seconds=4)
+    assert room.together("ann", "bob")
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"userId": 7}', b'{"userId": "../../x"}', b'{"userId": "bob"}'])
+def test_an_entry_whose_document_says_nothing_is_matched_with_nobody(room: WaitingRoom, body: bytes) -> None:
+    label = room.label("ghost")
+    one = folder.Waiting(label, folder.milliseconds(room.platform.now()), "-", room.platform.now())
+    room.platform.documents.put(folder.waiting_key("maze", one), body)
+    room.visit("ann")
+    [proposal] = room.document().proposed
+    room.platform.documents.put(folder.confirmation_key("maze", label, proposal.id), b"")
+    room.poll("ann", "cem", seconds=20)
+    assert room.together("ann", "cem")
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"proposed": 7}', b"[" * 100_000])
+def test_a_document_that_cannot_be_read_is_made_anew(body: bytes) -> None:
+    room = WaitingRoom(pairs(patience=300))
+    room.visit("ann")
+    room.platform.documents.put(decisions.key("maze"), body)
+    room.poll("ann", "bob", seconds=6)
+    assert room.document().proposed == (), "a session may be half written, of which the document says nothing any more"
+    room.poll("ann", "bob", seconds=52)
+    room.lobby.repair(room.project)
+    assert room.document().renewed is not None, "not yet: a request that writes a session may still run"
+    room.poll("ann", "bob", seconds=4)
+    room.lobby.repair(room.project)
+    room.serve(*room.started())
+    room.poll("ann", "bob", seconds=6)
+    assert room.together("ann", "bob")
+
+
+def test_a_session_that_was_half_written_when_the_document_was_lost_is_finished(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    found = room.session("ann")
+    room.platform.documents.delete(membership_key("maze", "bob"))
+    room.platform.documents.put(decisions.key("maze"), b"{")
+    room.poll("bob", "cem", seconds=62)
+    assert room.membership("bob") is None
+    room.lobby.repair(room.project)
+    assert room.together("ann", "bob")
+    assert room.session("bob") == found
+
+
+def test_nobody_is_unmatched_before_a_lost_document_is_whole_again(room: WaitingRoom) -> None:
+    room.visit("ann")
+    room.platform.documents.put(decisions.key("maze"), b"{")
+    room.poll("ann", seconds=70)
+    assert room.membership("ann") is None
+    room.lobby.repair(room.project)
+    room.poll("ann", seconds=2)
+    membership = room.membership("ann")
+    assert membership is not None
+    assert membership.unmatched
+
+
+def test_each_version_of_the_document_has_other_bytes() -> None:
+    """Else a function that read an earlier one could overwrite a later one, since an ETag is a hash of the content."""
+    crossing, written = Crossing(), list[bytes]()
+    documents = crossing.platform.documents
+    keep = documents._write
+
+    def write(key: str, body: bytes) -> str:
+        if key == decisions.key("maze"):
+            written.append(body)
+        return keep(key, body)
+
+    documents._write = write  # type: ignore[method-assign]
+    for lap in range(3):
+        for user in (f"ann{lap}", f"bob{lap}") * 3:
+            crossing.platform.wait(seconds=1)
+            crossing.finish(crossing.visit(user))
+        crossing.finish(crossing.repair())
+    assert len(written) == len(set(written)) == 9
+    assert crossing.decisions() == {"version": 9}
+
+
+# Servers that are started ahead
+
+
+def test_a_server_is_started_for_every_two_who_are_under_way(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", "cem")
+    assert len(room.started()) == 2
+    assert {each.id for each in room.document().open} == set(room.started())
+
+
+def test_the_pair_gets_the_server_that_was_started_first(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    room.wait(30)
+    room.arrive_at_start("bob", "cem")
+    first = room.started()[0]
+    room.poll("ann", "bob", seconds=4)
+    assert room.session("ann").id == first
+    assert room.started().count(first) == 1
+
+
+def test_the_pair_gets_a_server_that_is_ready_though_another_was_started_first(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    room.wait(30)
+    room.arrive_at_start("bob", "cem")
+    first, second = room.started()
+    room.serve(first, state=server.State.NAMING)
+    room.poll("ann", "bob", seconds=4)
+    assert room.session("ann").id == second
+    assert [each.id for each in room.document().open] == [first]
+
+
+def test_a_pair_whose_server_is_not_ready_is_formed_and_waits_for_the_first_that_is(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    room.wait(1)
+    room.arrive_at_start("cem", ready=False)
+    first, second = room.started()
+    room.serve(first, second, state=server.State.STARTING)
+    told = room.poll("ann", "bob", seconds=4)
+    assert told["ann"] == NoServerYet(first, 2, room.repository.server_of("maze", first))
+    assert (room.membership("ann"), room.stored(f"sessions/{first}/session.json")) == (None, None)
+    assert [name for name in room.entries() if not name.endswith(".way")] == [], "they need no entries any more"
+    room.serve(second)
+    room.poll("ann", "bob")
+    assert room.together("ann", "bob")
+    assert room.session("ann").id == second
+
+
+def test_of_two_pairs_the_first_gets_the_server_that_is_ready_first(room: WaitingRoom) -> None:
+    """The server of the second pair is ready. Its members ask, and the first pair has it."""
+    room.arrive_at_start("ann", "bob", ready=False)
+    room.wait(1)
+    room.arrive_at_start("cem", "dan", ready=False)
+    first, second = room.started()
+    room.serve(first, second, state=server.State.STARTING)
+    room.poll("ann", "bob", seconds=4)
+    room.poll("cem", "dan", seconds=4)
+    room.serve(second)
+    assert isinstance(room.visit("dan"), NoServerYet)
+    assert room.together("ann", "bob")
+    assert room.session("ann").id == second
+    room.serve(first)
+    room.poll("cem", "dan")
+    assert room.together("cem", "dan")
+    assert room.session("cem").id == first
+    assert room.started() == [first, second], "no server more is started"
+
+
+def test_a_pair_whose_server_has_ended_keeps_it_and_is_told(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    [first] = room.started()
+    room.serve(first, state=server.State.CLOSED, reason=server.Reason.REFUSED)
+    room.poll("ann", "bob", seconds=4)
+    assert room.session("ann").id == first
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["first", "second"])
+def test_a_pair_whose_server_has_ended_waits_for_another_that_starts(room: WaitingRoom, which: int) -> None:
+    for users in (("ann", "bob"), ("cem", "dan"), ("eve",)):
+        room.arrive_at_start(*users, ready=False)
+        room.wait(1)
+    servers = room.started()
+    room.serve(*servers, state=server.State.STARTING)
+    room.serve(servers[which], state=server.State.CLOSED, reason=server.Reason.FULL)
+    room.poll("ann", "bob", seconds=4)
+    room.poll("cem", "dan", seconds=4)
+    told = room.poll("ann", "bob", "cem", "dan")
+    assert all(isinstance(one, NoServerYet) for one in told.values())
+    others = [each for each in servers if each != servers[which]]
+    room.serve(*others)
+    room.poll("ann", "bob", "cem", "dan")
+    assert {room.session("ann").id, room.session("cem").id} == set(others)
+
+
+def test_a_pair_whose_server_has_ended_gets_one_that_is_ready_however_many_others_have_ended(room: WaitingRoom) -> None:
+    for number in range(8):
+        room.arrive_at_start(f"ann{number}", f"bob{number}", ready=False)
+        room.wait(1)
+    *ended, last = room.started()
+    room.serve(*ended, state=server.State.CLOSED, reason=server.Reason.FULL)
+    room.serve(last)
+    room.poll("ann0", "bob0", seconds=4)
+    assert room.session("ann0").id == last
+
+
+def test_a_group_gets_no_server_that_was_started_for_another_number_of_players(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob")
+    [before] = room.started()
+    room.project = pairs(players=3)
+    room.poll("ann", "bob", "cem", seconds=4)
+    assert room.together("ann", "bob", "cem")
+    assert room.session("ann").id != before
+    room.lobby.repair(room.project)
+    assert room.stopped() == [before]
+
+
+def test_a_group_that_was_proposed_before_the_number_of_players_changed_is_not_formed(room: WaitingRoom) -> None:
+    room.poll("ann", "bob")
+    room.project = pairs(players=3)
+    room.wait(2)
+    room.poll("ann", "bob", seconds=4)
+    assert room.stored("users/ann/session.json") is None
+    room.poll("ann", "bob", "cem", seconds=4)
+    assert room.together("ann", "bob", "cem")
+
+
+def test_a_pair_that_waits_for_its_server_stays_a_pair_when_the_number_of_players_changes(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    room.serve(*room.started(), state=server.State.STARTING)
+    room.poll("ann", "bob", seconds=4)
+    room.project = pairs(players=3)
+    room.serve(*room.started())
+    room.poll("ann", "bob")
+    assert room.together("ann", "bob")
+    assert room.session("ann").players == 2, "as its server was told"
+
+
+def test_a_pair_whose_server_is_lost_and_replaced_waits_for_it(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    [first] = room.started()
+    room.serve(first, state=server.State.CLOSED, reason=server.Reason.LOST)
+    told = room.poll("ann", "bob", seconds=4)
+    assert isinstance(told["ann"], NoServerYet)
+
+
+def test_after_five_minutes_a_pair_keeps_the_server_it_was_given(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    [first] = room.started()
+    room.serve(first, state=server.State.STARTING)
+    room.poll("ann", "bob", seconds=298)
+    assert room.membership("ann") is None
+    room.poll("ann", "bob", seconds=6)
+    assert room.session("ann").id == first
+
+
+def test_the_sweep_gives_ready_servers_to_pairs_that_ask_no_more(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    [first] = room.started()
+    room.serve(first, state=server.State.STARTING)
+    room.poll("ann", "bob", seconds=4)
+    room.serve(first)
+    room.lobby.repair(room.project)
+    assert room.together("ann", "bob")
+
+
+def test_a_start_message_that_comes_late_leaves_nobody_under_way_who_waits_for_a_server(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    room.serve(*room.started(), state=server.State.STARTING)
+    room.poll("ann", "bob", seconds=4)
+    room.arrive_at_start("ann", ready=False)
+    assert room.entries() == []
+
+
+def test_a_server_that_has_no_record_yet_is_asked_for_again_when_the_session_is_formed(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", "bob", ready=False)
+    room.platform.bus.sent.clear()  # the message was lost
+    room.poll("ann", "bob", seconds=4)
+    assert room.started() == [each.id for each in room.document().formed]
+    room.poll("ann", "bob", seconds=4)
+    assert len(room.started()) == 1, "once"
+
+
+def test_a_repeated_start_message_starts_nothing_more(room: WaitingRoom) -> None:
+    for _ in range(3):
+        room.arrive_at_start("ann")
+        room.wait(5)
+    assert len(set(room.started())) == 1
+    assert len(room.document().open) == 1
+
+
+def test_a_start_message_an_hour_late_changes_nothing(room: WaitingRoom) -> None:
+    room.poll("ann", "bob", seconds=4)
+    room.wait(3600)
+    before = (dict(room.platform.documents.kept), list(room.platform.bus.sent))
+    room.arrive_at_start("ann", "bob", ready=False)
+    assert (room.platform.documents.kept, room.platform.bus.sent) == before
+
+
+def test_no_more_servers_are_started_ahead_than_may_run_however_many_are_under_way() -> None:
+    """Else each sweep would ask anew for all that found no slot."""
+    room = WaitingRoom(pairs(max_servers=3))
+    for number in range(40):
+        room.arrive_at_start(f"p{number}", ready=False)
+    first = room.started()
+    assert len(set(first)) == len(room.document().open) == 3
+    room.serve(*first, state=server.State.CLOSED, reason=server.Reason.FULL, closed=room.platform.now())
+    room.wait(300)
+    room.lobby.repair(room.project)
+    assert len(set(room.started())) == 6
+
+
+def test_who_has_played_is_not_under_way(room: WaitingRoom) -> None:
+    room.platform.documents.put("maze/users/ann/answers/3.json", b"{}")
+    room.arrive_at_start("ann")
+    assert room.entries() == []
+    assert room.started() == []
+
+
+def test_a_start_message_of_one_who_waits_changes_nothing(room: WaitingRoom) -> None:
+    room.visit("ann")
+    before = room.entries()
+    room.arrive_at_start("ann")
+    assert room.entries() == before
+
+
+def test_the_unmatched_are_not_under_way(room: WaitingRoom) -> None:
+    room.poll("ann", seconds=60)
+    room.arrive_at_start("ann")
+    assert room.started() == []
+
+
+def test_servers_that_nobody_needs_are_stopped_by_the_sweep(room: WaitingRoom) -> None:
+    for user in ("ann", "bob", "cem", "dan", "eve"):
+        room.arrive_at_start(user)
+        room.wait(1)
+    assert len(room.document().open) == 3
+    for user in ("cem", "dan", "eve"):
+        room.lobby.forget(room.project, user)
+    listed = room.lobby.repair(room.project)
+    assert len(room.document().open) == 1
+    assert set(listed) == {room.started()[0]}
+    assert sorted(room.stopped()) == sorted(set(room.started()) - set(listed))
+
+
+def test_a_server_that_waited_too_long_is_replaced_by_the_sweep(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    [first] = room.started()
+    room.wait(sessions.open_for(room.project, room.platform.settings).total_seconds() - 1)
+    room.arrive_at_start("bob")
+    assert room.lobby.repair(room.project) == {first}
+    room.wait(1)
+    [second] = room.lobby.repair(room.project)
+    assert second != first
+    assert room.stopped() == [first]
+    assert room.started()[-1] == second
+
+
+def test_a_pair_does_not_get_a_server_that_waited_too_long(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    [first] = room.started()
+    room.wait(sessions.open_for(room.project, room.platform.settings).total_seconds())
+    room.poll("ann", "bob", seconds=4)
+    assert room.session("ann").id != first
+
+
+@pytest.mark.parametrize("max_runtime", [5, 60, 1440])
+def test_who_never_arrives_costs_one_server_that_waits_for_half_an_hour_at_most(max_runtime: int) -> None:
+    room = WaitingRoom(pairs(max_runtime=max_runtime))
+    room.arrive_at_start("ann")
+    for _ in range(12 * 25):  # a sweep every five minutes, for longer than any game
+        room.wait(300)
+        room.lobby.repair(room.project)
+        put_record(room, room.started()[0])
+    assert len(set(room.started())) == 1
+    assert room.stopped() == room.started()[:1]
+    assert room.entries() == []
+    assert room.document().open == ()
+
+
+def test_the_server_of_one_who_never_arrives_is_stopped_when_it_can_no_longer_be_used(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    room.wait(sessions.open_for(room.project, room.platform.settings).total_seconds())
+    assert list(room.lobby.repair(room.project)) == []
+    assert room.stopped() == room.started()[:1]
+
+
+def test_an_open_server_without_a_record_is_asked_for_again_by_the_sweep(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann", ready=False)
+    room.platform.bus.sent.clear()
+    room.wait(170)
+    room.lobby.repair(room.project)
+    assert room.started() == []
+    room.wait(11)
+    assert room.started() == []
+    assert list(room.lobby.repair(room.project)) == room.started()
+
+
+def test_an_open_server_that_has_ended_is_replaced_by_the_sweep(room: WaitingRoom) -> None:
+    room.arrive_at_start("ann")
+    [first] = room.started()
+    put_record(room, first, closed=True)
+    room.wait(181)
+    assert first not in room.lobby.repair(room.project)
+    assert len(room.document().open) == 1
+
+
+def put_record(room: WaitingRoom, session_id: str, *, closed: bool = False) -> None:
+    """The session's server as `start_server` writes it."""
+    platform = room.platform
+    made = server.new_attempt(room.project, session_id, 1, settings=platform.settings, now=platform.now())
+    if closed:
+        made = server.close(made, server.Reason.REFUSED, platform.now())
+    platform.documents.put(server.key(made.label), to_json(made))
+
+
+# Erasure
+
+
+def test_nothing_of_one_who_is_erased_stays_in_the_document() -> None:
+    member = decisions.Matched
+    now = WaitingRoom().platform.now()
+    document = Decisions(
+        open=(Ahead("s.1", now, "ann"),),
+        proposed=(
+            decisions.Proposal("s.2", ("ann", "bob"), now, Ahead("s.2", now)),
+            decisions.Proposal("s.4", ("dan", "eve"), now, Ahead("s.4", now, "ann")),
+        ),
+        formed=(decisions.Formed("s.3", (member("ann", "Ann"), member("cem", "Cem")), now),),
+        unmatched=(decisions.Unmatched("ann", "Ann", now),),
+    )
+    left = rules.without(document, "ann")
+    assert "nn" not in to_json(left).decode()
+    assert [member.user_id for member in left.formed[0].members] == ["", "Cem"]
+    assert {each.id for each in left.open} == {"s.1", "s.2"}
+    assert [each.labels for each in left.proposed] == [("dan", "eve")]
+
+
+# Calls
+
+
+def calls(room: WaitingRoom) -> dict[str, int]:
+    made = list(room.platform.documents.calls)
+    room.platform.documents.calls.clear()
+    return {name: made.count(name) for name in sorted(set(made))}
+
+
+def test_what_a_request_in_the_lobby_costs(room: WaitingRoom) -> None:
+    room.visit("ann")
+    calls(room)
+    room.wait(2)
+    room.visit("ann")
+    assert calls(room) == {"get": 2, "list": 1, "put": 1}  # the membership, the document; the folder; that she is there
+
+
+def test_what_a_pair_costs_from_the_lobby_to_its_memberships(room: WaitingRoom) -> None:
+    room.visit("ann")
+    assert calls(room) == {"get": 2, "list": 1, "put": 1}
+    room.wait(1)
+    room.visit("bob")  # and proposes: the document is read again, and written
+    assert calls(room) == {"get": 3, "list": 1, "put": 2}
+    room.wait(1)
+    room.visit("ann")  # confirms, and lists again
+    assert calls(room) == {"get": 2, "list": 2, "put": 1}
+    room.visit("bob")  # confirms, forms, and writes session and memberships
+    # two reads for each member; the document; a yes, the session, two memberships and the mark; four entries go
+    assert calls(room) == {"delete": 4, "get": 2 + 4 + 1, "list": 2, "put": 1 + 5}
+    room.wait(1)
+    room.visit("ann")
+    assert calls(room) == {"get": 1}
+
+
+def test_a_crowd_costs_one_request_no_more_than_a_few_documents() -> None:
+    room = WaitingRoom()
+    for number in range(300):
+        room.visit(f"u{number}")
+    calls(room)
+    room.wait(2)
+    room.visit("u0")
+    made = calls(room)
+    assert made["get"] <= 4
+    assert made["put"] <= 2
+
+
+def test_a_lost_reply_of_the_document_does_not_propose_twice() -> None:
+    crossing = Crossing()
+    crossing.finish(crossing.visit("ann"))
+    crossing.platform.wait(seconds=1)
+    before = len(crossing.platform.made)
+    crossing.finish(crossing.visit("bob"), Fault.REPLY, at=6)
+    assert crossing.platform.made[before + 5] == f"create {decisions.key('maze')}", "this call's reply is lost"
+    assert len(crossing.decisions()["proposed"]) == 1
+
+
+@pytest.mark.parametrize(("seconds", "is_formed"), [(1, False), (5, True)], ids=["a moment ago", "long ago"])
+def test_a_group_whose_own_requests_could_not_write_is_formed_by_others_after_a_while_and_carried_out_by_its_members(
+    room: WaitingRoom, seconds: float, is_formed: bool
+) -> None:
+    """In a crowd the document changes so fast that most writes meet another: then each one decides on several."""
+    room.poll("ann", "bob", "ann")  # bob's request proposes them
+    (proposal,) = room.document().proposed
+    for user in ("ann", "bob"):
+        room.platform.documents.put(folder.confirmation_key(room.project.id, room.label(user), proposal.id), b"")
+    room.wait(seconds)
+    room.visit("cem")
+    assert bool(room.document().formed) is is_formed
+    assert room.membership("ann") is None
+    if is_formed:
+        room.visit("ann")
+        assert room.together("ann", "bob")

@@ -1,0 +1,301 @@
+"""The game step of a study for several players, through `next_step`: lobby, session, unmatched."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import pytest
+
+from hippodrome.lobby import entries as folder
+from hippodrome.model import ids, server
+from hippodrome.model.messages import StartServer
+from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
+from hippodrome.model.records import to_json
+from hippodrome.ports import Address, Topic
+from hippodrome.storage.repository import Repository
+from hippodrome.storage.secret import SecretCache
+from lambdas import installed as place
+from lambdas import next_step
+from protocol.keys import answer_key
+from protocol.session import member_token
+from testing.aws_events import FORM, http_event
+from testing.fake_platform import FakePlatform
+from testing.servers import Servers
+from testing.studies import installed, study
+from testing.visitors import Browser, hidden
+
+STUDY: dict[str, Any] = {"players": 2, "patience": 60, "trial": {"game": "x", "players": {"a": "human", "b": "human"}}}
+NOTHING: list[str] = []
+
+
+@pytest.fixture
+def project() -> Project:
+    return study(**STUDY)
+
+
+@pytest.fixture
+def platform(project: Project) -> Iterator[FakePlatform]:
+    yield installed(project)
+    place.use(None)
+
+
+class Player(Browser):
+    """A participant's browser at the game step: its page, and what its polls are told."""
+
+    def __init__(self, platform: FakePlatform, user: str, query: str = "") -> None:
+        super().__init__(platform, f"projectId=maze&userId={user}{query}")
+        self.user = user
+
+    def to_game(self) -> Player:
+        self.answer(self.get(), consent="yes")
+        self.answer(self.get(), age="33")
+        return self
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What the page hands to its script."""
+        found = re.search(r'<script type="application/json"[^>]*>(.*?)</script>', self.get(), re.DOTALL)
+        assert found
+        return dict(json.loads(found[1]))
+
+    def poll(self, address: str | None = None) -> dict[str, Any]:
+        """What the page's poll address answers."""
+        query = urlsplit(address or self.data["poll"]).query
+        answer = next_step.handler(http_event("GET", query, None, headers={"accept": "application/json"}), None)
+        return {"status": answer["statusCode"], **json.loads(answer["body"])}
+
+    def close(self, page: str, **changes: str) -> int:
+        """What the page sends when it is closed; the status of the answer."""
+        fields = {**hidden(page), "hippodrome-action": "leave", **changes}
+        body = "&".join(f"{name}={value}" for name, value in fields.items())
+        return int(self.send("POST", body, content_type=FORM)["statusCode"])
+
+
+def waiting(platform: FakePlatform) -> list[str]:
+    return [key for key in platform.documents.kept if key.startswith(folder.FOLDER)]
+
+
+def matched(platform: FakePlatform, *players: Player) -> list[dict[str, Any]]:
+    """Their polls, when they are in a session."""
+    addresses = [player.data["poll"] for player in players]
+    for _ in range(4):
+        platform.wait(seconds=2)
+        told = [player.poll(address) for player, address in zip(players, addresses, strict=True)]
+    assert {one["state"] for one in told} == {"queued"}
+    return told
+
+
+def serve(platform: FakePlatform) -> str:
+    """Start the server of the one session, up to ready. Its token."""
+    [sid] = {m["userId"] for topic, m in platform.bus.sent if topic is Topic.START and m["userId"].startswith("s.")}
+    Servers(platform).start(StartServer("maze", sid))
+    repository = Repository(platform.documents)
+    stored = repository.server(ids.server_label("maze", sid))
+    assert stored
+    named = server.naming(stored.server, "task", Address("203.0.113.9", 5000), platform.now())
+    platform.documents.put(server.key(stored.server.label), to_json(server.ready(named, platform.now())))
+    return SecretCache(platform.documents).token(named)
+
+
+def test_the_lobby_tells_how_many_are_there_and_what_happens_at_the_end(platform: FakePlatform) -> None:
+    ann = Player(platform, "ann").to_game()
+    state = ann.data["state"]
+    assert state["state"] == "lobby"
+    assert {key: state[key] for key in ("players", "here", "seconds", "patience", "then", "proposed")} == {
+        "players": 2, "here": 1, "seconds": 0, "patience": 60, "then": "unmatched", "proposed": False,
+    }  # fmt: skip
+    assert (state["userId"], state["step"]) == ("ann", "3")
+    platform.wait(seconds=7)
+    assert ann.poll()["seconds"] == 7
+    bob = Player(platform, "bob").to_game()
+    bob.get()
+    assert ann.poll()["here"] == 2
+
+
+def test_a_pair_gets_one_server_and_each_a_token_of_their_own(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    token = serve(platform)
+    told = {player.user: player.poll() for player in (ann, bob)}
+    assert {one["url"] for one in told.values()} == {told["ann"]["url"]}
+    for user, state in told.items():
+        assert (state["state"], state["session"], state["players"], state["members"]) == ("ready", True, 2, 2)
+        assert state["token"] == member_token(token, user)
+    pages = ann.get() + bob.get()
+    assert token not in pages
+    assert token not in json.dumps(told)
+
+
+def test_who_is_not_matched_goes_on_and_their_pages_can_tell(platform: FakePlatform, project: Project) -> None:
+    said = b"{% if participant.unmatched %}alone{% else %}together {{ participant.members }}{% endif %} {{ completion_code }}"
+    for page in ("survey", "debrief"):
+        platform.documents.put(step_key("maze", page), said)
+    ann = Player(platform, "ann").to_game()
+    address = ann.data["poll"]
+    for _ in range(29):
+        platform.wait(seconds=2)
+        assert ann.poll(address)["state"] == "lobby"
+    platform.wait(seconds=2)
+    assert ann.poll(address)["state"] == "unmatched"
+    page = ann.get()
+    other = ids.completion_code(project.secret, "ann", "unmatched")
+    assert f"alone {other}" in page
+    assert ids.completion_code(project.secret, "ann") not in page
+    stored = json.loads(platform.documents.kept["maze/users/ann/answers/3.json"][0])
+    assert stored["answers"] == {"outcome": "unmatched"}
+    membership = json.loads(platform.documents.kept["maze/users/ann/session.json"][0])
+    assert (membership["session"], membership["unmatched"], membership["completionCode"]) == (None, True, other)
+    assert ann.poll(address)["state"] == "unmatched"  # a second tab
+
+
+def test_opening_the_link_at_the_end_of_patience_shows_the_next_step_at_once(platform: FakePlatform) -> None:
+    ann = Player(platform, "ann").to_game()
+    address = ann.data["poll"]
+    for _ in range(29):
+        platform.wait(seconds=2)
+        ann.poll(address)
+    platform.wait(seconds=3)
+    assert "<textarea" in ann.get()
+
+
+def test_members_of_a_session_are_not_unmatched(platform: FakePlatform) -> None:
+    platform.documents.put(step_key("maze", "survey"), b"{{ participant.unmatched }} {{ participant.members }}")
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    platform.documents.put("maze/users/ann/answers/3.json", b'{"answers": {}}')
+    assert "False 2" in ann.get()
+
+
+def test_a_closed_page_is_out_at_once_and_the_answer_is_no_redirect(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    page = ann.get()
+    platform.wait(seconds=2)
+    assert ann.close(page) == 204
+    platform.wait(seconds=1)
+    assert bob.data["state"]["here"] == 1
+
+
+def test_leaving_takes_the_ticket_of_the_step(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    page = ann.get()
+    assert ann.close(page, **{"hippodrome-ticket": "0" * 32}) == 204
+    assert bob.data["state"]["here"] == 2
+
+
+def test_leaving_changes_nothing_for_a_member(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    page = ann.get()
+    matched(platform, ann, bob)
+    before = dict(platform.documents.kept)
+    assert ann.close(page) == 204
+    assert platform.documents.kept == before
+
+
+@pytest.mark.parametrize("query", ["poll=3", "poll=3&ticket=0", "poll=1&ticket=0", "poll=", "poll=3&ticket=%00"])
+def test_polling_for_another_participant_takes_their_ticket(platform: FakePlatform, query: str) -> None:
+    Player(platform, "ann").to_game()
+    before = dict(platform.documents.kept)
+    mallory = Player(platform, "ann")
+    assert mallory.poll(f"?projectId=maze&userId=ann&{query}")["status"] == 403
+    assert platform.documents.kept == before
+
+
+def test_a_ticket_of_another_step_or_participant_opens_no_lobby(platform: FakePlatform, project: Project) -> None:
+    before = dict(platform.documents.kept)
+    ann = Player(platform, "ann")
+    for ticket in (ids.ticket(project.secret, "ann", "1"), ids.ticket(project.secret, "bob", "3")):
+        assert ann.poll(f"?projectId=maze&userId=ann&poll=3&ticket={ticket}")["status"] == 403
+    consent = ids.ticket(project.secret, "ann", "1")
+    assert ann.poll(f"?projectId=maze&userId=ann&poll=1&ticket={consent}")["status"] == 403
+    assert platform.documents.kept == before
+
+
+def test_a_signed_link_is_needed_where_links_are_signed() -> None:
+    signed = study(**STUDY, signed_links=True)
+    platform = installed(signed)
+    signature = ids.link_signature(signed.secret, "maze", "ann")
+    ann = Player(platform, "ann", f"&signature={signature}").to_game()
+    address = ann.data["poll"]
+    assert ann.poll(address)["state"] == "lobby"
+    before = dict(platform.documents.kept)
+    unsigned = address.replace(signature, "0" * 32)
+    assert ann.poll(unsigned)["status"] == 400  # as HIPPO answers a program
+    assert platform.documents.kept == before
+    place.use(None)
+
+
+def test_a_form_for_another_server_is_for_the_sessions(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    serve(platform)
+    membership = Repository(platform.documents).membership("maze", "ann")
+    assert membership
+    stored = Repository(platform.documents).server(ids.server_label("maze", str(membership.session)))
+    assert stored
+    ended = server.close(stored.server, server.Reason.ENDED, platform.now())
+    platform.documents.put(server.key(ended.label), to_json(ended))
+    platform.bus.sent.clear()
+    ann.send(
+        "POST",
+        "&".join(f"{k}={v}" for k, v in hidden(ann.get()).items()) + "&hippodrome-action=restart",
+        content_type=FORM,
+    )
+    assert [m["userId"] for topic, m in platform.bus.sent if topic is Topic.START] == [membership.session]
+
+
+def test_a_program_waits_in_the_lobby_with_hippos_word(platform: FakePlatform) -> None:
+    ann = Player(platform, "ann").to_game()
+    answer = json.loads(ann.send(accept="application/json")["body"])
+    assert (answer["page"], answer["state"]) == ("wait", "lobby")
+
+
+def register(platform: FakePlatform, project: Project, *, live: bool) -> None:
+    platform.documents.put(MASTER_LIST, to_json(MasterList([msgspec.structs.replace(project, live=live)])))
+    platform.wait(seconds=60)
+
+
+def told_of(browser: Browser) -> tuple[int, str]:
+    answer = browser.send()
+    return answer["statusCode"], re.sub(r"nonce[-=\"'\w]+", "", answer["body"])
+
+
+def test_members_who_end_their_game_after_the_study_is_closed_are_told_what_one_alone_is(
+    platform: FakePlatform, project: Project
+) -> None:
+    """And go on where they were, once it is open again: docs/config.md, "closing"."""
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    addresses = [player.data["poll"] for player in (ann, bob)]
+    register(platform, project, live=False)
+    for user in ("ann", "bob"):
+        platform.documents.put(answer_key("maze", user, "3"), b'{"outcome": "finished"}')
+    alone = Player(alone_platform := installed(study()), "ann").to_game()
+    address_of_one = alone.data["poll"]
+    register(alone_platform, study(), live=False)
+    alone_platform.documents.put(answer_key("maze", "ann", "3"), b"{}")
+    said, polled = told_of(alone), alone.poll(address_of_one)
+    assert said[0] == 404
+    assert "There is no such study" in said[1]
+    place.use(platform)
+    assert [told_of(player) for player in (ann, bob)] == [said, said]
+    assert [player.poll(address) for player, address in zip((ann, bob), addresses, strict=True)] == [polled, polled]
+    register(platform, project, live=True)
+    for player in (ann, bob):
+        assert hidden(player.get())["hippodrome-step"] == "4"
+
+
+def test_a_study_for_one_has_no_lobby() -> None:
+    platform = installed(study())
+    ann = Player(platform, "ann").to_game()
+    platform.documents.calls.clear()
+    data = ann.data
+    assert data["state"]["state"] == "queued"
+    assert parse_qs(urlsplit(data["poll"]).query).keys() == {"projectId", "userId", "poll"}
+    assert platform.documents.calls == ["list", "get"]
+    assert waiting(platform) == NOTHING
+    place.use(None)

@@ -1,0 +1,43 @@
+"""Messages and events of a platform in memory reach the functions that start and stop servers."""
+
+from __future__ import annotations
+
+import json
+
+from hippodrome.model import messages
+from hippodrome.model.messages import TaskChanged
+from hippodrome.ports import Topic
+from testing.fake_platform import FakePlatform
+from testing.servers import Servers
+
+
+def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskChanged]:
+    """One for each task that runs."""
+    given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
+    return [
+        TaskChanged(task=task, cluster=request.cluster, name=request.name, status=status, **given)  # type: ignore[arg-type]
+        for task, request in platform.tasks.running.items()
+    ]
+
+
+def deliver(platform: FakePlatform, servers: Servers) -> None:
+    """Every message there is, and what comes of it, each once; tasks run and are named."""
+    servers.tasks_changed(events(platform, "RUNNING"))
+    while platform.bus.sent or platform.bus.delayed:
+        sent, platform.bus.sent = platform.bus.sent, []
+        later, platform.bus.delayed = platform.bus.delayed, []
+        for topic, message in sent:
+            body = json.loads(json.dumps(message))
+            if topic is Topic.START:
+                start = messages.parse_start_server(body)
+                assert start
+                servers.start(start)
+            else:
+                stop = messages.parse_stop_server(body)
+                assert stop
+                assert servers.stop([stop]) == []
+        for _, message in later:
+            changed = messages.parse_dns_changed(json.loads(json.dumps(message)))
+            assert changed
+            servers.dns_changed(changed)
+        servers.tasks_changed(events(platform, "RUNNING"))

@@ -1,0 +1,614 @@
+"""The servers of sessions: a session owns its server's record in the participant's place."""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+from typing import Any
+from urllib.parse import urlencode
+
+import msgspec
+import pytest
+
+from hippodrome.limits import rules as limits
+from hippodrome.limits.rules import ServerSlots
+from hippodrome.model import ids, messages, server, sessions
+from hippodrome.model.messages import KeepWarm, StartServer, StopServer, StopUser
+from hippodrome.model.project import MASTER_LIST, MasterList, Project
+from hippodrome.model.records import from_json, to_json
+from hippodrome.model.server import Reason, Server, State
+from hippodrome.ports import Settings, Topic
+from hippodrome.servers.sweep import Sweep
+from hippodrome.storage.secret import SecretCache
+from lambdas import installed as place
+from lambdas import send_start_server_message, send_stop_server_message
+from protocol import handover
+from protocol.handover import Handover
+from protocol.keys import answer_key, handovers_folder, membership_key, session_key
+from protocol.session import Member, Session, member_token
+from testing.aws_events import JSON, http_event
+from testing.fake_platform import FakePlatform
+from testing.servers import Servers
+from testing.studies import installed, study
+from tests.hippodrome.servers.delivery import deliver, events
+
+SESSION = "s." + "0" * 19 + "1"
+OTHER = "s." + "0" * 19 + "2"
+LABEL = ids.server_label("maze", SESSION)
+START, STOP = StartServer("maze", SESSION), StopServer("maze", SESSION)
+MEMBERS = ("alice", "bob")
+
+
+def pairs(**changes: object) -> Project:
+    return study(players=2, max_runtime=60, **changes)
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    return installed(pairs())
+
+
+@pytest.fixture
+def servers(platform: FakePlatform) -> Servers:
+    return Servers(platform)
+
+
+def form(platform: FakePlatform, session: str = SESSION, users: tuple[str, ...] = MEMBERS) -> None:
+    """What the lobby writes when a session is formed."""
+    members = tuple(Member(user, None, seat) for seat, user in enumerate(users))
+    platform.documents.put(session_key("maze", session), Session(session, 2, members).to_json())
+    for seat, user in enumerate(users):
+        seated = {"session": session, "seat": seat, "unmatched": False}
+        platform.documents.put(membership_key("maze", user), json.dumps(seated).encode())
+
+
+def answer(platform: FakePlatform, user: str, *steps: str) -> None:
+    platform.documents.put(f"maze/users/{user}/participant.json", b"{}")
+    for step in steps:
+        platform.documents.put(answer_key("maze", user, step), b"{}")
+
+
+def record(platform: FakePlatform, session: str = SESSION) -> Server:
+    return from_json(platform.documents.kept[server.key(ids.server_label("maze", session))][0], Server)
+
+
+def runs(platform: FakePlatform, servers: Servers) -> None:
+    """Every task that was started runs, has its name, and is ready."""
+    servers.tasks_changed(events(platform, "RUNNING"))
+    for _, message in platform.bus.delayed:
+        changed = messages.parse_dns_changed(json.loads(json.dumps(message)))
+        assert changed
+        servers.dns_changed(changed)
+    platform.bus.delayed.clear()
+
+
+def lose(platform: FakePlatform, servers: Servers) -> None:
+    """Spot takes every server back."""
+    lost = events(platform, "STOPPED", stop_code="SpotInterruption")
+    platform.tasks.running.clear()
+    assert servers.tasks_changed(lost) == []
+
+
+def nothing_left(platform: FakePlatform) -> bool:
+    return not (platform.tasks.running or platform.dns.records or platform.timers.due)
+
+
+# Start
+
+
+def test_a_session_gets_a_server_of_its_own_once(platform: FakePlatform, servers: Servers) -> None:
+    for _ in range(3):
+        servers.start(START)
+    (request,) = platform.tasks.running.values()
+    assert request.name == f"{LABEL}-1"
+    assert record(platform).is_sessions
+    assert platform.timers.due[f"{LABEL}-1"][1] == {
+        "projectId": "maze", "userId": SESSION, "attempt": 1, "reason": "deadline",
+    }  # fmt: skip
+
+
+def test_its_server_is_told_the_session_and_no_participant(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    (request,) = platform.tasks.running.values()
+    env = request.environment
+    assert env["SESSION"] == SESSION
+    assert env.keys().isdisjoint({"USER_ID", "GROUP", "SPARE"})
+    assert env["DEADLINE"] == str(int(record(platform).deadline.timestamp()))
+
+
+def test_no_server_of_a_project_without_sessions_is_told_one() -> None:
+    platform = installed()
+    Servers(platform).start(StartServer("maze", "alice"))
+    (request,) = platform.tasks.running.values()
+    assert "SESSION" not in request.environment
+
+
+@pytest.mark.parametrize(("limit", "waits", "lives"), [
+    (24 * 60, 30, 90), (90, 30, 90), (75, 15, 75), (65, 10, 65), (60, 10, 60), (45, 10, 45),
+])  # fmt: skip
+def test_its_deadline_leaves_those_who_are_matched_last_their_time(limit: int, waits: int, lives: int) -> None:
+    platform = installed(pairs())
+    platform.settings = Settings(root_domain="example.org", max_runtime=limit)
+    Servers(platform).start(START)
+    assert record(platform).deadline - platform.now() == timedelta(minutes=lives)
+    assert sessions.open_for(pairs(), platform.settings) == timedelta(minutes=waits)
+
+
+def test_a_session_holds_one_slot(platform: FakePlatform) -> None:
+    platform = installed(pairs(max_servers=1))
+    servers = Servers(platform)
+    servers.start(START)
+    servers.start(StartServer("maze", OTHER))
+    assert record(platform, OTHER).reason is Reason.FULL
+    servers.stop([STOP])
+    assert from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots).names == []
+    servers.start(StartServer("maze", OTHER))
+    assert record(platform, OTHER).state is State.STARTING
+
+
+def test_a_start_message_of_a_participant_starts_no_server_of_their_own(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    for _ in range(2):
+        servers.start(StartServer("maze", "alice"))
+    assert platform.tasks.running == {}
+    assert server.key(ids.server_label("maze", "alice")) not in platform.documents.kept
+
+
+def test_no_session_is_started_in_a_project_that_has_none_any_more(platform: FakePlatform) -> None:
+    servers = Servers(platform)
+    servers.start(START)
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([study()])))
+    platform.wait(seconds=11)
+    servers.start(StartServer("maze", OTHER))
+    assert [request.name for request in platform.tasks.running.values()] == [f"{LABEL}-1"]
+    servers.start(START)
+    deliver(platform, servers)
+    assert nothing_left(platform)
+
+
+def test_a_message_that_names_no_session_is_dropped() -> None:
+    for forged in ("s.", "s.xyz", "s." + "0" * 19, "s." + "0" * 21, "s." + "A" * 20, SESSION + "/..", " " + SESSION):
+        body = {"projectId": "maze", "userId": forged}
+        assert messages.parse_start_server(body) is None, forged
+        assert messages.parse_stop_server(body) is None, forged
+
+
+# Warm servers
+
+
+def test_a_warm_server_is_handed_over_to_a_session() -> None:
+    platform = installed(pairs(warm_servers=1, version="v1"))
+    servers = Servers(platform)
+    servers.start(KeepWarm("maze"))
+    ((_, first),) = platform.bus.sent
+    platform.bus.sent.clear()
+    start = messages.parse_start_server(json.loads(json.dumps(first)))
+    assert start
+    servers.start(start)
+    runs(platform, servers)
+    servers.start(START)
+    assert record(platform).state is State.READY
+    (key,) = (key for key in platform.documents.kept if key.startswith(handovers_folder("maze")))
+    assert handover.parse(platform.documents.kept[key][0]) == Handover(SESSION, None, f"{LABEL}-1")
+    assert (record(platform).deadline - platform.now()) == timedelta(minutes=90)
+
+
+def test_a_warm_server_that_is_taken_at_the_last_moment_leaves_a_session_all_its_time() -> None:
+    platform = installed(pairs(warm_servers=1, version="v1"))
+    platform.settings = Settings(root_domain="example.org", max_runtime=150)
+    servers = Servers(platform)
+    servers.start(KeepWarm("maze"))
+    deliver(platform, servers)
+    (warm,) = open_sessions(platform)
+    (request,) = platform.tasks.running.values()
+    ends = int(request.environment["DEADLINE"])
+    platform.clock = warm.deadline - timedelta(seconds=1)
+    servers.start(START)
+    assert record(platform).warm_server_name == warm.name
+    assert ends >= int(record(platform).deadline.timestamp())
+    assert ends <= int((warm.requested + timedelta(minutes=150)).timestamp()), "the installation's limit"
+
+
+# Replacement
+
+
+def test_a_lost_server_is_replaced_for_all_members(platform: FakePlatform, servers: Servers) -> None:
+    form(platform)
+    servers.start(START)
+    runs(platform, servers)
+    lose(platform, servers)
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 2})]
+    servers.start(StartServer("maze", SESSION, 2))
+    (request,) = platform.tasks.running.values()
+    assert request.environment["SESSION"] == SESSION
+
+
+@pytest.mark.parametrize(("played", "replaced"), [((), True), (("alice",), True), (MEMBERS, False)])
+def test_it_is_replaced_until_all_have_finished_their_games(
+    platform: FakePlatform, servers: Servers, played: tuple[str, ...], replaced: bool
+) -> None:
+    form(platform)
+    servers.start(START)
+    for user in MEMBERS:
+        answer(platform, user, "1", "2", *(["3"] if user in played else []))
+    lose(platform, servers)
+    assert bool(platform.bus.sent) == replaced
+
+
+def test_a_server_that_was_started_ahead_is_replaced_too(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(START)
+    lose(platform, servers)
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 2})]
+
+
+def test_a_member_whose_data_were_erased_is_waited_for_no_longer(platform: FakePlatform, servers: Servers) -> None:
+    form(platform)
+    one = Session(SESSION, 2, (Member("", None, 0), Member("bob", None, 1)))
+    platform.documents.put(session_key("maze", SESSION), one.to_json())
+    servers.start(START)
+    answer(platform, "bob", "1", "2", "3")
+    lose(platform, servers)
+    assert platform.bus.sent == []
+
+
+# Stop
+
+
+def test_a_sessions_server_is_stopped_by_its_id(platform: FakePlatform, servers: Servers) -> None:
+    form(platform)
+    servers.start(START)
+    runs(platform, servers)
+    assert servers.stop([STOP]) == []
+    assert record(platform).reason is Reason.STOPPED
+    assert nothing_left(platform)
+
+
+def test_a_stop_that_overtakes_the_start_leaves_no_server(platform: FakePlatform, servers: Servers) -> None:
+    assert servers.stop([STOP]) == []
+    servers.start(START)
+    assert nothing_left(platform)
+
+
+@pytest.mark.parametrize("first", MEMBERS)
+def test_it_is_stopped_when_the_last_member_reaches_the_stop_step(
+    platform: FakePlatform, servers: Servers, first: str
+) -> None:
+    """The message of the last member comes before their answer is stored."""
+    last = next(user for user in MEMBERS if user != first)
+    form(platform)
+    servers.start(START)
+    runs(platform, servers)
+    answer(platform, first, "1", "2", "3")
+    answer(platform, last, "1", "2")
+    assert servers.stop([StopServer("maze", first)]) == []
+    assert record(platform).state is State.READY
+    assert servers.stop([StopServer("maze", last)]) == []
+    assert record(platform).reason is Reason.STOPPED
+    assert nothing_left(platform)
+
+
+def test_the_messages_of_both_members_in_one_batch_stop_it_once(platform: FakePlatform) -> None:
+    platform = installed(pairs(max_servers=3, max_server_hours=10))
+    servers = Servers(platform)
+    form(platform)
+    servers.start(START)
+    servers.start(StartServer("maze", OTHER))
+    runs(platform, servers)
+    platform.wait(minutes=10)
+    for user in MEMBERS:
+        answer(platform, user, "1", "2", "3")
+    assert servers.stop([StopServer("maze", user) for user in MEMBERS]) == []
+    assert record(platform).reason is Reason.STOPPED
+    slots = from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots)
+    assert [*slots.names] == [f"{ids.server_label('maze', OTHER)}-1"]
+    assert slots.used == 10 * 60
+
+
+def test_a_participants_stop_leaves_no_record_of_theirs(platform: FakePlatform, servers: Servers) -> None:
+    """Neither a tombstone for a member, nor for one who was never matched."""
+    form(platform)
+    before = {key for key in platform.documents.kept if key.startswith(server.RECORDS)}
+    for user in ("alice", "carol"):
+        assert servers.stop([StopServer("maze", user)]) == []
+    assert {key for key in platform.documents.kept if key.startswith(server.RECORDS)} == before
+
+
+def test_a_stop_in_all_projects_ends_no_session_that_another_plays(platform: FakePlatform, servers: Servers) -> None:
+    form(platform)
+    servers.start(START)
+    answer(platform, "alice", "1", "2", "3")
+    answer(platform, "bob", "1", "2")
+    assert servers.stop([StopUser("alice")]) == []
+    assert record(platform).state is State.STARTING
+    assert servers.stop([StopUser("bob")]) == []
+    assert record(platform).reason is Reason.STOPPED
+
+
+def test_a_server_from_before_the_project_had_sessions_is_stopped_as_ever() -> None:
+    platform = installed(study())
+    Servers(platform).start(StartServer("maze", "alice"))
+    platform.documents.put(MASTER_LIST, to_json(MasterList([pairs()])))
+    assert Servers(platform).stop([StopServer("maze", "alice")]) == []
+    assert nothing_left(platform)
+
+
+# The relays
+
+
+@pytest.fixture
+def relays(platform: FakePlatform) -> Any:
+    place.use(platform)
+    yield platform
+    place.use(None)
+
+
+def ask(function: Any, user: str, **body: object) -> int:
+    query = urlencode({"projectId": "maze", "userId": user})
+    event = http_event("POST", query, json.dumps(body), "/relay", {"content-type": JSON, "accept": JSON})
+    return int(function.handler(event, None)["statusCode"])
+
+
+def proof(user: str) -> dict[str, str]:
+    return {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", user, "1")}
+
+
+def test_a_member_cannot_stop_the_server_of_the_others(relays: FakePlatform, servers: Servers) -> None:
+    form(relays)
+    servers.start(START)
+    for user in MEMBERS:
+        answer(relays, user, "1", "2")
+    assert ask(send_stop_server_message, "alice", **proof("alice")) == 202
+    ((topic, message),) = relays.bus.sent
+    stop = messages.parse_stop_server(json.loads(json.dumps(message)))
+    assert (topic, stop) == (Topic.STOP, StopServer("maze", "alice"))
+    assert stop
+    assert servers.stop([stop]) == []
+    assert record(relays).state is State.STARTING
+
+
+def test_a_members_token_is_their_own(relays: FakePlatform, servers: Servers) -> None:
+    form(relays)
+    servers.start(START)
+    for user in MEMBERS:
+        answer(relays, user, "1", "2")
+    token = SecretCache(relays.documents).token(record(relays))
+    for stolen in (token, member_token(token, "bob"), member_token("", "alice")):
+        assert ask(send_stop_server_message, "alice", token=stolen) == 403
+    assert ask(send_stop_server_message, "alice", token=member_token(token, "alice")) == 202
+
+
+def test_the_relays_do_not_take_a_sessions_id_for_a_participant(relays: FakePlatform, servers: Servers) -> None:
+    form(relays)
+    servers.start(START)
+    token = SecretCache(relays.documents).token(record(relays))
+    for function in (send_start_server_message, send_stop_server_message):
+        assert ask(function, SESSION, token=token, **proof(SESSION)) == 400
+    assert relays.bus.sent == []
+
+
+def test_a_members_delayed_stop_does_not_replace_anothers(relays: FakePlatform, servers: Servers) -> None:
+    form(relays)
+    servers.start(START)
+    for user in MEMBERS:
+        assert ask(send_stop_server_message, user, **proof(user), delay=90) == 202
+    delayed = {str(message["userId"]) for name, (_, message) in relays.timers.due.items() if name.endswith("-delay")}
+    assert delayed == set(MEMBERS)
+
+
+def test_a_member_asks_for_the_next_server_of_their_session(relays: FakePlatform, servers: Servers) -> None:
+    form(relays)
+    answer(relays, "alice", "1", "2")
+    servers.start(START)
+    closed = server.close(msgspec.structs.replace(record(relays), attempt=3), Reason.LOST, relays.now())
+    relays.documents.put(server.key(LABEL), to_json(closed))
+    assert ask(send_start_server_message, "alice", **proof("alice")) == 202
+    assert relays.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 4})]
+
+
+def test_one_who_waits_in_the_lobby_may_leave_it_by_the_relay(relays: FakePlatform) -> None:
+    answer(relays, "carol", "1", "2")
+    assert ask(send_stop_server_message, "carol", **proof("carol")) == 202
+    assert relays.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "carol"})]
+
+
+# The sweep
+
+
+def test_a_server_that_no_lobby_lists_and_no_session_was_formed_for_is_stopped(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    """Started ahead and not needed, by a forged or late message, or its lobby's document was lost."""
+    servers.start(START)
+    runs(platform, servers)
+    swept = Sweep(platform).run()
+    assert (swept.sessions, swept.failed) == (1, 0)
+    deliver_stops(platform, servers)
+    assert record(platform).reason is Reason.STOPPED
+    assert nothing_left(platform)
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"open": 3}'])
+def test_it_is_stopped_too_if_the_lobbys_document_cannot_be_read(
+    platform: FakePlatform, servers: Servers, body: bytes
+) -> None:
+    servers.start(START)
+    platform.documents.put("_lobbies/maze.json", body)
+    for _ in range(2):
+        Sweep(platform).run()
+        deliver_stops(platform, servers)
+    assert record(platform).reason is Reason.STOPPED
+
+
+def test_a_session_that_was_formed_goes_on(platform: FakePlatform, servers: Servers) -> None:
+    form(platform)
+    servers.start(START)
+    runs(platform, servers)
+    for user in MEMBERS:
+        answer(platform, user, "1", "2")
+    assert Sweep(platform).run().sessions == 0
+    assert platform.bus.sent == []
+
+
+def test_it_goes_on_also_if_its_document_cannot_be_read_or_its_project_is_gone(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    form(platform)
+    servers.start(START)
+    platform.documents.put(session_key("maze", SESSION), b"{")
+    swept = Sweep(platform).run()
+    assert (swept.sessions, swept.failed) == (0, 1)
+    form(platform)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([])))
+    assert Sweep(platform).run().sessions == 0
+    assert platform.bus.sent == []
+
+
+def test_one_that_all_members_have_left_is_stopped(platform: FakePlatform, servers: Servers) -> None:
+    """Their stop messages crossed: each was handled before the other's answer was stored."""
+    form(platform)
+    servers.start(START)
+    for user in MEMBERS:
+        answer(platform, user, "1", "2")
+        servers.stop([StopServer("maze", user)])
+    for user in MEMBERS:
+        answer(platform, user, "3")
+    assert record(platform).state is State.STARTING
+    assert Sweep(platform).run().sessions == 1
+    deliver_stops(platform, servers)
+    assert record(platform).reason is Reason.STOPPED
+
+
+@pytest.mark.parametrize("listed", [[pairs(live=False)], []], ids=["closed", "gone"])
+def test_it_is_stopped_also_when_its_project_is_closed_or_gone(
+    platform: FakePlatform, servers: Servers, listed: list[Project]
+) -> None:
+    servers.start(START)
+    platform.documents.put(MASTER_LIST, to_json(MasterList(list(listed))))
+    assert Sweep(platform).run().sessions == 1
+    deliver_stops(platform, servers)
+    assert record(platform).reason is Reason.STOPPED
+
+
+def test_a_lobby_that_cannot_be_repaired_takes_no_server_away(
+    platform: FakePlatform, servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    servers.start(START)
+    sweep = Sweep(platform)
+    monkeypatch.setattr(sweep._lobby, "repair", lambda project: (_ for _ in ()).throw(ConnectionError()))
+    swept = sweep.run()
+    assert (swept.sessions, swept.failed) == (0, 1)
+    assert platform.bus.sent == []
+
+
+def deliver_stops(platform: FakePlatform, servers: Servers) -> None:
+    sent, platform.bus.sent = platform.bus.sent, []
+    stops = [messages.parse_stop_server(json.loads(json.dumps(m))) for topic, m in sent if topic is Topic.STOP]
+    assert servers.stop([stop for stop in stops if stop]) == []
+
+
+# With the lobby
+
+
+def open_sessions(platform: FakePlatform) -> list[Server]:
+    found = [from_json(kept[0], Server) for key, kept in platform.documents.kept.items() if key.startswith("_servers/")]
+    return [one for one in found if not one.is_closed]
+
+
+@pytest.mark.parametrize(("people", "wanted"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
+def test_one_server_is_started_ahead_for_every_two_who_are_under_way(
+    platform: FakePlatform, servers: Servers, people: int, wanted: int
+) -> None:
+    for _ in range(2):
+        for number in range(people):
+            servers.start(StartServer("maze", f"user{number}"))
+        deliver(platform, servers)
+    found = open_sessions(platform)
+    assert len(found) == wanted
+    assert all(one.is_sessions and one.state is State.READY for one in found)
+    assert Sweep(platform).run().sessions == 0
+
+
+def test_servers_ahead_are_stopped_when_those_they_were_for_go_away(platform: FakePlatform, servers: Servers) -> None:
+    for user in ("alice", "bob", "carol"):
+        servers.start(StartServer("maze", user))
+    deliver(platform, servers)
+    assert servers.stop([StopServer("maze", "carol")]) == []
+    Sweep(platform).run()
+    deliver(platform, servers)
+    assert len(open_sessions(platform)) == 1
+    assert servers.stop([StopUser("alice"), StopUser("bob")]) == []
+    Sweep(platform).run()
+    deliver(platform, servers)
+    assert open_sessions(platform) == []
+    assert nothing_left(platform)
+
+
+def test_nothing_is_left_when_those_who_are_under_way_never_arrive(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(StartServer("maze", "alice"))
+    deliver(platform, servers)
+    started = set()
+    for _ in range(24):  # two hours
+        platform.wait(minutes=5)
+        Sweep(platform).run()
+        deliver(platform, servers)
+        started |= {one.name for one in open_sessions(platform)}
+        assert len(open_sessions(platform)) <= 1
+    assert nothing_left(platform)
+    assert len(started) <= 3, "a server is kept for half an hour, as long as the participant may come"
+    assert [key for key in platform.documents.kept if key.startswith("_lobby/")] == []
+
+
+def test_nothing_is_left_when_the_lobbys_document_is_lost(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(StartServer("maze", "alice"))
+    deliver(platform, servers)
+    platform.documents.delete("_lobbies/maze.json")
+    Sweep(platform).run()
+    deliver(platform, servers)
+    assert len(open_sessions(platform)) == 1, "another one for who is under way"
+    servers.stop([StopServer("maze", "alice")])
+    Sweep(platform).run()
+    deliver(platform, servers)
+    assert nothing_left(platform)
+
+
+def test_a_project_that_is_closed_keeps_no_server_ahead(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(StartServer("maze", "alice"))
+    deliver(platform, servers)
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([pairs(live=False)])))
+    platform.wait(seconds=60)
+    for _ in range(2):
+        Sweep(platform).run()
+        deliver(platform, servers)
+    assert nothing_left(platform)
+    assert json.loads(platform.documents.kept["_lobbies/maze.json"][0]).get("open", []) == []
+
+
+def test_a_project_that_is_gone_keeps_no_server_ahead(platform: FakePlatform, servers: Servers) -> None:
+    servers.start(StartServer("maze", "alice"))
+    deliver(platform, servers)
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([study(max_runtime=60)])))
+    platform.wait(seconds=60)
+    Sweep(platform).run()
+    deliver(platform, servers)
+    assert nothing_left(platform)
+
+
+def test_a_start_message_that_comes_an_hour_late_starts_no_server_that_stays(
+    platform: FakePlatform, servers: Servers
+) -> None:
+    """Of a participant who has played, of one who is unmatched, and of a session that is over."""
+    form(platform)
+    servers.start(START)
+    runs(platform, servers)
+    for user in MEMBERS:
+        answer(platform, user, "1", "2", "3")
+    servers.stop([StopServer("maze", user) for user in MEMBERS])
+    unmatched = {"session": None, "seat": 0, "unmatched": True}
+    platform.documents.keep(membership_key("maze", "carol"), json.dumps(unmatched).encode())
+    platform.wait(hours=1)
+    for user in (*MEMBERS, "carol", SESSION):
+        servers.start(StartServer("maze", user))
+    deliver(platform, servers)
+    assert nothing_left(platform)
+    assert not any(key.startswith("_lobby/") for key in platform.documents.kept)

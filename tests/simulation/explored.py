@@ -1,0 +1,28 @@
+"""Faults at the calls of a journey, and the same without what repairs them."""
+
+from __future__ import annotations
+
+import pytest
+
+from testing.exploration import sample
+from testing.simulation import faults
+from testing.simulation.faults import Journey
+from testing.simulation.world import World
+
+
+def assert_no_fault_does_harm(journey: Journey, seed: int, tried: int | None = None) -> None:
+    """A fault at so many of the calls, at a thirtieth without a number: each run ends well."""
+    points = faults.points(journey, seed)
+    assert len(points) > 100
+    tried = tried or max(24 * len(faults.FAULTS), len(points) // 30)
+    outcomes = [faults.run(journey, seed, point)[1] for point in sample(points, tried)]
+    assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
+    bad = [outcome for outcome in outcomes if not outcome.well]
+    assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
+
+
+def assert_faults_do_harm_without_repair(journey: Journey, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exploration sees what it should: the same faults, without a sweep and a second delivery."""
+    monkeypatch.setattr(World, "_sweep", lambda world: None)
+    monkeypatch.setattr(World, "RECEIVES", 1)
+    assert any(not outcome.well for outcome in faults.explore(journey, seed))

@@ -1,0 +1,194 @@
+"""Each call of a pair's journey fails, is the last, or loses its reply: the end is the same."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from testing.exploration import sample
+from testing.port_faults import Fault, FaultAt
+from tests.stateful.functions import Invocation
+from tests.stateful.sessions import SessionWorld, always, ends_well, pairs
+from tests.stateful.world import World
+
+pytestmark = pytest.mark.usefixtures("numbered_sessions")
+
+FAULTS = (Fault.ERROR, Fault.REPLY, Fault.CRASH_BEFORE, Fault.CRASH_AFTER)
+PAIR = ("alice", "bob")
+
+
+class Counted:
+    """Counts the calls of each invocation, and injects a fault at one call of one of them."""
+
+    def __init__(self, world: World, at: tuple[int, FaultAt] | None = None) -> None:
+        self.calls: list[int] = []  # of each invocation, in their order
+        invoke = world.functions.invoke
+
+        def counted(
+            function: str, about: str, act: Callable[[], Any], done: Callable[[Invocation], None], _: Any = None
+        ) -> None:
+            number = len(self.calls)
+            self.calls.append(0)
+
+            def finished(invocation: Invocation) -> None:
+                self.calls[number] = invocation.calls
+                done(invocation)
+
+            invoke(function, about, act, finished, at[1] if at and at[0] == number else None)
+
+        world.functions.invoke = counted  # type: ignore[method-assign]
+
+
+def come(world: SessionWorld, *users: str) -> None:
+    """To the page before the game, where the server is started ahead."""
+    for user in users:
+        world.ask(user)
+        world.answer(user, "1")
+
+
+def wait_together(world: SessionWorld, *users: str, rounds: int = 4) -> None:
+    for _ in range(rounds):
+        for user in users:
+            world.poll(user)
+        world.wait(2)
+
+
+def meet(world: SessionWorld) -> None:
+    """A server is started ahead, and the pair meets in the lobby."""
+    come(world, *PAIR)
+    world.go_on()
+    for user in PAIR:
+        world.answer(user, "2")
+    wait_together(world, *PAIR)
+    world.go_on()
+
+
+def a_pair(world: SessionWorld) -> None:
+    """The lobby, the game, and each by themselves to the end."""
+    meet(world)
+    for task in [task for task in world.tasks if task.alive]:
+        world.played(task)
+    for user in PAIR:
+        world.ask(user)
+        world.deliver_all("stop")
+    world.sweep()
+
+
+def a_pair_without_a_server_ahead(world: SessionWorld) -> None:
+    """They are matched before their start messages arrive."""
+    come(world, *PAIR)
+    for user in PAIR:
+        world.answer(user, "2")
+    wait_together(world, *PAIR)
+    world.deliver_all("start")
+    world.go_on()
+
+
+def a_pair_whose_server_is_lost(world: SessionWorld) -> None:
+    """Between the answers of its two members."""
+    meet(world)
+    for task in [task for task in world.tasks if task.alive]:
+        world.played(task, answers=1)
+        world.account.fleet.end(task, "SpotInterruption", "spot")
+    world.move_all()
+    world.deliver_all("tasks")
+    world.go_on()
+
+
+def one_alone(world: SessionWorld) -> None:
+    """No other comes: unmatched, and the server that was started ahead is stopped."""
+    come(world, "alice")
+    world.go_on()
+    world.answer("alice", "2")
+    for _ in range(14):  # more than their patience, which is a minute
+        world.poll("alice")
+        world.wait(5)
+    world.ask("alice")
+    world.deliver_all("stop")
+    world.sweep()
+    world.deliver_all("stop")
+
+
+def one_who_never_comes(world: SessionWorld) -> None:
+    """Under way, and away: the server is stopped after half an hour, and no other starts once they are forgotten."""
+    come(world, "alice")
+    world.go_on()
+    for _ in range(3):
+        world.wait(16 * 60)
+        world.sweep()
+        world.deliver_all("stop")
+        world.go_on()
+
+
+def with_a_warm_server(world: SessionWorld) -> None:
+    """The pair is handed a server that waits."""
+    world.go_on()
+    meet(world)
+
+
+JOURNEYS: dict[str, tuple[Callable[[SessionWorld], None], dict[str, Any]]] = {
+    "a pair": (a_pair, {}),
+    "a pair with limits": (a_pair, {"max_servers": 1, "max_server_hours": 4}),
+    "a pair without a server ahead": (a_pair_without_a_server_ahead, {}),
+    "a pair whose server is lost": (a_pair_whose_server_is_lost, {}),
+    "one alone": (one_alone, {}),
+    "one who never comes": (one_who_never_comes, {}),
+    "a warm server": (with_a_warm_server, {"warm_servers": 1}),
+    "alone with policies": (one_alone, {"after_patience": "policies"}),
+}
+
+
+FORMED: dict[str, tuple[list[int], list[str]]] = {
+    **dict.fromkeys(JOURNEYS, ([2], [])),
+    "one alone": ([], ["alice"]),
+    "one who never comes": ([], []),
+    "alone with policies": ([1], []),
+}
+"""How many members each session has, and who is unmatched, at the end of the journey."""
+
+
+def begin(name: str, at: tuple[int, FaultAt] | None = None) -> tuple[SessionWorld, Counted]:
+    journey, changes = JOURNEYS[name]
+    world = SessionWorld(pairs(**changes), PAIR)
+    counted = Counted(world, at)
+    journey(world)
+    always(world)
+    return world, counted
+
+
+@functools.cache
+def places(name: str) -> list[tuple[int, FaultAt]]:
+    """Every call of every invocation of the journey, with every fault."""
+    _, counted = begin(name)
+    return [
+        (number, FaultAt(call, fault))
+        for number, calls in enumerate(counted.calls)
+        for call in range(1, calls + 1)
+        for fault in FAULTS
+    ]
+
+
+@pytest.mark.parametrize("name", JOURNEYS)
+def test_each_journey_ends_well_if_nothing_fails(name: str) -> None:
+    world, _ = begin(name)
+    members = [len(session.members) for session in world.sessions()]
+    unmatched = [user for user in PAIR if (membership := world.membership(user)) and membership.unmatched]
+    assert (members, unmatched) == FORMED[name]
+    ends_well(world)
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize("name", JOURNEYS)
+def test_whatever_call_fails_nobody_is_stranded_and_nothing_is_left(name: str) -> None:
+    wrong: list[str] = []
+    for number, fault in sample(places(name), 12, seed=len(name)):
+        world: SessionWorld | None = None
+        try:
+            world, _ = begin(name, (number, fault))
+            ends_well(world)
+        except AssertionError as error:
+            wrong.append(f"invocation {number}, {fault}: {error}")
+    assert not wrong, "\n".join(wrong[:10])

@@ -1,0 +1,52 @@
+"""Whatever comes in whatever order, however often, and whatever fails, for participants who play together."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import Phase, seed, settings
+from hypothesis.stateful import run_state_machine_as_test
+
+from hippodrome.servers.sweep import Sweep, SweepResult
+from testing.exploration import examples
+from testing.fake_platform import FakeDocuments
+from tests.stateful.mutations import Mutation, assert_seen, written_unread
+from tests.stateful.session_machine import SessionMachine
+
+pytestmark = pytest.mark.usefixtures("numbered_sessions")
+
+PROFILE = settings(
+    max_examples=examples(60),
+    stateful_step_count=40,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],
+)
+MUTATED = settings(PROFILE, max_examples=400, derandomize=True, phases=[Phase.generate])
+
+
+@pytest.mark.explores
+@pytest.mark.timeout(0)
+def test_nobody_is_stranded_split_or_merged_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
+    run_state_machine_as_test(SessionMachine, settings=PROFILE)
+
+
+@seed(1)
+class SeededMachine(SessionMachine):
+    """With a seed that sees every mutation within the first examples."""
+
+
+MUTATIONS = {
+    "a decision that was written over": Mutation(
+        FakeDocuments,
+        "replace",
+        written_unread,
+        r"in two sessions|does not know them|nobody will tell|waits for ever|two tasks run for|runs without a",
+    ),
+    "a membership that was written over": Mutation(
+        FakeDocuments, "create", written_unread, r"a session changed|an answer changed"
+    ),
+    "a sweep that does nothing": Mutation(Sweep, "run", lambda sweep: SweepResult(), r"left behind: "),
+}
+
+
+@pytest.mark.parametrize("what", MUTATIONS)
+def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_seen(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)

@@ -1,0 +1,86 @@
+"""A session of two participants on a real trial server: its document, its agent, and its members' clients."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import AsyncIterator, Iterable
+from pathlib import Path
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed
+
+from protocol.keys import session_key
+from protocol.session import Member, Session, member_token
+from tests.trial.conftest import Client, client_of
+from tests.trial.two_players import TRIAL as ONE_HUMAN
+from tests.trial.two_players import two_players
+from trial.recordings import recording
+
+SID = "s.0123456789abcdef0123"
+TOKEN = "the-secret-token"  # of every server that conftest starts
+MEMBERS = ("anna", "bert")
+TRIAL: dict[str, Any] = {
+    **ONE_HUMAN,
+    "players": {"left": "human", "right": "human"},
+    "countdown": 0,
+    "ui": {"up": True, "down": True, "start": True, "pause": True, "stop": True},
+}
+
+
+def document(
+    members: Iterable[str] = MEMBERS, *, players: int = 2, group: int | None = None, sid: str = SID
+) -> Session:
+    """A session whose members have the seats 0, 1 and so on."""
+    found = tuple(Member(user_id, group, seat) for seat, user_id in enumerate(members))
+    return Session(sid, players, found, group, "2026-11-22T22:00:00.000000Z")
+
+
+def form(store: Path, session: Session | None = None) -> None:
+    """What the lobby does when the session is formed."""
+    found = session or document()
+    put(store, session_key("study", SID), found.to_json())
+
+
+def put(store: Path, key: str, body: bytes) -> None:
+    """Create a document whole."""
+    path = store / key
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".new")
+    unfinished.write_bytes(body)
+    unfinished.replace(path)
+
+
+def launch_session(launch: Any, *, trial: dict[str, Any] | None = None, agent: str | None = None, **env: str) -> Any:
+    """Start the server of the session; its document is another matter (`form`)."""
+    told = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60", **env}
+    return launch(agent=agent or two_players(), trial={**TRIAL, **(trial or {})}, **told)
+
+
+def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
+    """What a member's page says first."""
+    return {"userId": user_id, "token": member_token(TOKEN, user_id), "step": "3", **change}
+
+
+@contextlib.asynccontextmanager
+async def member(server: Any, user_id: str, *, port: int = 0, **change: Any) -> AsyncIterator[Client]:
+    """A member's client that has been let in, by another `port` perhaps."""
+    async with client_of(f"ws://127.0.0.1:{port or server.port}/") as client:
+        await client.hello(**hello_of(user_id, **change))
+        try:
+            await client.until(lambda: client.controls or client.done)
+        except ConnectionClosed as closed:
+            raise AssertionError(f"{client.errors}; the server said:\n{server.said()}") from closed
+        yield client
+
+
+def answer(store: Path, user_id: str, step: str = "3") -> dict[str, Any]:
+    """The document of a member's answer."""
+    found: dict[str, Any] = json.loads((store / f"study/users/{user_id}/answers/{step}.json").read_text())
+    return found
+
+
+def recordings(store: Path, server: str = "pair-1") -> dict[str, list[dict[str, Any]]]:
+    """What a server of the session has recorded, by file."""
+    folder = store / f"study/sessions/{SID}/trials/{server}"
+    return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob("*.gz*"))}

@@ -1,0 +1,132 @@
+"""A server without members asks the function `match` of agent.py who plays with whom."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import textwrap
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from protocol.keys import groups_key, waiting_key
+from trial.agent import match
+from trial.agent.match import BadGroups
+from trial.recordings.store import FolderStore
+from trial.server import matching
+from trial.server.matching import Matching
+from trial.settings import Settings
+
+QUESTION = {"id": "0" * 20, "players": 2, "waiting": [{"id": name, "answers": {"skill": name}} for name in "abcd"]}
+
+
+def groups(function: Callable[..., Any]) -> tuple[list[list[str]], str]:
+    return match.groups(function, QUESTION)
+
+
+def test_a_group_holds_ids_or_those_who_wait() -> None:
+    assert groups(lambda waiting: [["a", "b"], waiting[2:]]) == ([["a", "b"], ["c", "d"]], "")
+
+
+def test_match_may_ask_how_many_play() -> None:
+    assert groups(lambda waiting, players: [waiting[:players]]) == ([["a", "b"]], "")
+
+
+def test_all_that_match_is_told_is_there() -> None:
+    seen: list[Any] = []
+    groups(lambda waiting: seen.extend(waiting) or [])
+    assert seen[0] == {"id": "a", "waited": 0, "group": None, "answers": {"skill": "a"}}
+
+
+@pytest.mark.parametrize("returned", [None, "ab", {"a": "b"}, 5, [5], ["ab"], [[1, 2]], [None]])
+def test_what_is_no_groups_is_refused(returned: Any) -> None:
+    with pytest.raises(BadGroups):
+        groups(lambda waiting: returned)
+
+
+@pytest.mark.parametrize("bad", [["a"], ["a", "a"], ["a", "x"], ["a", "b", "d"], ["c", "a"]])
+def test_a_group_that_cannot_play_is_left_out_and_told(bad: list[str]) -> None:
+    found, problem = groups(lambda waiting: [["c", "d"], bad])
+    assert found == [["c", "d"]]
+    assert problem
+
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+SHOWN = [
+    textwrap.dedent(block)
+    for name in ("agent.md", "sessions.md")
+    for block in re.findall(r"^ {4}def match\((?:.*\n|\n)(?:(?: {4}.*)?\n)+", (DOCS / name).read_text(), re.MULTILINE)
+]
+WHO = [("0", "no", 0), ("9", "no", 0), ("1", "yes", 1), ("9.5", "yes", 1)]
+PEOPLE = [
+    {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "opinion": opinion}}
+    for name, (skill, opinion, group) in zip("abcd", WHO, strict=True)
+]
+
+
+def test_the_docs_show_three_functions() -> None:
+    assert len(SHOWN) == 3
+
+
+@pytest.mark.parametrize(
+    ("code", "chosen"),
+    list(zip(SHOWN, ([["a", "c"], ["b", "d"]],) * 3, strict=False)),
+    ids=["opinion", "skill", "group"],
+)
+def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: list[list[str]]) -> None:
+    found: dict[str, Any] = {}
+    exec(code, found)
+    assert match.groups(found["match"], {"id": "0" * 20, "players": 2, "waiting": PEOPLE}) == (chosen, "")
+
+
+def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 0.3, question: bytes | None = None) -> Any:
+    """The answer that a server without members stores; None if it stores none."""
+    store = FolderStore(tmp_path)
+    store.create(waiting_key("maze"), question if question is not None else json.dumps(QUESTION).encode())
+
+    class Open:
+        project_id, session, assigned, agent_dir = "maze", "s." + "0" * 20, False, tmp_path
+
+    async def run() -> None:
+        working = asyncio.create_task(Matching(store, lambda: cast(Settings, Open), function).run())
+        await asyncio.sleep(seconds)
+        working.cancel()
+
+    asyncio.run(run())
+    found = store.get(groups_key("maze", "0" * 20))
+    return None if found is None else json.loads(found)
+
+
+def test_a_server_stores_what_match_chooses(tmp_path: Path) -> None:
+    assert served(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["a", "c"]]}
+
+
+def test_an_answer_that_another_server_has_given_stays(tmp_path: Path) -> None:
+    FolderStore(tmp_path).create(groups_key("maze", "0" * 20), b'{"groups": [["b", "d"]]}')
+    assert served(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["b", "d"]]}
+
+
+def test_a_match_that_raises_matches_nobody_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert served(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
+    assert "KeyError: 'age'" in caplog.text
+
+
+def test_a_match_that_hangs_is_given_up(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(match, "SECONDS", 0.1)
+    assert served(tmp_path, lambda waiting: time.sleep(1) or [], seconds=0.5) == {"groups": []}
+    assert "match() has not returned within 0.1 s" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"[" * 100_000, b"[]", b'{"id": "../../x", "players": 2, "waiting": []}', b'{"id": "00000000000000000000"}'],
+)
+def test_a_question_that_is_none_is_left_alone(tmp_path: Path, body: bytes) -> None:
+    assert matching.read(body) is None
+    assert served(tmp_path, lambda waiting: [], question=body) is None

@@ -1,0 +1,633 @@
+"""A session's trial, event by event: who is waited for, when the game begins, is held and ends, and what each is told."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.trial.session_driver import SessionDriver
+from trial.core import messages
+from trial.core.effects import AskPolicy, Log, RecordLine, ResetCall, ResetPolicy
+from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.message_log import MESSAGES_KEPT
+from trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
+from trial.core.unfinished import RecordedTrial
+from trial.recordings.resume import add_lines
+
+POLICY = {"afterAbsent": "policy", "substitute": "random"}
+
+# ---- the beginning
+
+
+def test_the_game_begins_by_itself_when_all_are_here_and_have_counted_down():
+    driver = SessionDriver().come(0)
+    told = driver.told(0)
+    assert (told["you"], told["people"]) == ("left", {"left": "here", "right": "awaited"})
+    assert (told["state"], told["heldFor"]) == ("ready", 60)
+    assert "beginsIn" not in told
+    driver.wait(10)
+    assert driver.taken == []
+    driver.come(1)
+    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.told(1)["beginsIn"] == 3
+    assert driver.told(0).keys().isdisjoint({"heldFor", "turnOf"})
+    driver.wait(2.9)
+    assert driver.taken == []
+    driver.wait(0.1)
+    assert len(driver.taken) == 1
+    assert [driver.told(number)["state"] for number in (0, 1)] == ["playing", "playing"]
+    assert "turnOf" not in driver.told(0), "in real time it is all players' turn"
+
+
+def test_start_of_one_does_not_begin_without_the_other():
+    driver = SessionDriver().come(0).say(0, command="start").wait(5)
+    assert driver.taken == []
+
+
+def test_whoever_leaves_in_the_countdown_ends_it():
+    driver = SessionDriver().come(0, 1).wait(2).go(1).wait(2)
+    assert driver.taken == []
+    driver.come(1).wait(2.9)
+    assert driver.taken == []
+    assert len(driver.wait(0.2).taken) >= 1
+
+
+def test_a_member_who_does_not_come_ends_the_game_for_all():
+    driver = SessionDriver().come(0).wait(59.9)
+    assert not driver.trial.progress.over
+    driver.wait(0.2)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
+    assert driver.errors(0) == [PARTNER_MISSING]
+    assert driver.done(0).outcome == "partnerLeft"
+    driver.come(1)
+    assert driver.done(1).outcome == "left", "who comes too late is sent on"
+
+
+def test_a_policy_plays_for_a_member_who_does_not_come():
+    driver = SessionDriver(**POLICY).come(0).wait(64)
+    (ask,) = driver.calls(AskPolicy)
+    driver.event("policy_acted", "right", ask.ask_id, 2, driver.now)
+    driver.wait(0.1)
+    action = driver.taken[-1].actions["right"]
+    assert (ask.player, action.index, action.by) == ("right", 2, "policy")
+    assert driver.told(0)["people"] == {"left": "here", "right": "policy"}
+    assert driver.presence() == [("left", "joined"), ("right", "replaced")]
+
+
+def test_in_a_seat_without_a_member_a_policy_plays_from_the_start():
+    driver = SessionDriver(vacant=("right",), **POLICY).come(0)
+    assert driver.told(0)["people"] == {"left": "here", "right": "policy"}
+    assert driver.told(0)["beginsIn"] == 3
+    driver.wait(4)
+    assert len(driver.taken) > 5
+    assert [ask.player for ask in driver.calls(AskPolicy)] == ["right"]
+    driver.say(0, command="stop").take()
+    assert list(driver.outcomes) == ["P0"], "a seat without a member gets no answer"
+
+
+def test_the_game_begins_when_all_have_gone_on_from_the_instructions():
+    driver = SessionDriver(instructions="rules.html").come(0, 1).wait(60)
+    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    assert driver.taken == []
+    driver.say(0, command="start")
+    assert driver.told(1)["people"] == {"left": "here", "right": "reads"}
+    assert driver.told(0)["heldFor"] == 60
+    driver.wait(50)
+    assert driver.taken == []
+    driver.say(1, command="start").wait(3)
+    assert driver.taken
+
+
+def test_a_member_who_reads_for_ever_holds_the_others_only_for_gather_seconds():
+    driver = SessionDriver(instructions="rules.html").come(0, 1).say(0, command="start").wait(59.9)
+    assert "beginsIn" not in driver.told(0)
+    driver.wait(0.1)
+    assert driver.told(1)["beginsIn"] == 3
+    assert driver.wait(3.1).taken
+
+
+def test_no_time_of_the_game_is_used_before_it():
+    driver = SessionDriver(absent=0).come(0).wait(50).come(1).wait(3.2)
+    assert driver.taken
+    driver.go(1)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
+
+
+def test_who_has_gone_on_from_the_instructions_still_reads_the_page_after_the_first_episode():
+    driver = SessionDriver(instructions="rules.html", betweenEpisodes="between.html", maxEpisodes=2).come(0, 1)
+    driver.say(0, command="start").say(1, command="start").wait(3.05)
+    driver.trial.progress.stepped({}, True, False)
+    taken = len(driver.wait(0.2).taken)
+    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    assert len(driver.wait(30).taken) == taken
+
+
+def test_members_are_told_parts_of_a_second_too():
+    driver = SessionDriver().come(0).wait(59.4996).say(0, command="requestUI")
+    assert driver.told(0)["heldFor"] == 0.5, "thousandths, no more"
+    driver.come(1).wait(2.5).say(1, command="requestUI")
+    assert driver.told(1)["beginsIn"] == 0.5
+
+
+def test_a_substitute_of_an_empty_place_does_not_play_for_members_who_leave():
+    driver = SessionDriver(3, vacant=("third",), substitute="random").begin().go(1).wait(30)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
+    assert driver.told(0)["people"] == {"left": "here", "right": "away", "third": "policy"}
+
+
+# ---- away and back
+
+
+def test_the_game_is_held_while_one_is_away_and_goes_on_with_a_countdown():
+    driver = SessionDriver().begin().wait(1)
+    driver.go(1)
+    held = len(driver.taken)
+    told = driver.told(0)
+    assert (told["state"], told["people"], told["heldFor"]) == ("paused", {"left": "here", "right": "away"}, 30)
+    driver.wait(12).come(1)
+    assert driver.told(0)["beginsIn"] == 3
+    driver.wait(2.9)
+    assert len(driver.taken) == held
+    assert len(driver.wait(0.2).taken) > held
+    assert driver.presence()[2:] == [("right", "left"), ("right", "returned")]
+
+
+def test_the_game_ends_for_all_when_one_stays_away():
+    driver = SessionDriver().begin().wait(1).go(1).wait(30)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
+    assert driver.errors(0) == [PARTNER_LEFT]
+    assert (driver.done(0).outcome, driver.lines("end")[-1]["why"]) == ("partnerLeft", "partnerLeft")
+    assert driver.lines("end")[-1]["outcomes"] == {"left": "partnerLeft", "right": "left"}
+
+
+def test_the_returned_find_the_game_ended_and_why():
+    driver = SessionDriver().begin().wait(1).go(1)
+    driver.now += 30
+    driver.event("advance", driver.now)  # the answers are not stored yet
+    driver.event("connect", "P1", "tab1", Window(), driver.now)
+    assert driver.errors(1) == [LEFT]
+
+
+def test_a_policy_takes_the_place_and_gives_it_back_at_the_next_step():
+    driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
+    assert driver.told(0)["people"]["right"] == "policy"
+    assert driver.told(0)["beginsIn"] == 3
+    (ask,) = driver.calls(AskPolicy)
+    assert (ask.player, ask.observation) == ("right", driver.steps)
+    driver.event("policy_acted", "right", ask.ask_id, 2, driver.now)
+    driver.wait(3.05)
+    action = driver.taken[-1].actions["right"]
+    assert (action.index, action.by) == (2, "policy")
+    driver.come(1).say(1, action="up", held=True)
+    assert driver.told(0)["state"] == "playing", "nobody waits for who comes back"
+    driver.wait(0.2)
+    action = driver.taken[-1].actions["right"]
+    assert (action.index, action.by) == (1, "human")
+    assert driver.presence()[-2:] == [("right", "replaced"), ("right", "returned")]
+
+
+def test_a_policys_answer_that_comes_after_the_return_changes_nothing():
+    driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
+    (ask,) = driver.calls(AskPolicy)
+    driver.come(1).event("policy_acted", "right", ask.ask_id, 2, driver.now)
+    driver.wait(4)
+    assert {step.actions["right"].index for step in driver.taken} == {0}
+
+
+def test_a_policy_that_plays_for_a_member_begins_each_episode_anew():
+    driver = SessionDriver(maxEpisodes=3, **POLICY).begin().wait(1).go(1).wait(33.05)
+    resets = [effect for effect in driver.all if isinstance(effect, ResetPolicy)]
+    assert [(reset.player, reset.seed) for reset in resets] == [("right", driver.lines("presence")[-1]["seed"])]
+    driver.trial.progress.stepped({}, True, False)
+    driver.wait(0.2)
+    resets = [effect for effect in driver.all if isinstance(effect, ResetPolicy)]
+    assert len(resets) == 2
+
+
+def test_nothing_runs_out_while_all_are_gone():
+    driver = SessionDriver().begin().wait(1).go(0).wait(10).go(1).wait(3600)
+    assert not driver.trial.progress.over
+    assert driver.trial.wake_at is None
+    driver.come(1)
+    assert driver.told(1)["heldFor"] == pytest.approx(20, abs=0.01)
+    driver.wait(20.1)
+    assert driver.outcomes == {"P0": "left", "P1": "partnerLeft"}
+
+
+def test_a_page_that_stops_answering_is_away_until_it_answers():
+    driver = SessionDriver()
+    window = Window()
+    driver.come(0)
+    driver.event("connect", "P1", "tab1", window, driver.now)
+    window.sent(1, driver.now)
+    window.acknowledged(1, driver.now + 0.05)
+    driver.wait(3.05)
+    window.sent(2, driver.now)
+    driver.wait(STALLED_SECONDS + 0.5)
+    assert driver.told(0)["people"]["right"] == "away"
+    held = len(driver.taken)
+    driver.wait(5)
+    assert len(driver.taken) == held
+    window.acknowledged(2, driver.now)
+    driver.say(1, ack=2)
+    assert driver.told(0)["people"]["right"] == "here"
+    assert len(driver.wait(3.1).taken) > held
+    assert driver.presence()[2:] == [("right", "left"), ("right", "returned")]
+    said = [message for step in driver.taken for message in step.fields.get("messages", ()) if "event" in message]
+    assert [each["event"] for each in said if each["player"] == "right"] == ["connected", "stopped answering"]
+
+
+def test_another_tab_of_a_member_takes_their_own_place():
+    driver = SessionDriver().begin().wait(1)
+    driver.event("connect", "P1", "tab9", Window(), driver.now)
+    taken = len(driver.taken)
+    assert len(driver.wait(0.3).taken) > taken, "the others do not wait"
+    driver.event("disconnect", "tab1", driver.now)
+    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+
+
+# ---- who does what
+
+
+def test_nobodys_key_moves_another():
+    driver = SessionDriver().begin()
+    driver.say(0, action="up", held=True).say(1, action="right", held=True).wait(0.2)
+    step = driver.taken[-1].actions
+    assert (step["left"].name, step["right"].name) == ("up", "right")
+    driver.go(0).come(0).wait(4)
+    step = driver.taken[-1].actions
+    assert (step["left"].name, step["right"].name) == ("noop", "right"), "only the keys of who left are let go"
+
+
+def test_the_recording_says_when_the_key_was_pressed_that_acts():
+    driver = SessionDriver().begin()
+    driver.now += 0.03
+    driver.say(1, action="up", held=True)
+    pressed = int(driver.now * 1e9)
+    driver.wait(0.3)
+    assert [step.actions["right"].pressed_at for step in driver.taken[1:3]] == [pressed, pressed]
+    assert {step.actions["left"].pressed_at for step in driver.taken} == {None}
+
+
+def test_messages_and_feedback_say_whose_they_are():
+    driver = SessionDriver().begin().say(1, command="good").say(0, command="bad").wait(0.2)
+    step = next(step for step in driver.taken if step.feedback)
+    assert step.feedback == (("good", "right"), ("bad", "left"))
+    said = [(message["player"], message["command"]) for message in step.fields["messages"] if "command" in message]
+    assert said == [("right", "good"), ("left", "bad")]
+
+
+def test_who_sends_very_much_takes_no_room_from_the_others_messages():
+    driver = SessionDriver().begin().wait(0.5).say(0, command="pause")
+    for _ in range(MESSAGES_KEPT + 10):
+        driver.trial.receive("tab0", messages.Message(command="good"), driver.now)
+    driver.say(1, command="bad").say(1, command="start").wait(3.2)
+    step = next(step for step in driver.taken if step.fields.get("messagesDropped"))
+    said = [message["command"] for message in step.fields["messages"] if message["player"] == "right"]
+    assert said == ["bad", "start"]
+    assert step.fields["messagesDropped"] > 0
+
+
+def test_a_pause_of_one_holds_all_and_any_goes_on():
+    driver = SessionDriver().begin().wait(0.5).say(0, command="pause")
+    paused = len(driver.taken)
+    driver.wait(100)
+    assert len(driver.taken) == paused
+    assert driver.told(1)["state"] == "paused"
+    driver.say(1, command="start")
+    assert driver.told(0)["beginsIn"] == 3
+    assert len(driver.wait(3.2).taken) > paused
+
+
+def test_a_pause_in_a_break_holds_the_next_episode_until_one_goes_on():
+    driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2).begin()
+    driver.take(terminated=True).wait(1).say(0, command="pause")
+    assert driver.told(1)["state"] == "paused"
+    taken = len(driver.taken)
+    driver.wait(60)
+    assert len(driver.taken) == taken
+    assert len(driver.say(1, command="start").wait(3.2).taken) > taken
+
+
+def test_stop_of_one_ends_it_for_all_and_the_answers_say_whose_it_was():
+    driver = SessionDriver().begin().wait(0.5)
+    driver.say(1, command="stop").take()
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "stopped"}
+    assert (driver.errors(0), driver.errors(1)) == ([PARTNER_STOPPED], [])
+    assert (driver.done(0).outcome, driver.done(1).outcome) == ("partnerLeft", "stopped")
+    assert driver.lines("end")[-1]["outcomes"] == {"left": "partnerLeft", "right": "stopped"}
+
+
+def test_who_has_stopped_the_game_is_known_on_the_next_server_too():
+    first = SessionDriver().begin().wait(0.5)
+    first.say(1, command="stop").take()
+    second = SessionDriver(recorded=recorded_of(first))
+    assert second.outcomes == {"P0": "partnerLeft", "P1": "stopped"}
+
+
+def test_each_member_has_their_own_score():
+    driver = SessionDriver(maxEpisodes=1).begin()
+    driver.take(rewards={"left": 3.0, "right": 5.0}, terminated=True)
+    answers = dict(driver.answers)
+    assert {human: (each["score"], each["player"]) for human, each in answers.items()} == {
+        "P0": (3, "left"),
+        "P1": (5, "right"),
+    }
+    assert answers["P1"]["scores"] == {"left": 3, "right": 5}
+    assert (driver.done(0).score, driver.done(1).score) == (3, 5)
+    assert driver.done(0).outcome == "finished"
+
+
+def test_who_is_replaced_at_the_end_has_left():
+    driver = SessionDriver(maxEpisodes=1, **POLICY).begin().wait(1).go(1).wait(33.05)
+    driver.trial.progress.stop()
+    driver.wait(0.2)
+    assert driver.outcomes == {"P0": "stopped", "P1": "left"}
+
+
+# ---- breaks
+
+
+def test_a_break_with_a_page_ends_when_all_who_are_here_have_gone_on():
+    driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
+    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    driver.take(terminated=True)
+    assert driver.told(0)["state"] == "break"
+    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    taken = len(driver.taken)
+    driver.say(0, command="start").wait(10)
+    assert driver.told(1)["people"] == {"left": "here", "right": "reads"}
+    assert driver.told(1)["heldFor"] == 60
+    assert len(driver.taken) == taken
+    driver.say(1, command="start").wait(0.2)
+    assert len(driver.taken) > taken
+
+
+def test_a_page_between_episodes_holds_the_others_for_gather_seconds_at_most():
+    driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
+    driver.take(terminated=True).wait(600)
+    assert driver.told(0)["state"] == "break", "nobody waits yet"
+    taken = len(driver.taken)
+    driver.say(0, command="start").wait(59.9)
+    assert len(driver.taken) == taken
+    assert len(driver.wait(0.3).taken) > taken
+
+
+def test_who_leaves_in_a_break_does_not_end_it_for_the_others():
+    driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2).begin()
+    driver.take(terminated=True).wait(5).go(1)
+    assert driver.told(0)["state"] == "break"
+    driver.wait(16)
+    taken = len(driver.taken)
+    assert driver.told(0)["state"] == "paused"
+    driver.come(1).wait(3.2)
+    assert len(driver.taken) > taken
+
+
+# ---- turn by turn
+
+
+def test_turn_by_turn_all_are_told_whose_turn_it_is():
+    driver = SessionDriver(turns=("left", "right"), pace="turns", turnSeconds=20).begin()
+    assert [driver.told(number)["turnOf"] for number in (0, 1)] == [["left"], ["left"]]
+    assert [driver.told(number)["toAct"] for number in (0, 1)] == [True, False]
+    driver.say(1, action="up")
+    assert driver.taken == [], "a press out of turn does nothing"
+    driver.say(0, action="right").take()
+    assert [driver.told(number)["turnOf"] for number in (0, 1)] == [["right"], ["right"]]
+    assert driver.told(1)["turnEndsIn"] == 20
+    driver.say(0, command="pause")
+    assert "turnOf" not in driver.told(1), "while the game is held it is nobody's"
+
+
+def test_turn_by_turn_a_policy_chooses_for_who_stays_away():
+    driver = SessionDriver(turns=("left", "right"), pace="turns", **POLICY).begin()
+    driver.say(0, action="up").take().go(1).wait(33.5)
+    ask = driver.calls(AskPolicy)[-1]
+    assert ask.player == "right"
+    driver.event("policy_acted", "right", ask.ask_id, 2, driver.now)
+    assert driver.taken[-1].actions["right"].index == 2
+
+
+# ---- round trips
+
+
+def test_whose_round_trip_is_too_long_is_refused_before_the_game():
+    driver = SessionDriver(maxPing=100, pingSamples=3).come(0, 1)
+    for seconds in (0.02, 0.5, 0.03):
+        driver.trip(0, seconds)
+    assert driver.told(1)["people"] == {"left": "here", "right": "awaited"}
+    for seconds in (0.3, 0.05, 0.101):
+        driver.trip(1, seconds)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "ping"}
+    assert (driver.errors(1), driver.errors(0)) == ([PING], [PARTNER_MISSING])
+    assert driver.done(1).outcome == "ping"
+
+
+def test_with_a_substitute_the_others_play_without_the_refused_who_goes_on_at_once():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.02).trip(1, 0.2)
+    assert driver.answers == [("P1", {**dict(driver.answers)["P1"], "outcome": "ping", "player": "right"})]
+    assert (driver.errors(1), driver.errors(0)) == ([PING], [])
+    assert driver.done(1) is None
+    driver.event("member_saved", "P1", driver.now)
+    assert driver.done(1).outcome == "ping"
+    driver.say(1, command="stop").wait(3.2)
+    assert driver.taken, "what the refused says does not count"
+    driver.say(0, command="stop").take()
+    assert [human for human, _ in driver.answers] == ["P1", "P0"]
+    assert (driver.done(0).outcome, driver.done(1).outcome) == ("stopped", "ping")
+
+
+def test_a_round_trip_of_just_max_ping_is_short_enough():
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).trip(0, 0.1).trip(1, 0.1)
+    assert driver.told(0)["beginsIn"] == 3
+
+
+def test_if_all_are_refused_no_policies_play_alone():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.2).trip(1, 0.3).wait(10)
+    assert driver.outcomes == {"P0": "ping", "P1": "ping"}
+    assert driver.taken == []
+    assert driver.trial.progress.over
+
+
+def test_who_is_refused_does_not_wait_for_the_others():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.02).trip(1, 0.2).wait(4)
+    driver.go(0).wait(3600)
+    assert driver.presence()[-1] == ("left", "left"), "no policy has taken the place"
+    assert driver.come(0).told(0)["beginsIn"] == 3
+
+
+def test_policies_do_not_play_while_the_only_member_is_still_measured():
+    driver = SessionDriver(maxPing=100, pingSamples=2, **POLICY).come(1).trip(1, 0.02).wait(100)
+    assert driver.taken == []
+    assert driver.trip(1, 0.02).wait(3.2).taken
+    assert driver.told(1)["people"] == {"left": "policy", "right": "here"}
+
+
+@pytest.mark.parametrize("seconds", [1, 10])
+def test_a_member_who_is_still_measured_when_their_time_is_over_gets_their_place_back(seconds):
+    """Before the game has begun without them, or in the game."""
+    driver = SessionDriver(maxPing=100, pingSamples=2, **POLICY).come(0).trip(0, 0.02).trip(0, 0.02).wait(59.9)
+    driver.come(1).trip(1, 0.02).wait(seconds)
+    assert driver.told(0)["people"]["right"] == "policy"
+    driver.trip(1, 0.02).wait(4).say(1, action="up", held=True).wait(0.2)
+    assert driver.told(0)["people"]["right"] == "here"
+    assert driver.taken[-1].actions["right"].by == "human"
+    assert driver.presence()[-2:] == [("right", "replaced"), ("right", "returned")]
+
+
+def test_a_round_trip_that_comes_after_the_end_changes_no_outcome():
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0).trip(0, 0.02).wait(59.9).come(1)
+    driver.say(0, command="good").now += 1
+    driver.event("advance", driver.now)  # the agent hears the last feedback
+    driver.event("round_trip", "P1", 9.0, driver.now)
+    driver.event("connect", "P1", "tab1", Window(), driver.now)
+    assert driver.errors(1)[-1] == LEFT
+
+
+def test_who_takes_their_place_back_from_a_policy_plays_at_once_however_long_their_round_trip():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0).trip(0, 0.02).wait(64)
+    driver.come(1)
+    assert (driver.told(0)["state"], driver.told(0)["people"]["right"]) == ("playing", "here")
+    driver.trip(1, 9.0).wait(0.2)
+    assert driver.told(0)["people"]["right"] == "here"
+
+
+@pytest.mark.parametrize("trips", [(0.01, 0.03, 0.02), (0.3, 0.01, 0.03, 0.0)])
+def test_the_median_of_the_round_trips_is_recorded_when_the_game_begins(trips):
+    driver = SessionDriver(pingSamples=len(trips)).come(0, 1)
+    for seconds in trips:
+        driver.trip(1, seconds)
+    driver.wait(3.2)
+    assert driver.lines("ping")[0]["roundTrip"] == {"right": 20}
+
+
+def test_in_the_game_each_round_trip_is_recorded_in_milliseconds():
+    driver = SessionDriver().begin().wait(1).trip(0, 0.6).wait(0.2)
+    (line,) = driver.lines("ping")
+    assert line["roundTrip"] == {"left": 600}
+    assert line["step"] > 0
+    assert driver.presence() == [("left", "joined"), ("right", "joined")], "it moves no one"
+
+
+def test_an_episode_begins_with_the_latest_round_trips_and_who_is_replaced():
+    driver = SessionDriver(maxEpisodes=2, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.6).wait(3.2)
+    driver.trip(0, 0.9).trip(1, 0.05).go(1).wait(34)
+    driver.trial.progress.stepped({}, True, False)
+    driver.wait(0.2)
+    first, second = driver.calls(ResetCall)
+    assert first.fields == {}
+    assert second.fields == {"roundTrip": {"left": 900, "right": 50}, "standIns": ["right"]}
+
+
+@pytest.mark.parametrize(("why", "goes"), [
+    ("their round trip is too long", lambda driver: driver.trip(0, 0.02).trip(1, 0.2)),
+    ("they stay away", lambda driver: driver.trip(0, 0.02).go(1).wait(60)),
+], ids=["ping", "away"])  # fmt: skip
+def test_the_log_says_why_the_game_ends_for_all(why, goes):
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1)
+    goes(driver)
+    assert driver.calls(Log)[0].text == f"the game ends for all without right: {why}"
+
+
+def test_a_long_round_trip_during_the_game_changes_nothing():
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).trip(0, 0.02).trip(1, 0.02).wait(3.5)
+    driver.trip(1, 9.0).wait(0.2)
+    assert not driver.trial.progress.over
+
+
+# ---- another server goes on
+
+
+def recorded_of(driver, *, ended=True):
+    """What the next server reads of what this one has recorded; the agent's own lines are made up."""
+    lines = [{"kind": "reset", "episode": 1, "seed": 7}]
+    part = {"action": 0, "reward": 1.0}
+    for number in range(1, driver.steps + 1):
+        lines.append({"kind": "step", "episode": 1, "step": number, "human": None, "action": 0, "reward": 1.0,
+                      "players": dict.fromkeys(driver.names, part)})  # fmt: skip
+    kinds = ("presence", "end", "break") if ended else ("presence",)
+    effects = [effect for effect in driver.all if isinstance(effect, RecordLine) and effect.kind in kinds]
+    found = RecordedTrial()
+    add_lines(found, [*lines, *({"kind": effect.kind, **effect.fields} for effect in effects)])
+    return found
+
+
+def test_on_the_next_server_all_are_waited_for_again_and_nobody_reads_again():
+    first = SessionDriver(instructions="rules.html").come(0, 1)
+    first.say(0, command="start").say(1, command="start").wait(5)
+    second = SessionDriver(instructions="rules.html", recorded=recorded_of(first, ended=False)).come(0)
+    assert second.trial.progress.steps == first.steps
+    assert second.told(0)["people"] == {"left": "here", "right": "awaited"}
+    second.come(1)
+    assert second.told(1)["beginsIn"] == 3
+    assert second.wait(3.1).taken[0].fields["step"] == first.steps + 1
+
+
+def test_a_game_that_has_ended_for_all_is_over_on_the_next_server_too():
+    first = SessionDriver().begin().wait(1).go(1).wait(30)
+    second = SessionDriver(recorded=recorded_of(first))
+    assert second.outcomes == first.outcomes == {"P0": "partnerLeft", "P1": "left"}
+    second.come(0, 1)
+    assert (second.done(0).outcome, second.done(1).outcome) == ("partnerLeft", "left")
+    assert second.taken == []
+
+
+def test_a_game_that_has_ended_in_a_break_is_over_on_the_next_server_too():
+    first = SessionDriver(betweenEpisodes=60, maxEpisodes=2).begin()
+    first.take(terminated=True).go(1).wait(31)
+    assert first.lines("break")[-1]["why"] == "partnerLeft"
+    second = SessionDriver(betweenEpisodes=60, maxEpisodes=2, recorded=recorded_of(first))
+    assert second.outcomes == {"P0": "partnerLeft", "P1": "left"}
+
+
+def test_who_was_refused_is_refused_on_the_next_server_too():
+    section = {"maxPing": 100, "pingSamples": 1, **POLICY}
+    first = SessionDriver(**section).come(0, 1).trip(0, 0.02).trip(1, 0.2).wait(4)
+    second = SessionDriver(**section, recorded=recorded_of(first, ended=False)).come(0)
+    second.wait(3.2)
+    assert second.taken, "the others do not wait for them"
+    second.event("member_saved", "P1", second.now)
+    second.come(1)
+    assert (second.errors(1), second.done(1).outcome) == ([PING], "ping")
+
+
+def test_the_next_server_knows_whose_feedback_the_agent_has_not_heard():
+    lines = [
+        {"kind": "reset", "episode": 1, "seed": 7},
+        {"kind": "end", "episode": 1, "why": "shutdown", "messages": [{"command": "good", "player": "right"}]},
+    ]
+    found = RecordedTrial()
+    add_lines(found, lines)
+    driver = SessionDriver(recorded=found).begin().wait(0.2)
+    assert driver.taken[0].feedback == (("good", "right"),)
+
+
+@pytest.mark.parametrize("seconds", [0, 70])
+def test_each_page_between_episodes_waits_for_all_anew(seconds):
+    """Also after an episode that is longer than all wait for each other at a page."""
+    driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=3).begin()
+    for _ in range(2):
+        driver.take(terminated=True)
+        assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+        taken = len(driver.taken)
+        driver.say(0, command="start").wait(5)
+        assert len(driver.taken) == taken
+        driver.say(1, command="start").wait(0.15)
+        assert len(driver.taken) > taken
+        driver.take().wait(seconds).take()
+        driver.now = max(driver.now, driver.trial.wake_at or 0.0)
+        driver.event("advance", driver.now)
+
+
+def test_a_pause_in_the_countdown_is_told_at_once():
+    driver = SessionDriver().come(0, 1).say(0, command="pause")
+    assert "beginsIn" not in driver.told(1)
+
+
+def test_a_break_that_all_who_are_here_have_ended_leads_to_no_step_without_the_missing():
+    driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
+    driver.take(terminated=True).go(1)
+    taken = len(driver.taken)
+    driver.say(0, command="start").wait(20)
+    assert len(driver.taken) == taken
+    assert driver.told(0)["state"] == "paused"

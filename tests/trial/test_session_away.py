@@ -1,0 +1,84 @@
+"""Two members on a real server: a page that sleeps and wakes, a connection that is lost, a policy in the place."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from tests.trial.sessions import answer, form, launch_session, member, recordings
+
+pytestmark = pytest.mark.timeout(90)
+
+
+async def both_play(anna: Any, bert: Any) -> None:
+    for client in (anna, bert):
+        await client.until(lambda client=client: client.state.get("state") == "playing")
+
+
+def people(client: Any) -> dict[str, str]:
+    found: dict[str, str] = client.state.get("people", {})
+    return found
+
+
+def test_a_page_that_sleeps_is_away_and_is_back_by_its_acknowledgement_alone(launch):
+    server = launch_session(launch, trial={"startingFrameRate": 20})
+    form(server.store)
+
+    async def run() -> None:
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            await both_play(anna, bert)
+            await anna.until(lambda: len(anna.frames) > 5)
+            anna.acks = False
+            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "away"), 20)
+            assert bert.state["state"] == "paused"
+            await anna.until(lambda: people(anna).get("left") == "away")
+            await anna.say(ack=anna.frames[-1][1])
+            anna.acks = True
+            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "here"), 20)
+            await bert.until(lambda: bert.state["state"] == "playing")
+
+    asyncio.run(run())
+
+
+def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launch):
+    trial = {"startingFrameRate": 20, "substitute": "agent:Partner", "afterAbsent": "policy", "absent": 1}
+    server = launch_session(launch, trial=trial)
+    form(server.store)
+
+    async def run() -> None:
+        async with member(server, "bert") as bert:
+            async with member(server, "anna") as anna:
+                await both_play(anna, bert)
+            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "policy"), 20)
+            await bert.until(lambda: bert.state["state"] == "playing")
+            seen = len(bert.frames)
+            await bert.until(lambda: len(bert.frames) > seen + 5)
+            async with member(server, "anna") as anna:
+                await anna.say(action="up", held=True)
+                seen = len(anna.frames)
+                await anna.until(lambda: len(anna.frames) > seen + 5)
+                assert people(anna) == {"left": "here", "right": "here"}
+                await anna.say(command="stop")
+                await anna.until(lambda: anna.done)
+                await bert.until(lambda: bert.done)
+
+    asyncio.run(run())
+    assert server.wait() == 0, server.said()
+    lines = [line for found in recordings(server.store).values() for line in found]
+    head = next(line for line in lines if line["kind"] == "header")
+    assert head["players"]["left"] == {
+        "kind": "human",
+        "substitute": {"kind": "policy", "policy": "agent:Partner"},
+        "seat": 0,
+    }
+    moved = [(line["player"], line["what"]) for line in lines if line["kind"] == "presence"]
+    assert [what for player, what in moved if player == "left"][:4] == ["joined", "left", "replaced", "returned"]
+    by = [line["players"]["left"]["by"] for line in lines if line["kind"] == "step"]
+    assert "policy" in by
+    assert by[-1] == "human", "she plays again"
+    last = [line for line in lines if line["kind"] == "step"][-1]["players"]["left"]
+    assert last["pressedAt"] <= lines[-1]["ns"]
+    outcomes = {user: answer(server.store, user)["answers"]["outcome"] for user in ("anna", "bert")}
+    assert outcomes == {"anna": "stopped", "bert": "partnerLeft"}

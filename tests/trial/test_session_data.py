@@ -1,0 +1,132 @@
+"""What a real session's server records is what `data` and `erase` read: whose it is, and what is one member's alone."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from console.problem import Exit
+from deploy.__main__ import main
+from hippodrome.model.memberships import Membership
+from hippodrome.model.records import to_json
+from protocol.keys import membership_key
+from tests.trial.sessions import SID, form, launch_session, member, put, recordings
+from tests.trial.two_players import two_players
+from trial.core.unfinished import RecordedTrial
+from trial.recordings.resume import add_lines
+
+FEEDBACK = {"ui": {"up": True, "down": True, "start": True, "stop": True, "good": True, "bad": True}}
+
+
+CALLBACKS = """
+
+class Agent(Agent):
+    on_join = on_leave = on_return = lambda self, session, player: "of " + player
+    on_feedback = lambda self, session, player, word: word
+"""
+
+
+@pytest.fixture
+def store(launch: Any) -> Path:
+    """The data of a session of anna and bert, who have pressed keys and given feedback; bert has come back."""
+    server = launch_session(
+        launch,
+        agent=two_players() + CALLBACKS,
+        trial={**FEEDBACK, "recordObservations": True, "pingSamples": 1, "absent": 20},
+    )
+    form(server.store)
+    for seat, user in enumerate(("anna", "bert")):
+        put(server.store, membership_key("study", user), to_json(Membership(SID, seat, members=2)))
+
+    async def play() -> None:
+        async with member(server, "anna") as anna:
+            async with member(server, "bert") as bert:
+                await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= 3) for each in (anna, bert)))
+                await anna.say(action="up")
+                await bert.say(action="down")
+                await anna.say(command="good")
+                await bert.say(command="bad")
+                await bert.until(lambda: len(bert.frames) >= 8)
+            async with member(server, "bert") as bert:
+                await bert.until(lambda: len(bert.frames) >= 5)
+                await anna.say(command="stop")
+                await asyncio.gather(anna.closed(), bert.closed())
+
+    asyncio.run(play())
+    assert server.wait() == 0
+    found: Path = server.store
+    return found
+
+
+def data(store: Path, out: Path) -> dict[str, list[dict[str, str]]]:
+    code = main(["data", str(out), "--project", "study", "--from", str(store), "--format", "csv,parquet,minari"])
+    assert code == Exit.DONE
+    found = {}
+    for name in ("answers", "episodes", "problems"):
+        with (out / f"{name}.csv").open(newline="") as file:
+            found[name] = list(csv.DictReader(file))
+    return found
+
+
+def of_one(store: Path, player: str) -> list[Any]:
+    """Everything in the session's recordings that is of one player alone."""
+    (lines,) = recordings(store).values()
+    found: list[Any] = [m for line in lines for m in line.get("messages") or () if m.get("player") in (player, None)]
+    for line in lines:
+        found += [line[name][player] for name in ("roundTrip", "outcomes") if player in (line.get(name) or {})]
+        if line["kind"] in ("presence", "callback") and line["player"] == player:
+            found.append(line)
+        if line["kind"] not in ("header", "reset"):
+            part = (line.get("players") or {}).get(player, {})
+            found += [part[name] for name in ("pressedAt", "human") if part.get(name) is not None]
+    return found
+
+
+def test_a_real_session_becomes_tables_and_datasets(store: Path, tmp_path: Path) -> None:
+    found = data(store, tmp_path / "out")
+    assert found["problems"] == []
+    answers = {row["participant"]: row for row in found["answers"]}
+    assert {user: (row["session"], row["3.session"], row["3.player"]) for user, row in answers.items()} == {
+        "anna": (SID, SID, "left"),
+        "bert": (SID, SID, "right"),
+    }
+    (anna, bert) = found["episodes"]
+    assert [(row["participant"], row["player"], row["session"]) for row in (anna, bert)] == [
+        ("anna", "left", SID),
+        ("bert", "right", SID),
+    ]
+    assert anna["frames"] == bert["frames"] != "0"
+    assert {path.name for path in (tmp_path / "out/minari").iterdir()} == {"study-3-left-v0", "study-3-right-v0"}
+    for name in ("left", "right"):
+        about = json.loads((tmp_path / f"out/minari/study-3-{name}-v0/data/metadata.json").read_text())
+        assert "not recorded" not in about["description"]
+
+
+@pytest.mark.parametrize(("user", "mine", "other"), [("anna", "left", "right"), ("bert", "right", "left")])
+def test_what_is_one_members_alone_leaves_a_real_recording(
+    store: Path, tmp_path: Path, user: str, mine: str, other: str
+) -> None:
+    (whole,) = recordings(store).values()
+    theirs, ours = of_one(store, other), of_one(store, mine)
+    assert {"presence", "callback"} <= {each["kind"] for each in ours if isinstance(each, dict) and "kind" in each}
+    assert {"key", "command", "action"} & {name for each in ours if isinstance(each, dict) for name in each}
+    assert main(["erase", user, "--project", "study", "--from", str(store), "--yes"]) == Exit.DONE
+    assert of_one(store, mine) == []
+    assert of_one(store, other) == theirs
+    (left,) = recordings(store).values()
+    before, after = RecordedTrial(), RecordedTrial()
+    add_lines(before, whole)
+    add_lines(after, left)
+    taken = [[{name: part.action for name, part in step.players.items()} for step in each.steps]
+             for each in (before.unfinished, after.unfinished) if each]  # fmt: skip
+    assert before.ended == after.ended
+    assert taken[:1] == taken[1:]
+    assert not (store / "study/users" / user).exists()
+    found = data(store, tmp_path / "out")
+    assert found["problems"] == []
+    assert [row["participant"] for row in found["episodes"] if row["player"] == mine] == [""]

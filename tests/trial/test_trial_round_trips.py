@@ -1,0 +1,131 @@
+"""Round trips are measured by the WebSocket's own pings, which any client answers without its page."""
+
+import asyncio
+import contextlib
+import time
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.asyncio.server import serve
+from websockets.frames import Opcode
+
+from tests.trial.far_away import far_away
+from trial.wire import round_trips
+from trial.wire.player_socket import PlayerSocket
+
+
+class Pinged(PlayerSocket):
+    """Counts pings that wait for their pong."""
+
+    most = 0
+
+    async def ping(self, data=None):
+        answer = await super().ping(data)
+        self.most = max(self.most, len(self.pending_pings))
+        return answer
+
+
+@contextlib.asynccontextmanager
+async def measured(samples, *, delay=None):
+    """A connection that is measured; yields the client, the server's end, and the times and seconds that it reports."""
+    reports, ends = [], []
+
+    async def handle(websocket):
+        ends.append(websocket)
+        await round_trips.measure(websocket, samples, lambda seconds: reports.append((time.monotonic(), seconds)))
+
+    async with (
+        serve(handle, "127.0.0.1", 0, create_connection=Pinged, compression=None, ping_interval=None) as server,
+        contextlib.AsyncExitStack() as stack,
+    ):
+        port = server.sockets[0].getsockname()[1]
+        if delay is not None:
+            port = await stack.enter_async_context(far_away(port, delay))
+        async with connect(f"ws://127.0.0.1:{port}", proxy=None, ping_interval=None, compression=None) as client:
+            while not ends:
+                await asyncio.sleep(0.01)
+            yield client, ends[0], reports
+
+
+async def until(true, seconds=10):
+    async with asyncio.timeout(seconds):
+        while not true():
+            await asyncio.sleep(0.01)
+
+
+def test_what_is_reported_is_the_way_there_and_back():
+    async def run():
+        async with measured(3, delay=0.1) as (_, _, reports):
+            await until(lambda: len(reports) == 3)
+        assert all(0.2 <= seconds < 2 for _, seconds in reports)
+
+    asyncio.run(run())
+
+
+def test_the_samples_come_one_after_the_other_and_then_one_now_and_then(monkeypatch):
+    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 3.0)
+
+    async def run():
+        async with measured(4) as (_, end, reports):
+            await until(lambda: len(reports) == 5)
+            assert end.most == 1
+        times = [when for when, _ in reports]
+        assert times[3] - times[0] < 2.9, "four samples"
+        assert times[4] - times[3] >= 2.9
+
+    asyncio.run(run())
+
+
+def test_a_client_that_does_not_answer_is_reported_as_slow_and_pinged_no_more_meanwhile(monkeypatch):
+    monkeypatch.setattr(round_trips, "LONGEST_SECONDS", 0.3)
+    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
+
+    async def run():
+        async with measured(1) as (client, end, reports):
+            await until(lambda: len(reports) >= 1)
+            client.transport.pause_reading()
+            await until(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
+            assert len(end.pending_pings) == 1
+            known = len(reports)
+            client.transport.resume_reading()
+            await until(lambda: len(reports) > known)
+            assert all(seconds < 0.3 for _, seconds in reports[known:]), "the ping that was late counts once"
+            assert end.most == 1
+
+    asyncio.run(run())
+
+
+def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
+    """A client that sends pongs ahead does not know the four bytes of the ping that they would have to answer."""
+    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.3)
+
+    async def run():
+        async with measured(1, delay=0.1) as (client, _, reports):
+            for _ in range(200):
+                await client.pong(b"1234")
+            await until(lambda: len(reports) == 3)
+        assert all(seconds >= 0.2 for _, seconds in reports)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_measuring_ends_with_the_connection(answers):
+    async def run():
+        async with measured(1) as (client, _, reports):
+            await until(lambda: reports)
+            if not answers:
+                client.transport.pause_reading()
+            client.transport.abort()
+            known = len(reports)
+        assert len(reports) - known <= 1
+
+    asyncio.run(run())
+
+
+def test_a_ping_costs_sixteen_bytes():
+    """What round_trips.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
+    from websockets.frames import Frame
+
+    ping, pong = (Frame(opcode, b"1234") for opcode in (Opcode.PING, Opcode.PONG))
+    assert (len(ping.serialize(mask=False)), len(pong.serialize(mask=True))) == (6, 10)

@@ -1,0 +1,117 @@
+"""A trial that one participant plays. It decides what `trial/core/session.py` decides if several do: same calls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from trial.core import records
+from trial.core.effects import SaveAnswer
+from trial.core.flow_control import Window
+from trial.core.messages import CommandRefused, Message
+from trial.core.progress import Progress
+
+
+class Alone:
+    """The one participant of a trial: who comes and goes, and what follows from it."""
+
+    def __init__(self, progress: Progress, trial_id: str) -> None:
+        self._progress = progress
+        self._trial_id = trial_id
+
+    def place_of(self, human: str) -> str:
+        """The player whom this human plays."""
+        return self._progress.first
+
+    def name_of(self, player: str) -> str | None:
+        """What the recording calls the participant who plays this player: nothing, there is one."""
+        return None
+
+    # ---- what happens
+
+    def come(self, player: str, now: float) -> None:
+        """The participant has connected. They begin, or go on, by `start`."""
+
+    def go(self, player: str, now: float, *, closing: bool) -> None:
+        """The participant has gone: hold the game, unless the server is `closing`, which has ended what was on."""
+        if not closing:
+            self._progress.leave(player)
+
+    def sleeps(self, player: str, now: float) -> bool:
+        """The participant's page has stopped answering, as if they had gone. Whether that is new."""
+        self._progress.leave(player)
+        return True
+
+    def hears(self, player: str, message: Message, window: Window, now: float) -> bool:
+        """A message has come; whether it is read. Raises CommandRefused."""
+        if message.hidden is not None:
+            raise CommandRefused("unknown field 'hidden'")
+        return True
+
+    def start(self, player: str, now: float) -> None:
+        """The participant begins or goes on."""
+        self._progress.start()
+
+    def pause(self, now: float) -> None:
+        """The participant holds the game."""
+        self._progress.pause()
+
+    def stop(self, player: str) -> None:
+        """The participant is to end the game, after the step that is being taken."""
+
+    def stopped(self) -> None:
+        """The game has ended so."""
+
+    def round_trip(self, player: str, seconds: float, now: float) -> None:
+        """The participant's browser has answered a ping. Only sessions measure it."""
+
+    def saved(self, human: str) -> None:
+        """The answer of a member who does not play is stored. There is none."""
+
+    # ---- what follows
+
+    def attend(self, now: float, seconds: float) -> None:
+        """Bring the game into line with who is here. One participant's game follows their commands alone."""
+
+    def wake_at(self, now: float) -> float | None:
+        """When to look again if nothing happens; there is no need to."""
+        return None
+
+    # ---- recordings and answers
+
+    def of_reset(self) -> Mapping[str, Any]:
+        """More for the line of a reset."""
+        return {}
+
+    def outcomes(self) -> Mapping[str, str | None] | None:
+        """How the trial has ended for each member."""
+        return None
+
+    def write_lines(self) -> None:
+        """Write the lines that wait for an open recording."""
+
+    def answer(self, seconds: float, *, played: bool) -> SaveAnswer:
+        """What is to be stored; `seconds` were played. Without an answer if the game could not be `played`."""
+        return SaveAnswer(records.answers(self._progress, seconds, self._trial_id) if played else None)
+
+    # ---- what the participant is told
+
+    def state(self) -> None:
+        """Another value whenever the members are to be told of each other anew."""
+        return None
+
+    def told(self, now: float) -> Mapping[str, Any] | None:
+        """What all members are told of each other."""
+        return None
+
+    def sentence(self, player: str) -> str | None:
+        """Why the game is over for a member, in words."""
+        return None
+
+    def has_answered(self, human: str) -> bool:
+        """Whether the member's answer is stored, while the others play."""
+        return False
+
+    def answer_of(self, human: str) -> Mapping[str, Any] | None:
+        """A member's own answer, once there is one."""
+        return None

@@ -1,0 +1,102 @@
+"""How an episode begins: its seed, its recording, then a reset, or the steps that an earlier server recorded. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from trial.core.alone import Alone
+from trial.core.effects import Call, Effect, RecordLine, ReplayCall, Replayed, ResetCall, ResetPolicy
+from trial.core.message_log import MessageLog
+from trial.core.policies import Observed
+from trial.core.progress import Progress
+from trial.core.recording import Recording
+from trial.core.seeds import policy_seed
+from trial.core.session import Session
+from trial.core.timing import Timing
+from trial.core.unfinished import UnfinishedEpisode
+from trial.settings import Settings
+
+
+class Beginning:
+    """Begins one episode after the other; the caller makes the calls of the agent that this returns."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        timing: Timing,
+        recording: Recording,
+        message_log: MessageLog,
+        new_seed: Callable[[], int],
+        emit: Callable[[Effect], None],
+    ) -> None:
+        self._settings = settings
+        self._timing = timing
+        self._recording = recording
+        self._message_log = message_log
+        self._new_seed = new_seed
+        self._emit = emit
+        self._seed = 0  # of the episode
+        self.unfinished: UnfinishedEpisode | None = None
+        """An earlier server began the episode that comes next."""
+        self.begun_again: int | None = None
+        """This episode begins anew, because it could not be replayed."""
+
+    def begin(self, progress: Progress, session: Alone | Session) -> Call | None:
+        """The call that begins the next episode; None: a recording is to be opened before."""
+        self._timing.begin_episode()  # what pages are told before the reset is the new episode's time
+        unfinished = self.unfinished
+        self._seed = self._next_seed(progress) if unfinished is None or unfinished.seed is None else unfinished.seed
+        if self._recording.is_open:
+            return self._reset(progress, session)
+        self._recording.ask(progress, self._seed)
+        return None
+
+    def _next_seed(self, progress: Progress) -> int:
+        first = self._settings.trial.seed
+        return self._new_seed() if first is None else first + progress.episode - 1
+
+    def opened(self, progress: Progress, session: Alone | Session, ns: int) -> Call:
+        """The call that begins the episode now that its recording is open. `ns` is the time, for messages."""
+        unfinished, self.unfinished = self.unfinished, None
+        if unfinished is not None and unfinished.steps:
+            progress.choices.begins(self._seed)
+            default = {name: player.idle for name, player in progress.players.items()}
+            return ReplayCall(limit=self._settings.start_seconds, unfinished=unfinished, default_actions=default)
+        if unfinished is not None:
+            self.repeat_feedback(unfinished, ns)
+        return self._reset(progress, session)
+
+    def begin_again(self, progress: Progress, session: Alone | Session) -> Call:
+        """The call that begins an episode anew that could not be replayed."""
+        self.begun_again = progress.episode
+        return self._reset(progress, session)
+
+    def _reset(self, progress: Progress, session: Alone | Session) -> Call:
+        progress.choices.begins(self._seed)
+        self._reset_policies(progress, {})
+        return ResetCall(
+            limit=self._settings.step_seconds,
+            episode=progress.episode,
+            seed=self._seed,
+            asked=frozenset(player.name for player in progress.choices.policies.asked),
+            fields=session.of_reset(),
+        )
+
+    def _reset_policies(self, progress: Progress, observed: Mapping[str, Sequence[Observed]]) -> None:
+        for player in progress.choices.policies.asked:
+            seed = policy_seed(self._seed, player.name)
+            self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
+
+    def replayed(self, progress: Progress, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
+        """The episode stands where the earlier server left it."""
+        steps = len(unfinished.steps)
+        self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
+        self._reset_policies(progress, replayed.observed)
+        self._timing.resume_episode(steps / progress.frame_rate)
+        progress.replayed(steps, unfinished.scores or {progress.first: unfinished.score})
+        progress.choices.policies.go_on(unfinished.going_on, unfinished.failures)
+
+    def repeat_feedback(self, unfinished: UnfinishedEpisode, ns: int) -> None:
+        """Take up the feedback that an earlier server's agent did not hear any more."""
+        self._message_log.repeat(unfinished.unheard, ns)

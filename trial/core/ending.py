@@ -1,0 +1,86 @@
+"""How an episode, a break and the trial end: the last feedback, the lines of the recording, then the answer. Pure."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from trial.core import records
+from trial.core.alone import Alone
+from trial.core.effects import Effect, FeedbackCall, Log
+from trial.core.ended import Break, Episode
+from trial.core.message_log import MessageLog
+from trial.core.progress import Progress
+from trial.core.recording import Recording
+from trial.core.session import Session
+from trial.core.timing import Timing
+from trial.settings import Settings
+
+LAST_CALL_SECONDS = 2.0
+"""The time that a call of the agent has to come back once the server must end."""
+
+
+class Ending:
+    """Records what is over (`Progress.ended`), one after the other, and at last the end of the trial."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        timing: Timing,
+        recording: Recording,
+        message_log: MessageLog,
+        emit: Callable[[Effect], None],
+    ) -> None:
+        self._settings = settings
+        self._timing = timing
+        self._recording = recording
+        self._message_log = message_log
+        self._emit = emit
+        self._break_shut_down = False
+        self.closing = False
+        """The server must end."""
+        self.all_written = False
+        """The last lines are written, and the answer was given to the store."""
+
+    def last_feedback(self, progress: Progress) -> FeedbackCall:
+        """The call before the first end is recorded: the agent hears the feedback, and its callbacks what is over."""
+        return FeedbackCall(
+            limit=LAST_CALL_SECONDS if self.closing else self._settings.step_seconds,
+            feedback=self._message_log.feedback,
+            messages=len(self._message_log.messages),
+            over=progress.ended[0],
+            last=progress.over and len(progress.ended) == 1,
+        )
+
+    def record(self, call: FeedbackCall, progress: Progress, session: Alone | Session) -> None:
+        """Record the end of the first episode or break that is over, with the messages before this call."""
+        over = progress.ended.pop(0)
+        if isinstance(over, Episode):
+            for player, late in progress.choices.policies.late().items():
+                self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
+        outcomes = session.outcomes() if progress.over and not progress.ended else None
+        self._emit(records.end(over, self._message_log.messages[: call.messages], outcomes))
+        self._message_log.recorded(call.messages, len(call.feedback))
+        # The break after an episode belongs to its file.
+        more = isinstance(progress.ended[0], Break) if progress.ended else progress.on_break
+        if self._settings.trial.data_file == "episode" and not more:
+            self._close_recording(session)
+
+    def shut_down_break(self, progress: Progress) -> None:
+        """If the server must end in a break, it ends the break."""
+        if self.closing and progress.on_break and not self._break_shut_down:
+            self._break_shut_down = True
+            progress.ended.append(Break(progress.episode, "shutdown"))
+
+    def write_last(self, progress: Progress, session: Alone | Session, *, broken: bool) -> None:
+        """Write the last lines, and give the answer to the store; none if the game was `broken`, or is not over."""
+        self.all_written = True
+        if self.closing and not progress.over and not progress.on_break:
+            self._emit(records.shutdown(progress, self._message_log.messages))
+        self._close_recording(session)
+        self._emit(session.answer(self._timing.seconds, played=progress.over and not broken))
+
+    def _close_recording(self, session: Alone | Session) -> None:
+        session.write_lines()
+        self._recording.close()

@@ -1,0 +1,336 @@
+"""Who of a session's members is here, how long the others wait for the rest, and when the game may go on. Pure.
+
+The game goes on while every member is here, or a policy plays in their place. Otherwise it is held. A member may be
+missing for `gather` seconds before the game, and then for `absent` seconds. This time runs while another member waits,
+and stops while all are gone. A member who plays gets used time back little by little, so a member who comes and goes
+cannot hold the others for ever. Before the game begins, and after each hold, there is a countdown. All times are
+seconds of one monotonic clock, which is passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+Where = Literal["here", "reads", "awaited", "away", "policy"]
+"""What the others are told of a player. reads: here, but still at the page before the game or between two episodes;
+awaited: has not come yet; away: was here."""
+LEAST_ABSENCE = 3.0
+"""An absence uses so many seconds at least, or a third of `absent`: the countdown begins anew after it."""
+GIVEN_BACK = 0.25
+"""So many seconds of their time a member has again for each second of play."""
+Over = Literal["absent", "ping"]
+"""Why a member does not play any more: their time is over, or their round trip is too long."""
+
+
+@dataclass(slots=True)
+class _Member:
+    player: str
+    samples: deque[float]
+    left: float
+    """Seconds for which the others still wait, while the clock stands."""
+    measured: bool
+    until: float | None = None
+    """The clock runs: so long do the others wait."""
+    connected: bool = False
+    asleep: bool = False
+    hidden: bool = False
+    met: bool = False
+    gone_on: bool = False
+    over: Over | None = None
+
+    @property
+    def takes_part(self) -> bool:
+        return self.connected and not self.asleep and not self.hidden and self.over != "ping"
+
+    @property
+    def here(self) -> bool:
+        return self.takes_part and self.measured
+
+    @property
+    def missing(self) -> bool:
+        return self.over is None and not self.here
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What the project says: seconds, milliseconds, numbers."""
+
+    absent: float
+    gather: float
+    countdown: float
+    max_ping: float
+    ping_samples: int
+
+
+@dataclass(slots=True)
+class Presence:
+    """All members of a session, by their player."""
+
+    rules: Rules
+    players: Sequence[str]
+    """Those of the members, in their order."""
+    reads: bool
+    """There is a page to read: the game begins when all have gone on from it."""
+    begun: bool
+    """The game has begun, here or on an earlier server: round trips are not compared with `max_ping` any more."""
+    paused: bool = False
+    """A member has paused the game."""
+    version: int = 0
+    """Becomes another number whenever something changes that members are told."""
+    _members: dict[str, _Member] = field(init=False)
+    _counts_until: float | None = None
+    _page_until: float | None = None
+    _on_since: float | None = None
+    """The game is on since then."""
+
+    def __post_init__(self) -> None:
+        left, samples = self.rules.absent if self.begun else self.rules.gather, self.rules.ping_samples
+        measured = self.begun or not self.rules.max_ping
+        self._members = {name: _Member(name, deque(maxlen=samples), left, measured) for name in self.players}
+
+    # ---- what happens
+
+    def come(self, player: str, now: float) -> Literal["joined", "returned"]:
+        """The member has connected. Whoever was replaced finds their place."""
+        self._give_time_back(now)
+        member = self._members[player]
+        returned, member.met = member.met, True
+        member.connected, member.asleep, member.hidden = True, False, False
+        if member.over == "absent":
+            member.over = None
+        self._changed(now)
+        return "returned" if returned else "joined"
+
+    def go(self, player: str, now: float) -> None:
+        """The member's connection is closed."""
+        self._give_time_back(now)
+        self._members[player].connected = False
+        self._changed(now)
+
+    def sleeps(self, player: str, now: float) -> bool:
+        """The member's page has stopped answering; whether they are away only since then."""
+        member = self._members[player]
+        return self._turns_away(member, now, asleep=True, hidden=member.hidden)
+
+    def hides(self, player: str, now: float) -> bool:
+        """The member looks at another page; whether they are away only since then."""
+        member = self._members[player]
+        return self._turns_away(member, now, asleep=member.asleep, hidden=True)
+
+    def _turns_away(self, member: _Member, now: float, *, asleep: bool, hidden: bool) -> bool:
+        self._give_time_back(now)
+        new = not member.asleep and not member.hidden
+        member.asleep, member.hidden = asleep, hidden
+        if new:
+            self._changed(now)
+        return new
+
+    def wakes(self, player: str) -> bool:
+        """The member's page answers; whether they were away because it did not, so that they are to `come`."""
+        member = self._members[player]
+        if member.hidden:
+            member.asleep = False
+        return member.asleep
+
+    def hidden(self, player: str) -> bool:
+        """Whether the member looks at another page."""
+        return self._members[player].hidden
+
+    def goes_on(self, player: str, now: float) -> None:
+        """The member has gone on from the page; they have also had enough of a pause."""
+        self._members[player].gone_on = True
+        self.paused = False
+        if self._page_until is None:
+            self._page_until = now + self.rules.gather
+        self._changed(now)
+
+    def pauses(self) -> None:
+        """A member pauses the game, until any of them goes on."""
+        self.paused = True
+
+    def round_trip(self, player: str, seconds: float, now: float) -> None:
+        """The member's browser has answered a ping. Before the game, the first samples decide whether they may play."""
+        member = self._members[player]
+        member.samples.append(seconds)
+        if not member.measured and len(member.samples) == self.rules.ping_samples:
+            member.measured = True
+            if _median(member.samples) * 1000 > self.rules.max_ping:
+                member.over = "ping"
+            self._changed(now)
+        if member.over == "absent" and member.here:  # their time was over while they were measured
+            member.over = None
+            self._changed(now)
+
+    def page(self) -> None:
+        """A break begins: nobody has gone on from it."""
+        self._page_until = None
+        for member in self._members.values():
+            member.gone_on = False
+        self._tell()
+
+    def refused(self, player: str) -> None:
+        """An earlier server has refused the member for their round trip."""
+        self._members[player].over = "ping"
+
+    def has_left(self, player: str) -> None:
+        """On an earlier server, the game has ended because the member stayed away."""
+        self._members[player].over = "absent"
+
+    # ---- what follows
+
+    def look(self, now: float) -> None:
+        """The others wait no longer for those whose time is over."""
+        over = [one for one in self._members.values() if one.until is not None and now >= one.until]
+        for member in over:
+            member.over = "absent"
+        if over:
+            self._changed(now)
+
+    def may_play(self, now: float, *, on: bool) -> bool:
+        """Whether the game may be on now. If it is not `on`, the countdown comes first, from when this is asked."""
+        if not self.complete or self.paused or self._held_by_page(now):
+            self._give_time_back(now)
+            self._on_since = None
+            if self._counts_until is not None:
+                self._counts_until = None
+                self._tell()
+            return False
+        if on:
+            return True
+        if self._counts_until is None:
+            self._counts_until = now + self.rules.countdown
+            self._tell()
+        if now < self._counts_until:
+            return False
+        self._counts_until, self._on_since = None, now
+        for member in self._members.values():
+            member.measured = True
+            if not self.begun:
+                member.left = self.rules.absent
+        self.begun, self.reads = True, False
+        self._tell()
+        return True
+
+    @property
+    def complete(self) -> bool:
+        """No member is waited for, and one at least is here."""
+        members = self._members.values()
+        return any(one.here for one in members) and not any(one.missing for one in members)
+
+    @property
+    def waits(self) -> bool:
+        """A member waits for the game."""
+        return any(one.takes_part for one in self._members.values())
+
+    def all_gone_on(self, now: float) -> bool:
+        """All who are here have gone on from the page, or the others have waited long enough for the rest."""
+        if self._page_until is None:
+            return False
+        return now >= self._page_until or all(one.gone_on for one in self._members.values() if one.here)
+
+    def _held_by_page(self, now: float) -> bool:
+        return self.reads and not self.all_gone_on(now)
+
+    def time_left(self, player: str) -> float:
+        """Seconds for which the others would wait for the member from now on: none if no absence is left to them."""
+        left = self._members[player].left
+        return left if left >= self._least else 0.0
+
+    def over(self, player: str) -> Over | None:
+        """Why the member does not play any more; None if they do."""
+        return self._members[player].over
+
+    def all_refused(self) -> bool:
+        """Nobody is left who could play."""
+        return all(one.over == "ping" for one in self._members.values())
+
+    # ---- what is told
+
+    def people(self, vacant: Iterable[str], *, reads: bool, plays_on: bool) -> dict[str, Where]:
+        """Where each member is. In the places of `vacant` a policy plays from the start.
+
+        `reads`: there is a page between two episodes. Without `plays_on` no policy takes the place of a member.
+        """
+        page = reads or self.reads
+        return {
+            **{one.player: _where(one, page, plays_on) for one in self._members.values()},
+            **dict.fromkeys(vacant, "policy"),
+        }
+
+    def begins_in(self, now: float) -> float | None:
+        """Seconds of the countdown that are left; None if it does not run."""
+        return None if self._counts_until is None else max(0.0, self._counts_until - now)
+
+    def held_for(self, now: float, *, reads: bool) -> float | None:
+        """Seconds until the others wait no longer; None if they do not wait. `reads` as in `people`."""
+        until = self._until(now, reads=reads)
+        return None if until == math.inf else max(0.0, until - now)
+
+    def wake_at(self, now: float, *, on_break: bool) -> float:
+        """When to look again if nothing happens; infinite if there is no need to."""
+        counts = math.inf if self._counts_until is None else self._counts_until
+        return min(self._until(now, reads=on_break), counts)
+
+    def round_trips(self) -> dict[str, int]:
+        """The median of each member's last samples in milliseconds, of those who have some."""
+        return {one.player: round(_median(one.samples) * 1000) for one in self._members.values() if one.samples}
+
+    def _until(self, now: float, *, reads: bool) -> float:
+        ends = [one.until for one in self._members.values() if one.until is not None]
+        page = self._page_until
+        if (reads or self.reads) and page is not None and not self.all_gone_on(now):
+            ends.append(page)
+        return min(ends, default=math.inf)
+
+    def _tell(self) -> None:
+        """Something has changed that members are told."""
+        self.version += 1
+
+    def _changed(self, now: float) -> None:
+        """Let the clocks of those who are missing run while another one waits."""
+        self._tell()
+        waits = self.waits
+        for member in self._members.values():
+            if member.missing and waits:
+                if member.until is None:
+                    member.until = now + self.time_left(member.player)
+            elif member.until is not None:
+                least = 0.0 if member.missing else self._least
+                member.left, member.until = max(0.0, min(member.until - now, member.left - least)), None
+
+    @property
+    def _least(self) -> float:
+        return min(LEAST_ABSENCE, self.rules.absent / 3)
+
+    def _give_time_back(self, now: float) -> None:
+        """Members who have played since the last call get some of their time back. Call it before a change."""
+        if self._on_since is None:
+            return
+        played, self._on_since = now - self._on_since, now
+        for member in self._members.values():
+            if member.here:
+                member.left = min(self.rules.absent, member.left + GIVEN_BACK * played)
+
+
+def _where(member: _Member, page: bool, plays_on: bool) -> Where:
+    if member.over is not None:
+        return "policy" if plays_on else "away"
+    if member.here:
+        return "reads" if page and not member.gone_on else "here"
+    return "away" if member.met and not member.takes_part else "awaited"
+
+
+def outcomes(presence: Presence, outcome: str | None) -> Mapping[str, str | None]:
+    """By player, how the trial has ended for each member; `outcome` is that of the trial."""
+    names: dict[Over | None, str | None] = {"absent": "left", "ping": "ping", None: outcome}
+    return {player: names[presence.over(player)] for player in presence.players}
+
+
+def _median(samples: Iterable[float]) -> float:
+    ordered = sorted(samples)
+    middle = len(ordered) // 2
+    return ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2

@@ -1,0 +1,83 @@
+"""A step of the environment: what the agent is told to take, and what came of it. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from trial.core.clients import Clients
+from trial.core.effects import Begun, Effect, Replayed, StepCall, StepTaken, WriteLine
+from trial.core.message_log import MessageLog
+from trial.core.players import View
+from trial.core.progress import Progress
+from trial.core.timing import Timing
+from trial.settings import Settings
+
+
+class Steps:
+    """Takes one step after the other. The caller says when, and makes the calls of the agent that this returns."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        timing: Timing,
+        message_log: MessageLog,
+        clients: Clients,
+        emit: Callable[[Effect], None],
+    ) -> None:
+        self._settings = settings
+        self._timing = timing
+        self._message_log = message_log
+        self._clients = clients
+        self._emit = emit
+
+    def take(self, progress: Progress, now: float) -> StepCall:
+        """The call that takes the step that is due, with the messages and the feedback since the step before."""
+        said, dropped = self._message_log.messages, self._message_log.take_dropped()
+        fields: dict[str, Any] = {
+            "episode": progress.episode,
+            "step": progress.steps + 1,
+            "frame": self._clients.frame_id + 1,
+        }
+        if said:
+            fields["messages"] = said
+        if dropped:
+            fields["messagesDropped"] = dropped
+        return StepCall(
+            limit=self._settings.step_seconds,
+            actions=progress.next_actions(),
+            feedback=self._message_log.feedback,
+            messages=len(said),
+            fields=fields,
+            truncated_by=self._timing.limit_of_step(progress, now),
+        )
+
+    def taken(self, call: StepCall, step: StepTaken, progress: Progress, now: float) -> None:
+        """The step was taken: record it, count it, and show what came of it."""
+        self._emit(WriteLine(step.line))
+        self._message_log.recorded(call.messages, len(call.feedback))
+        self._timing.stepped(now, progress.frame_rate)
+        ended = len(progress.ended)
+        progress.stepped(step.rewards, step.terminated, step.truncated, call.truncated_by)
+        if len(progress.ended) == ended and (step.view is not None or progress.turns is not None):
+            self._see(step.view, progress, now)
+        self._clients.show(step.pictures)
+
+    def began(self, begun: Begun, progress: Progress, now: float) -> None:
+        """The environment was reset: record it, and show the first picture."""
+        self._emit(WriteLine(begun.line))
+        progress.began()
+        self._timing.begin_episode()
+        self.show(begun, progress, now)
+
+    def show(self, found: Begun | Replayed, progress: Progress, now: float) -> None:
+        """Show where the episode begins or goes on."""
+        self._see(found.view, progress, now)
+        self._clients.show(found.pictures)
+
+    def _see(self, view: View | None, progress: Progress, now: float) -> None:
+        """The players see this, and those that are no humans are asked."""
+        progress.choices.see(view, now)
+        for ask in progress.choices.asks(progress.steps, now):
+            self._emit(ask)

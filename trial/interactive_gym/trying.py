@@ -1,0 +1,76 @@
+"""Tries the policies of an experiment on the researcher's machine: each is loaded and asked for one action."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from protocol.players import ONNXRUNTIME
+from trial.agent.tracebacks import where
+from trial.interactive_gym import looking, playing
+from trial.interactive_gym.configuration_constants import PolicyTypes
+from trial.interactive_gym.looking import Look
+from trial.interactive_gym.playing import Unplayable
+from trial.interactive_gym.remote_config import RemoteConfig
+from trial.policies import onnx
+from trial.policies.policy import PolicyError
+
+_WORDS = 300
+
+
+def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | None], root: Path) -> Iterator[str]:
+    """Try each player's policy with what that player sees first. Yields sentences about those that cannot be tried.
+
+    `find` finds a file that an option names, `root` is the folder of the experiment's modules. Raises Unplayable if a
+    policy is no ONNX file, does not fit the environment, raises, or chooses an action that there is not.
+    """
+    untried = False
+    for player, plays in playing.mapping_of(config).items() if look.several else ():
+        if isinstance(plays, str) and plays in (PolicyTypes.Human, PolicyTypes.Random):
+            continue
+        if looking.is_file(config, plays):
+            file = find(plays)
+            if file is None or not file.is_file():
+                continue  # that is said where the files are copied
+            if importlib.util.find_spec("onnxruntime") is None:
+                untried = True
+                continue
+            if look.joined_as_sorted:
+                _try_file(player, file, look)
+                continue
+        _try_functions(config, player, look, find, root)
+    if untried:
+        yield f"ONNX files are not tried, since onnxruntime is not installed here: pip install {ONNXRUNTIME}"
+
+
+def _try_file(player: Any, file: Path, look: Look) -> None:
+    """As Hippodrome plays the file on a server."""
+    try:
+        policy = onnx.load(file.name, file, look.counts[player], look.spaces.get(player), sample=True)
+        if player in look.seen:
+            policy.act(look.seen[player], {}, None)
+    except PolicyError as error:
+        raise Unplayable(f"the policy of {player} does not fit: {error}") from error
+
+
+def _try_functions(
+    config: RemoteConfig, player: Any, look: Look, find: Callable[[Any], Path | None], root: Path
+) -> None:
+    """As the experiment's own functions play on a server."""
+
+    def locate(name: Any) -> Any:
+        path = find(name) if isinstance(name, str) else None
+        return str(path) if path is not None and path.is_file() else name
+
+    try:
+        policy = playing.policy_class(config, player, locate)()
+        action = policy.act(look.seen[player], {}) if player in look.seen else 0
+    except Exception as error:
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        place = where(error, root)
+        at = f" ({place})" if place else ""
+        raise Unplayable(f"the policy of {player} fails: {words[:_WORDS]}{at}") from error
+    if not 0 <= action < look.counts[player]:
+        raise Unplayable(f"the policy of {player} chose action {action}; there are 0 to {look.counts[player] - 1}")

@@ -1,0 +1,313 @@
+"""One object of a scene: its id, its type, and its fields with their checked values (docs/objects.md). Pure.
+
+The words are those of Interactive Gym's object contexts (`uuid`, `object_type`, `image_name`, …); `id`, `type` and
+`image` are short for three of them. A checked object has one form, whatever words it was given in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, TypeGuard
+
+import numpy as np
+
+MOST_POINTS = 5_000
+"""Points of one line or polygon."""
+LONGEST_TEXT = 1_000
+"""Characters."""
+LONGEST_TWEEN = 10_000
+"""Milliseconds."""
+
+_LONGEST_ID = 100
+_FARTHEST = 1e6
+_DIGITS = 4  # a relative coordinate then names a tenth of a pixel of a picture 1,000 pixels wide
+_HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
+_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # images are called without it
+_FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
+
+CheckedObject = Mapping[str, Any]
+"""What is sent of an object: plain values of JSON. A field that has its default is left out."""
+
+
+class Wrong(ValueError):
+    """A value of an object cannot be used; the words go on after the name of the field."""
+
+
+# ---- what `render()` returns of one object
+
+
+def is_map(value: Any) -> TypeGuard[Mapping[str, Any]]:
+    """Whether the value is a map."""
+    return type(value) is dict or isinstance(value, Mapping)  # the first is quicker
+
+
+def has_fields(value: Any) -> bool:
+    """Whether the value is an object of Interactive Gym's, or a dataclass."""
+    return callable(getattr(value, "as_dict", None)) or (
+        dataclasses.is_dataclass(value) and not isinstance(value, type)
+    )
+
+
+def mapping_of(value: Any) -> Mapping[str, Any]:
+    """The object as a map: it is one, or has `as_dict()` (as Interactive Gym's have), or is a dataclass."""
+    if is_map(value):
+        return value
+    convert = getattr(value, "as_dict", None)
+    if callable(convert):
+        value = convert()
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    if not isinstance(value, Mapping):
+        raise Wrong(f"is no map of fields, but {type(value).__name__}")
+    return value
+
+
+def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[str, Any]]:
+    """The object's id, and its fields under their one name; a field that is None counts as left out."""
+    fields = {_OTHER_NAMES.get(key, key): each for key, each in mapping_of(value).items() if each is not None}
+    name = fields.pop("id", None)
+    if isinstance(name, int | np.integer) and not isinstance(name, bool):
+        name = str(name)
+    if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_ID:
+        kind = str(fields.get("type", "object"))[:20]
+        rule = (
+            "has no id" if name is None or name == "" else f"has an id that is no text of 1 to {_LONGEST_ID} characters"
+        )
+        problems.append(f"object {index + 1} of render() ({kind}) {rule}; give each object an id that it keeps")
+        name = f"#{index + 1}"
+    return name, fields
+
+
+def called(value: Any, index: int) -> str:
+    """How a sentence names the object."""
+    name = None
+    if isinstance(value, Mapping):
+        name = value.get("id", value.get("uuid"))
+    elif has_fields(value):
+        name = getattr(value, "id", getattr(value, "uuid", None))
+    return f"object {index + 1} of render()" if name is None else f"the object {str(name)[:_LONGEST_ID]!r}"
+
+
+def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) -> CheckedObject:
+    """The object's values as they are sent. Raises Wrong if it cannot be drawn."""
+    kind = fields.get("type")
+    table = TYPES.get(kind) if isinstance(kind, str) else None
+    if table is None:
+        raise Wrong(f"has the type {str(kind)[:40]!r}; there are {', '.join(TYPES)}")
+    checked: dict[str, Any] = {"type": kind}
+    for key, (check, default) in table.items():
+        value = fields.get(key)
+        if value is None:
+            if default is _NEEDED:
+                raise Wrong(f"has no {key}, which a {kind} needs")
+            continue
+        try:
+            value = check(value)
+        except Wrong as error:
+            raise Wrong(f"cannot be drawn: its {key} {error}") from None
+        if value != default:
+            checked[key] = value
+    if fields.get("tween"):
+        tween = _tween(fields)
+        if tween:
+            checked["tween"] = tween
+    for key in fields.keys() - table.keys() - _ANY:
+        problems.append(f"the object {name!r} has a field {str(key)[:40]!r}, which a {kind} does not have")
+    return checked
+
+
+def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
+    """The object that was `given` and checked, with the new values of its fields; None if all is to be checked."""
+    if list(given) != list(value) or list(map(type, given.values())) != list(map(type, value.values())):
+        return None
+    if not _OTHER_NAMES.keys().isdisjoint(value):  # two words for one field may stand side by side
+        return None
+    table, fields = TYPES[earlier["type"]], {}
+    for key, each in value.items() - given.items():
+        if key not in earlier or key not in table:  # at its default before, or what decides on more than itself
+            return None
+        check, default = table[key]
+        try:
+            fields[key] = check(each)
+        except Wrong:
+            return None
+        if fields[key] == default:
+            return None
+    return earlier if fields.items() <= earlier.items() else {**earlier, **fields}
+
+
+# ---- values
+
+
+_NO_NUMBERS = (bool, np.bool_, str, bytes)  # though `float` takes them
+
+
+def _number(low: float, high: float) -> Callable[[Any], float]:
+    def check(value: Any) -> float:
+        if isinstance(value, _NO_NUMBERS):
+            raise Wrong("is no number")
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise Wrong("is no number") from None
+        if not math.isfinite(number):
+            raise Wrong(f"is no finite number ({number})")
+        if not low <= number <= high:
+            raise Wrong(f"is {number:g}; it must be from {low:g} to {high:g}")
+        return _short(number)
+
+    return check
+
+
+def _short(number: float) -> float:
+    """Rounded, and a whole number without a point: it needs fewer bytes."""
+    rounded = round(number, _DIGITS)
+    return int(rounded) if rounded == int(rounded) else rounded
+
+
+def _points(least: int) -> Callable[[Any], list[list[float]]]:
+    def check(value: Any) -> list[list[float]]:
+        try:
+            count = len(value)
+        except TypeError:
+            raise Wrong("are no list") from None
+        if not least <= count <= MOST_POINTS:
+            raise Wrong(f"are {count}; there must be {least} to {MOST_POINTS}")
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise Wrong("are not pairs of numbers") from None
+        if array.shape != (count, 2):
+            raise Wrong("are not pairs of numbers")
+        if not np.isfinite(array).all() or np.abs(array).max() > _FARTHEST:
+            raise Wrong("are not all finite numbers, or lie too far away")
+        points: list[list[float]] = np.round(array, _DIGITS).tolist()
+        return [[int(x) if x == int(x) else x, int(y) if y == int(y) else y] for x, y in points]
+
+    return check
+
+
+def color(value: Any) -> str:
+    """A color as CSS writes it: `#rgb`, `#rrggbb`, with an alpha value at the end, or a name. Raises Wrong."""
+    if not isinstance(value, str):
+        raise Wrong("is no color; write it as '#rrggbb'")
+    if not _HEX.fullmatch(value) and not _is_color_name(value):
+        raise Wrong(f"is no color: {value[:40]!r}; write it as '#rrggbb'")
+    return value.lower()
+
+
+@lru_cache(maxsize=256)
+def _is_color_name(value: str) -> bool:
+    from PIL import ImageColor  # noqa: PLC0415 - most games write colors as numbers
+
+    return len(value) <= 30 and value.lower() in ImageColor.colormap
+
+
+def _text(value: Any) -> str:
+    text = str(value)
+    if len(text) > LONGEST_TEXT:
+        raise Wrong(f"has {len(text)} characters; at most {LONGEST_TEXT} are shown")
+    if text.isprintable():
+        return text
+    return "".join(letter for letter in text if letter == "\n" or letter.isprintable())
+
+
+def _image(value: Any) -> str:
+    if not isinstance(value, str) or not 0 < len(value) <= 200:
+        raise Wrong("is no name of a file in the folder of assets")
+    return _EXTENSION.sub("", value)
+
+
+def _frame(value: Any) -> str:
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        return str(int(value))
+    return _word(value)
+
+
+def _word(value: Any) -> str:
+    if not isinstance(value, str) or not 0 < len(value) <= 200:
+        raise Wrong("is no name")
+    return value
+
+
+def _font(value: Any) -> str:
+    if not isinstance(value, str) or not _FONT.fullmatch(value):
+        raise Wrong("is no name of a font, such as 'Arial'")
+    return value
+
+
+def _flag(value: Any) -> bool:
+    return bool(value)
+
+
+def _origin(value: Any) -> list[float]:
+    try:
+        x, y = value
+    except (TypeError, ValueError):
+        raise Wrong("is no pair of numbers from 0 to 1") from None
+    share = _number(-10, 10)
+    return [share(x), share(y)]
+
+
+def _tween(fields: Mapping[str, Any]) -> float:
+    """Milliseconds: of a `tween` that is a number, or of `tween_duration`, if `tween` is true."""
+    value = fields["tween"]
+    if isinstance(value, bool | np.bool_):
+        value = fields.get("tween_duration", _TWEEN)
+    try:
+        return _number(0, LONGEST_TWEEN)(value)
+    except Wrong as error:
+        raise Wrong(f"cannot be drawn: its tween {error}") from None
+
+
+_NEEDED: Any = object()
+_TWEEN = 50  # ms; Interactive Gym's
+_OTHER_NAMES = {"uuid": "id", "object_type": "type", "image_name": "image", "opacity": "alpha", "rotation": "angle"}
+_ANY = frozenset(
+    {"type", "permanent", "remove", "tween", "tween_duration", "object_size"}
+)  # what every object may have
+
+_place, _length = _number(-_FARTHEST, _FARTHEST), _number(0, _FARTHEST)
+_Table = Mapping[str, tuple[Callable[[Any], Any], Any]]
+_COMMON: _Table = {"depth": (_place, 0), "alpha": (_number(0, 1), 1)}
+_AT: _Table = {"x": (_place, _NEEDED), "y": (_place, _NEEDED)}
+_TURNED: _Table = {"angle": (_place, 0), "origin": (_origin, [0, 0])}
+_FILLED: _Table = {"color": (color, "#000000"), "outline": (color, None), "outline_width": (_length, 1)}
+
+TYPES: Mapping[str, _Table] = {
+    "sprite": {
+        **_AT,
+        "image": (_image, _NEEDED),
+        "frame": (_frame, None),
+        "animation": (_word, None),
+        "width": (_length, None),
+        "height": (_length, None),
+        **_TURNED,
+        **_COMMON,
+    },
+    "line": {
+        "points": (_points(2), _NEEDED),
+        "width": (_length, 1),
+        "color": (color, "#000000"),
+        "fill_below": (_flag, False),
+        "fill_above": (_flag, False),
+        **_COMMON,
+    },
+    "circle": {**_AT, "radius": (_length, _NEEDED), **_FILLED, **_COMMON},
+    "rectangle": {**_AT, "width": (_length, _NEEDED), "height": (_length, _NEEDED), **_FILLED, **_TURNED, **_COMMON},
+    "polygon": {"points": (_points(3), _NEEDED), **_FILLED, **_COMMON},
+    "text": {
+        **_AT,
+        "text": (_text, _NEEDED),
+        "size": (_number(1, 1_000), 16),
+        "color": (color, "#000000"),
+        "font": (_font, "Arial"),
+        **_TURNED,
+        **_COMMON,
+    },
+}
+"""The fields of each type: the check of a value, and the default. A field at its default is not sent."""

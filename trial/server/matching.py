@@ -1,0 +1,112 @@
+"""Answers who plays with whom, by the function `match` of agent.py (`matching: match`), until there are members.
+
+The lobby writes who waits into a document, with an id. Servers without members look at it, call `match`, and create the
+answer's document; the first one's counts. `match` runs on a thread of its own: if it never returns, the server can
+still play.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from protocol.keys import QUESTION_ID, groups_key, waiting_key
+from protocol.session import MOST_PLAYERS
+from trial.agent import match
+from trial.agent.match import BadGroups
+from trial.agent.tracebacks import report
+from trial.agent.worker import Worker
+from trial.core.effects import AgentTimeout
+from trial.recordings.store import Store, short_error
+from trial.settings import Settings
+
+log = logging.getLogger("trial")
+
+LOOK_SECONDS = 2.0
+"""From one look for a question to the next."""
+
+
+class Matching:
+    """Answers questions until the server has members."""
+
+    def __init__(self, store: Store, settings: Callable[[], Settings], function: Callable[..., Any]) -> None:
+        """`settings` returns those of now."""
+        self._store = store
+        self._settings = settings
+        self._function = function
+        self._worker = Worker("match")
+        self._answered = ""
+        self._said: set[str] = set()
+
+    async def run(self) -> None:
+        """Look, and answer, until the members are known, or `match` does not return."""
+        while not self._settings().assigned:
+            if self._settings().session:
+                try:
+                    await self._look()
+                except Exception as error:  # noqa: BLE001 - whatever the store raises, the next look may succeed
+                    self._say(logging.WARNING, f"cannot see who waits ({short_error(error)}); trying again")
+            if self._worker.busy:
+                return
+            await asyncio.sleep(LOOK_SECONDS)
+        self._worker.close()
+
+    async def _look(self) -> None:
+        project = self._settings().project_id
+        body = await asyncio.to_thread(self._store.look, waiting_key(project))
+        question = None if body is None else read(body)
+        if question is None or question["id"] == self._answered or len(question["waiting"]) < question["players"]:
+            return
+        if self._settings().assigned:
+            return
+        groups = await self._groups(question)
+        answer = json.dumps({"groups": groups}).encode()
+        await asyncio.to_thread(self._store.create, groups_key(project, question["id"]), answer)
+        self._answered = question["id"]
+
+    async def _groups(self, question: Mapping[str, Any]) -> list[list[str]]:
+        """What `match` chooses; none if it fails, which the log says once."""
+        folder = self._settings().agent_dir
+        try:
+            found, problem = await self._worker.call(
+                lambda: match.groups(self._function, question), limit=match.SECONDS
+            )
+        except BadGroups as error:
+            self._say(logging.ERROR, f"{error}; nobody is matched")
+            return []
+        except AgentTimeout:
+            text = f"match() has not returned within {match.SECONDS:g} s; this server calls it no more"
+            self._say(logging.ERROR, text)
+            return []
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            self._say(logging.ERROR, f"match() failed, and nobody is matched\n{report(error, folder)}")
+            return []
+        if problem:
+            self._say(logging.ERROR, f"{problem}; that group is left out")
+        return found
+
+    def _say(self, level: int, text: str) -> None:
+        """Once each."""
+        if text not in self._said and len(self._said) < 100:
+            self._said.add(text)
+            log.log(level, "%s", text)
+
+
+def read(body: bytes) -> dict[str, Any] | None:
+    """The question in a document; None if there is none."""
+    try:
+        found = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(found, dict):
+        return None
+    name, players, waiting = found.get("id"), found.get("players"), found.get("waiting")
+    if not (isinstance(name, str) and QUESTION_ID.fullmatch(name)) or not isinstance(waiting, list):
+        return None
+    if not isinstance(players, int) or not 2 <= players <= MOST_PLAYERS:
+        return None
+    good = all(isinstance(each, dict) and isinstance(each.get("id"), str) for each in waiting)
+    return {"id": name, "players": players, "waiting": waiting} if good else None

@@ -1,0 +1,137 @@
+// The lobby: where a participant waits for others to play with. The rest of the script runs once they are matched, so
+// this module stands before it and imports nothing that runs the game. docs/pages.md says what the poll address answers.
+import { data, duration, find, make, setText, showSection } from "./page.js";
+import { loadPage, pageAnswers, pause, pollUntilAnswered } from "./requests.js";
+import { isOver } from "./waiting.js";
+
+// Milliseconds between polls. The lobby takes a participant who has not asked for ten seconds for gone; one who is
+// matched confirms that by the next poll. No poll is asked for from a timer's own timer: browsers slow such chains down
+// to one a minute on pages that are hidden for long (developer.chrome.com/blog/timer-throttling-in-chrome-88).
+const ASK_EVERY = 2_000;
+const CONFIRM_AFTER = 500;
+const CLOCKS_DIFFER = 5; // seconds between two computers of the site at most
+const NO_ANSWER = 10_000; // ms in which polls fail; then the page may know why
+const SOON_OVER = [60, 10]; // seconds that are left when that is said
+const CALL = "● "; // before the title of a hidden page, every other second
+
+const studyTitle = document.title;
+const lobby = { state: data.state, since: 0, trouble: null, waits: data.state.state === "lobby", said: "" };
+
+async function waitForOthers() {
+  while (lobby.waits) {
+    showLobby();
+    await pause(lobby.state.proposed ? CONFIRM_AFTER : ASK_EVERY);
+    const asked = performance.now();
+    const state = await pollUntilAnswered();
+    const took = performance.now() - asked;
+    if (state.state === "lobby") {
+      // The clock of a participant who was away begins anew.
+      if (state.seconds < lobby.state.seconds - CLOCKS_DIFFER) {
+        setText(find("lobby-note"), "You were away for a while, so your waiting time has begun again.");
+        tellAloud(find("lobby-note").textContent);
+      }
+      lobby.state = state;
+      if (took > ASK_EVERY) await pause(took); // a site that is slow is asked less often
+    } else await proceed(state);
+  }
+}
+
+// The participant is matched, or the study goes on without the game.
+async function proceed(state) {
+  lobby.waits = false;
+  if (isOver(state) || state.state === "unmatched") return loadPage();
+  data.state = state;
+  find("lobby").hidden = true;
+  showCompany();
+  find("announce").textContent = "Your game is being prepared.";
+}
+
+// Who plays in the game that is being prepared, and the title meanwhile.
+function showCompany() {
+  const others = (data.state.members ?? 1) - 1;
+  const empty = data.players - others - 1;
+  const people = others === 1 ? "another participant" : `${others} other participants`;
+  const computers = empty === 1 ? "a computer player" : `${empty} computer players`;
+  const known = data.state.members ? [others && people, empty && computers].filter(Boolean) : [];
+  setText(find("company"), known.length ? "You play with " + known.join(" and ") + "." : "");
+  data.title = "Your game is being prepared – " + studyTitle;
+  document.title = studyTitle;
+}
+
+function showLobby() {
+  const { players, here, seconds, proposed, then } = lobby.state;
+  const there = Math.min(players, here);
+  lobby.since = performance.now() - 1000 * seconds;
+  showSection("wait");
+  find("lobby-places").replaceChildren(...Array.from({ length: players }, (_, at) => make("i", { className: at < there ? "taken" : "" })));
+  const text = proposed ? textOfSession(players, there, then) : textOfFew(players, there);
+  setText(find("lobby-here"), text);
+  if (lobby.said && lobby.said !== text) tellAloud(text);
+  lobby.said = text;
+  document.title = `${proposed && there === players ? "Found" : `${there} of ${players}`} – ${studyTitle}`;
+  showTime();
+}
+
+const textOfFew = (players, there) => there === 1 ? `You are the first of ${players}` : `${there} of ${players} are here, you included`;
+
+// What is said of a session that is about to begin. With `policies` it may have empty places, even all but one.
+function textOfSession(players, there, then) {
+  const moment = "One moment, please…";
+  if (there === players) return `Found: ${players === 2 ? "another participant is here" : "enough participants are here"}. ${moment}`;
+  if (then !== "policies") return textOfFew(players, there);
+  const one = players - there === 1;
+  if (there === 1) return "Nobody else has come: you play with " + (one ? "a computer player" : "computer players") + `. ${moment}`;
+  return `${textOfFew(players, there)}: ${one ? "a computer player takes the empty place" : "computer players take the empty places"}. ${moment}`;
+}
+
+// How long it is until the participant no longer waits, and what happens then.
+function showTime() {
+  const { players, patience, then, proposed } = lobby.state;
+  const waited = Math.max(0, Math.round((performance.now() - lobby.since) / 1000));
+  const left = Math.max(0, Math.ceil(patience - waited));
+  const alone = players === 2;
+  const next = {
+    unmatched: "you go on to the next part of the study without this game",
+    policies: alone ? "you play with a computer player instead" : "the game begins with those who are here, and computer players take the empty places",
+  }[then];
+  setText(find("lobby-clock"), `You have waited for ${duration(waited)}.`);
+  if (proposed) setText(find("lobby-then"), "");
+  else if (left) setText(find("lobby-then"), `If ${alone ? "nobody else comes" : "not enough people come"} in the next ${duration(left)}, ${next}.`);
+  else setText(find("lobby-then"), `${alone ? "Nobody else has come" : "Not enough people have come"}, so ${next}. One moment, please…`);
+  if (SOON_OVER.includes(left) && !proposed) tellAloud(find("lobby-then").textContent);
+}
+
+const tellAloud = (text) => setText(find("announce"), text);
+
+function leaveLobby() {
+  if (!lobby.waits) return;
+  const form = new FormData(find("again"));
+  form.set("hippodrome-action", "leave");
+  navigator.sendBeacon(find("again").action, new URLSearchParams(form));
+}
+
+// Once the participant is matched, the title of a hidden page changes every second.
+function callBack(calls) {
+  const plain = document.title.replace(CALL, "");
+  if (!lobby.waits) document.title = calls ? CALL + plain : plain;
+}
+
+// A site that answers for the page, and to no poll, has something to say there: the study is closed, for instance.
+async function lookAtPage() {
+  lobby.trouble = find("wait-status").textContent ? lobby.trouble ?? performance.now() : null;
+  if (lobby.trouble === null || performance.now() - lobby.trouble < NO_ANSWER) return;
+  lobby.trouble = null;
+  if (await pageAnswers().catch(() => false)) await loadPage();
+}
+
+setInterval(() => {
+  if (lobby.waits) {
+    showTime();
+    lookAtPage();
+  } else callBack(document.hidden && !document.title.startsWith(CALL));
+}, 1_000);
+document.addEventListener("visibilitychange", () => callBack(false));
+window.addEventListener("pagehide", leaveLobby);
+
+if (lobby.waits) await waitForOthers();
+else if (data.state.session) showCompany();
