@@ -181,10 +181,10 @@ def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_lead
     assert not tab.is_visible("text=Jump over the stones.")
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-between")
-    before = len(told.commands("command"))
+    before = len(told.given())
     tab.click("text=Next game")
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    assert told.commands("command")[before:] == ["start"]
+    assert told.given()[before:] == ["start"]
     assert tab.is_visible("#play")
 
 
@@ -193,11 +193,11 @@ def test_who_has_seen_the_last_picture_opens_the_page_between_at_once(told: Worl
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
     told.wait_for({"command": "start"})
-    before = len(told.commands("command"))
+    before = len(told.given())
     tell(told, state="break")
     tab.click("#overlay-button:text('Go on')", timeout=2_000)
     tab.wait_for_selector("text=Have a rest", timeout=1_000)
-    assert told.commands("command")[before:] == []
+    assert told.given()[before:] == []
 
 
 # The first picture, and the time that is left

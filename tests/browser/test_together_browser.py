@@ -303,7 +303,7 @@ def test_a_game_of_two_from_the_first_connection_to_the_countdown(
     shot(tab, f"{width}-gathering")
     tab.keyboard.press("ArrowLeft")
     together.wait_for({"action": "left", "held": False})
-    assert together.commands("command") == [], "nobody presses start"
+    assert together.given() == [], "nobody presses start"
     tell(together, state="ready", beginsIn=3, **people(red="here"))
     shows(tab, "#overlay-score", "3")
     assert tab.inner_text("#overlay-title") == "The game begins"
@@ -591,7 +591,7 @@ def test_the_game_is_told_when_the_instructions_are_read(together: World, tab: A
     together.ready()
     tab.goto(together.url)
     tab.wait_for_selector("h2:text('How to play'):visible")
-    assert together.commands("command") == []
+    assert together.given() == []
     tell(together, state="ready", heldFor=20, you="blue", people={"blue": "reads", "red": "here"})
     shows(tab, "#reading", "The other participant waits for you. Please go on within 20 seconds.")
     assert tab.is_visible("h2:text('How to play')")

@@ -97,6 +97,8 @@ class Spawner:
 
     def _start(self, start: Start, wakeup: Wakeup) -> None:
         if not self._free:
+            self._reap()  # one may have ended since
+        if not self._free:
             start.connection.close()
             self._tell(start.number, 1013, f"{self._limits.workers} connections use environments already; try later.")
             return

@@ -323,6 +323,21 @@ def test_no_more_connections_with_environments_than_allowed(small: GymServer) ->
             third.make("CartPole-v1")
 
 
+def test_a_worker_that_has_ended_makes_room_at_once(small: GymServer) -> None:
+    """Even if its end and the next connection's first request reach the spawner together."""
+    with Client(small.url) as first, Client(small.url) as second, Client(small.url) as third:
+        first.make("CartPole-v1")
+        second.make("CartPole-v1")
+        spawner, ending, _ = below(small)
+        spawner.suspend()
+        ending.kill()
+        third.websocket.send(json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}}))
+        wait_for(lambda: ending.status() == psutil.STATUS_ZOMBIE)
+        time.sleep(0.2)  # until the server has passed the request on, which nothing shows
+        spawner.resume()
+        assert "error" not in third.websocket.recv(WITHIN)
+
+
 def test_no_more_connections_than_allowed(small: GymServer) -> None:
     with Client(small.url), Client(small.url), Client(small.url), Client(small.url):
         with pytest.raises(InvalidStatus) as found, connect(small.url):
