@@ -25,7 +25,7 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import RECORDS, Server
 from testing.clock import EPOCH
 from testing.quiet_log import quiet
-from testing.simulation import faults, lobby
+from testing.simulation import faults, lobby, session_checks
 from testing.simulation.aws_bound import aws_alone_together
 from testing.simulation.members import Habits, Member
 from testing.simulation.ports import Conditions
@@ -63,7 +63,7 @@ class Together:
     @property
     def wrong(self) -> list[str]:
         """Sessions whose members are split, or that are merged, and ghosts."""
-        return lobby.wrong(self.world.platform.documents.kept, self.project, self.came)
+        return session_checks.wrong(self.world.platform.documents.kept, self.project, self.came)
 
     @property
     def waits(self) -> list[float]:

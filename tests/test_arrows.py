@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,23 @@ def test_no_room_imports_from_one_above(package: str, room: str) -> None:
         if name.startswith(f"{package}.") and name.split(".")[1] not in may
     }
     assert wrong == set()
+
+
+@pytest.mark.parametrize("package", MAY)
+def test_no_files_import_each_other_in_a_circle(package: str) -> None:
+    """Imports for types count, too: who reads one file of a circle has to read all of them."""
+    files = (ROOT / package).rglob("*.py")
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+    arrows = {
+        name: {other for other in imported(path) & modules.keys() if not f"{name}.".startswith(f"{other}.")}
+        for name, path in modules.items()  # without those to the packages that a module is in
+    }
+    circle: list[str] = []
+    try:
+        TopologicalSorter(arrows).prepare()
+    except CycleError as error:
+        circle = error.args[1]
+    assert circle == []
 
 
 def loaded(module: str) -> dict[str, str]:

@@ -14,7 +14,7 @@ import msgspec
 
 from protocol.keys import answer_key
 from testing.port_faults import Fault, FaultAt
-from testing.simulation import lobby
+from testing.simulation import session_checks
 from testing.simulation.members import Habits, Member
 from testing.simulation.people import Person, Visit
 from testing.simulation.ports import Conditions
@@ -210,7 +210,7 @@ def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: b
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
     first, *others = [person.visit for person in people]
     members = [person for person in people if isinstance(person, Member)]
-    wrong = tuple(lobby.wrong(kept, world.project, members))
+    wrong = tuple(session_checks.wrong(kept, world.project, members))
     outcome = Outcome(journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong)
     return world, outcome
 

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hippodrome.ports import Conflict
 from protocol.keys import groups_key, waiting_key
+from testing.simulation.ports import SimPlatform
 from testing.tasks import Life
 from trial.server.matching import LOOK_SECONDS
-
-if TYPE_CHECKING:
-    from testing.simulation.world import World
 
 TAKES = (0.05, 1.0)  # seconds of one call of `match`, and of its answer's way
 
@@ -25,16 +23,16 @@ TAKES = (0.05, 1.0)  # seconds of one call of `match`, and of its answer's way
 class SimMatching:
     """All servers that wait without members. One look stands for theirs: only the first answer counts."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, platform: SimPlatform, project_id: str) -> None:
+        self._platform, self._project_id = platform, project_id
         self.answered = 0  # questions
         self.most_waiting = 0  # in one question
         self.largest = 0  # bytes of the document
         self._look()
 
     def _look(self) -> None:
-        world, clock = self._world, self._world.clock
-        found = world.platform.documents.kept.get(waiting_key(world.project.id))
+        clock = self._platform.clock
+        found = self._platform.documents.kept.get(waiting_key(self._project_id))
         if found and self._servers_wait():
             question = json.loads(found[0])
             waiting = question.get("waiting", ())
@@ -45,15 +43,15 @@ class SimMatching:
         clock.after(LOOK_SECONDS, self._look)
 
     def _servers_wait(self) -> bool:
-        tasks = self._world.platform.tasks
+        tasks = self._platform.tasks
         return any(task.last is Life.RUNNING and task.session and not tasks.owner(task) for task in tasks.living())
 
     def _answer(self, question: Any) -> None:
         ids, players = sorted(one["id"] for one in question["waiting"]), question["players"]
         sessions = [ids[at : at + players] for at in range(0, len(ids) - players + 1, players)]
-        key = groups_key(self._world.project.id, question["id"])
+        key = groups_key(self._project_id, question["id"])
         try:
-            self._world.platform.documents.keep(key, json.dumps({"groups": sessions}).encode())
+            self._platform.documents.keep(key, json.dumps({"groups": sessions}).encode())
         except Conflict:
             return
         self.answered += 1

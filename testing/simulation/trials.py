@@ -12,17 +12,13 @@ import functools
 import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from hippodrome.ports import Conflict
 from protocol import session as sessions
 from protocol.keys import answer_key, session_key
 from protocol.session import Session, member_token
+from testing.simulation.ports import SimPlatform, TimedTask
 from testing.tasks import Life
-
-if TYPE_CHECKING:
-    from testing.simulation.ports import TimedTask
-    from testing.simulation.world import World
 
 TICK = 1.0  # seconds between two looks of a trial at who is there
 COUNTDOWN, ABSENT = 3.0, 30.0  # seconds: `trial.countdown` and `trial.absent`
@@ -35,20 +31,22 @@ _parsed = functools.lru_cache(maxsize=1000)(sessions.parse)  # a document is rea
 class SimTrial:
     """The trial of one task. `over` is why it has ended: `done`, `lost` (its server), or empty while it goes on."""
 
-    def __init__(self, world: World, task: TimedTask, session_id: str, step: str, play: float) -> None:
-        self.world, self.task, self.session_id = world, task, session_id
+    def __init__(self, trials: SimTrials, task: TimedTask, session_id: str, step: str, play: float) -> None:
+        """The game takes `play` seconds."""
+        self.task, self.session_id = task, session_id
         self.over = ""
         self.began: float | None = None  # when all members were here for the first time
         self._step, self._play = step, play
         self._here: Counter[str] = Counter()  # connections, by member
         self._away: defaultdict[str, float] = defaultdict(float)  # seconds, by member
         self._countdown = COUNTDOWN
-        world.clock.spawn(self._run)
+        self._trials, self._documents, self._clock = trials, trials.platform.documents, trials.platform.clock
+        self._clock.spawn(self._run)
 
     @property
     def session(self) -> Session | None:
         """The session's document, which the trial reads until it is there."""
-        found = self.world.platform.documents.kept.get(session_key(self.world.project.id, self.session_id))
+        found = self._documents.kept.get(session_key(self._trials.project_id, self.session_id))
         return _parsed(found[0]) if found else None
 
     def connect(self, user: str, token: str) -> bool:
@@ -68,9 +66,9 @@ class SimTrial:
 
     def _run(self) -> None:
         """The game, a look a second; then the answers, and the end of the task."""
-        alone, conditions = 0.0, self.world.conditions
+        alone = 0.0
         while not self.over:
-            self.world.clock.sleep(TICK)
+            self._clock.sleep(TICK)
             if is_lost(self.task):
                 self.over = "lost"
                 return
@@ -78,7 +76,7 @@ class SimTrial:
             here = {user for user, connections in self._here.items() if connections > 0}
             if session is None or not here:
                 alone += TICK
-                if alone > conditions.idle:
+                if alone > self._trials.idle:
                     self._end("idle")
                 continue
             alone = 0.0
@@ -89,7 +87,7 @@ class SimTrial:
         members = {member.user_id for member in session.members}
         if members <= here:
             self._all_here()
-            if self.world.played[self.session_id] >= self._play:
+            if self._trials.played[self.session_id] >= self._play:
                 self._store(session, dict.fromkeys(members, "finished"))
             return
         self._countdown = COUNTDOWN
@@ -105,23 +103,23 @@ class SimTrial:
             self._countdown -= TICK
             return
         if self.began is None:
-            self.began = self.world.clock.seconds
-        self.world.played[self.session_id] += TICK  # it is recorded
+            self.began = self._clock.seconds
+        self._trials.played[self.session_id] += TICK  # it is recorded
 
     def _store(self, session: Session, outcomes: Mapping[str, str]) -> None:
         """An answer for each member. What is there stays: an earlier server may have written it."""
-        project, documents = self.world.project.id, self.world.platform.documents
         for member in session.members:
             answers = {"score": 10, "outcome": outcomes[member.user_id], "session": session.id}
             record = {"step": self._step, "page": "game", "answers": answers, "schema": 1}
+            key = answer_key(self._trials.project_id, member.user_id, self._step)
             with contextlib.suppress(Conflict):
-                documents.keep(answer_key(project, member.user_id, self._step), json.dumps(record).encode())
+                self._documents.keep(key, json.dumps(record).encode())
         self.over = "done"
-        self.world.clock.after(LINGER, lambda: self._end("done"))
+        self._clock.after(LINGER, lambda: self._end("done"))
 
     def _end(self, why: str) -> None:
         self.over = self.over or why
-        self.world.platform.tasks.end(self.task.arn, "EssentialContainerExited", "Essential container exited", 0)
+        self._trials.platform.tasks.end(self.task.arn, "EssentialContainerExited", "Essential container exited", 0)
 
 
 def is_lost(task: TimedTask) -> bool:
@@ -133,15 +131,17 @@ def is_lost(task: TimedTask) -> bool:
 class SimTrials:
     """The trials of all tasks of a world."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, platform: SimPlatform, project_id: str, idle: float) -> None:
+        """A trial without members ends after `idle` seconds."""
+        self.platform, self.project_id, self.idle = platform, project_id, idle
+        self.played: defaultdict[str, float] = defaultdict(float)  # seconds that each session's recordings hold
         self._trials: dict[str, SimTrial] = {}  # by task
 
     def at(self, task: TimedTask, step: str, play: float) -> SimTrial | None:
         """The trial of a session's task; None if it is no session's, or of one that is not formed yet."""
-        session_id = self._world.platform.tasks.owner(task)
+        session_id = self.platform.tasks.owner(task)
         if not sessions.is_session_id(session_id):
             return None
         if task.arn not in self._trials:
-            self._trials[task.arn] = SimTrial(self._world, task, session_id, step, play)
+            self._trials[task.arn] = SimTrial(self, task, session_id, step, play)
         return self._trials[task.arn]

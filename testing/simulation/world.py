@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -108,9 +107,8 @@ class World:
         platform.tasks.changed = self.task_queue.send
         platform.tasks.owner = self._owner
         self._store_project()
-        self.trials = SimTrials(self)
-        self.matching = SimMatching(self) if project.matching == "match" else None
-        self.played: defaultdict[str, float] = defaultdict(float)  # seconds that each session's recordings hold
+        self.trials = SimTrials(platform, project.id, self.conditions.idle)
+        self.matching = SimMatching(platform, project.id) if project.matching == "match" else None
         self.people = 0  # participants who will come or are there
         self.calls_until_quiet = 0  # of the functions, until the last thing was gone
         self.clock.after(SWEEP_EVERY, self._sweep)

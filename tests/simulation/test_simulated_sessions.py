@@ -19,7 +19,7 @@ from hippodrome.model.project import MASTER_LIST
 from protocol.keys import answer_key, membership_key, session_key
 from protocol.session import Member as Seated
 from protocol.session import Session
-from testing.simulation import faults, lobby
+from testing.simulation import faults, lobby, session_checks
 from testing.simulation.members import POLL, PROPOSED_POLL, Habits, Member
 from testing.simulation.ports import Conditions
 from testing.simulation.trials import SimTrial
@@ -65,7 +65,7 @@ def crowd(people, seconds, conditions=None, *, project=PAIRS, habits=lambda numb
 
 def fair(world, came):
     """Nothing left, nothing wrong; everybody came to the end, left by themselves, or was told."""
-    assert lobby.wrong(world.platform.documents.kept, world.project, came) == [], world.story()
+    assert session_checks.wrong(world.platform.documents.kept, world.project, came) == [], world.story()
     assert not any(world.left().values()), (world.left(), world.story())
     assert all(faults.served_or_told(person.visit) for person in came), [p.visit.told for p in came]
     assert not world.cloud.dropped, "no chain of messages is taken for a loop"
@@ -111,7 +111,7 @@ def test_servers_that_are_taken_away_from_sessions_are_each_replaced_for_all():
     assert in_groups(world, came) == (60, 0)
     assert sum(task.interrupted for task in world.platform.tasks.tasks.values()) >= 5
     assert sum(person.visit.interruptions for person in came) >= 4
-    played = [seconds for seconds in world.played.values() if seconds]
+    played = [seconds for seconds in world.trials.played.values() if seconds]
     assert len(played) == 30
     assert all(math.isclose(seconds, 60.0, abs_tol=1.0) for seconds in played), "no game begins anew, none is shorter"
 
@@ -191,7 +191,7 @@ class Judged:
 
     @property
     def wrong(self):
-        return [text.split(":")[0] for text in lobby.wrong(self.kept, PAIRS, self.came)]
+        return [text.split(":")[0] for text in session_checks.wrong(self.kept, PAIRS, self.came)]
 
     def write(self, key, body):
         self.kept[key] = (body, "etag", self.world.clock.now())
