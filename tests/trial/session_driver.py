@@ -62,6 +62,7 @@ class SessionDriver:
         self.turns = turns
         self.steps = 0
         self.answered = set()
+        self.stores = True
         players = tuple(
             Player(name, SPACE, (self.settings.trial.substitute or "idle") if name in vacant else "human")
             for name in self.names
@@ -105,7 +106,7 @@ class SessionDriver:
 
     @property
     def saving(self):
-        return self.count(SaveAnswer) and not self.trial.done
+        return self.stores and self.count(SaveAnswer) and not self.trial.done
 
     def count(self, kind):
         return self.kinds[kind]

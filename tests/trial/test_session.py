@@ -6,7 +6,7 @@ import pytest
 
 from tests.trial.session_driver import SessionDriver
 from trial.core import messages
-from trial.core.effects import AskPolicy, Log, RecordLine, ResetCall, ResetPolicy
+from trial.core.effects import AskPolicy, Log, RecordLine, ResetCall, ResetPolicy, SendDone
 from trial.core.flow_control import STALLED_SECONDS, Window
 from trial.core.message_log import MESSAGES_KEPT
 from trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
@@ -435,6 +435,23 @@ def test_with_a_substitute_the_others_play_without_the_refused_who_goes_on_at_on
     driver.say(0, command="stop").take()
     assert [human for human, _ in driver.answers] == ["P1", "P0"]
     assert (driver.done(0).outcome, driver.done(1).outcome) == ("stopped", "ping")
+
+
+def test_a_member_goes_on_when_their_own_answer_is_stored_and_hears_so_once():
+    driver = SessionDriver().begin()
+    driver.stores = False
+    driver.say(0, command="stop").take()
+    driver.event("member_saved", "P0", driver.now)
+    assert (driver.done(0).outcome, driver.done(1)) == ("stopped", None)
+    driver.go(0).come(0)
+    assert driver.done(0).outcome == "stopped", "also on another page"
+    assert driver.trial.saving, "the server must stay"
+    driver.event("member_saved", "P1", driver.now)
+    assert driver.done(1).outcome == "partnerLeft"
+    told = driver.count(SendDone)
+    driver.event("answer_saved", driver.now)
+    assert driver.trial.finished
+    assert driver.count(SendDone) == told
 
 
 def test_a_round_trip_of_just_max_ping_is_short_enough():

@@ -627,41 +627,22 @@ def recorder_of(tmp_path, *members):
     return Recorder(formed, "3", "the-trial", store, Spool(formed, store)), store
 
 
+def save_answers(recorder, answers):
+    for each, said in answers.items():
+        asyncio.run(recorder.save_member(each, said))
+
+
 def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
     recorder, _ = recorder_of(tmp_path, Member("anna", 0, 0), Member("bert", 1, 1))
     given = {"anna": {"score": 1, "player": "left"}, "bert": {"score": 2, "player": "right"}}
-    asyncio.run(recorder.save(None, given))
+    save_answers(recorder, given)
     found = {each: answer(tmp_path, each) for each in MEMBERS}
     assert [found[each]["group"] for each in MEMBERS] == [0, 1]
     assert {each: found[each]["answers"] for each in MEMBERS} == {
         each: {**said, "session": SID} for each, said in given.items()
     }
-    asyncio.run(recorder.save(None, {each: {"score": 9} for each in MEMBERS}))
+    save_answers(recorder, {each: {"score": 9} for each in MEMBERS})
     assert {each: answer(tmp_path, each) for each in MEMBERS} == found
-
-
-def test_all_answers_are_stored_before_the_server_may_end(tmp_path, monkeypatch):
-    """One that cannot be stored at once holds up no other, and is tried again until it is there."""
-    recorder, store = recorder_of(tmp_path, Member("anna", None, 0), Member("bert", None, 1))
-    create, failures = store.create, [OSError(5, "the disk"), OSError(5, "the disk")]
-
-    def unwilling(key, data):
-        if "bert" in key and failures:
-            raise failures.pop()
-        return create(key, data)
-
-    monkeypatch.setattr(store, "create", unwilling)
-
-    async def run():
-        saving = asyncio.create_task(recorder.save(None, {each: {"score": 1} for each in MEMBERS}))
-        while not (tmp_path / "study/users/anna/answers/3.json").exists():
-            await asyncio.sleep(0.01)
-        assert not saving.done()
-        await saving
-
-    asyncio.run(run())
-    assert not failures
-    assert answer(tmp_path, "bert")["answers"]["score"] == 1
 
 
 def test_a_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 from tests.trial.conftest import client_of
+from tests.trial.far_away import far_away
 from tests.trial.sessions import MEMBERS, SID, TRIAL, answer, form, launch_session, member, recordings
 from trial.recordings import recording
 
@@ -98,3 +99,115 @@ def test_the_answers_come_after_the_recording_if_that_can_be_stored(launch):
     (recorded,) = (server.store / f"study/sessions/{SID}/trials/pair-1").glob("*.gz")
     answers = [server.store / f"study/users/{each}/answers/3.json" for each in MEMBERS]
     assert all(recorded.stat().st_mtime_ns <= each.stat().st_mtime_ns for each in answers)
+
+
+# ---- the answer of one member
+
+
+def refuse_answers_of(store: Path, user_id: str) -> Path:
+    """The store takes no answer of this member as long as this file is there."""
+    in_the_way = store / "study/users" / user_id
+    in_the_way.parent.mkdir(parents=True, exist_ok=True)
+    in_the_way.touch()
+    return in_the_way
+
+
+async def seen_by_both(anna, bert):
+    await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
+
+
+def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
+    """The answer of one is refused: they wait as who plays alone does, and get it when the store takes it."""
+    server = launch_session(launch)
+    form(server.store)
+    in_the_way = refuse_answers_of(server.store, "bert")
+
+    async def run():
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            await seen_by_both(anna, bert)
+            await bert.say(command="stop")
+            assert await anna.closed() == 1000
+            assert anna.done["outcome"] == "partnerLeft"
+            async with member(server, "anna") as again:
+                assert await again.closed() == 1000, "also on another page"
+            async with member(server, "bert") as again:
+                assert (again.state["state"], again.done) == ("ended", None)
+                in_the_way.unlink()
+                assert await again.closed() == 1000
+                assert again.done["outcome"] == "stopped"
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert outcomes(server.store) == {"anna": "partnerLeft", "bert": "stopped"}
+
+
+def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_deadline(launch):
+    server = launch_session(launch, DEADLINE=str(time.time() + 8), STOP_SECONDS="15")
+    form(server.store)
+    refuse_answers_of(server.store, "bert")
+
+    async def run():
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            await seen_by_both(anna, bert)
+            await anna.say(command="stop")
+            assert await anna.closed() == 1000
+            assert await bert.closed() == 1001
+
+    asyncio.run(run())
+    assert server.wait(25) == 0
+    assert "ending: deadline" in server.said()
+    assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
+
+
+def test_the_next_game_step_is_played_while_the_answer_of_one_to_the_step_before_is_refused(launch):
+    section = {"gather": 1, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
+    server = launch_session(launch, trial=section, GAME_STEPS="3,5")
+    form(server.store)
+    in_the_way = refuse_answers_of(server.store, "bert")
+
+    async def run():
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            await seen_by_both(anna, bert)
+            await anna.say(command="stop")
+            await anna.closed()
+            async with member(server, "anna", step="5") as later, member(server, "bert") as again:
+                await later.until(lambda: len(later.frames) > 5)
+                await later.say(command="stop")
+                await later.closed()
+                assert (again.state["state"], again.done) == ("ended", None)
+                in_the_way.unlink()
+                assert await again.closed() == 1000
+            async with member(server, "bert", step="5") as later:
+                assert await later.closed() == 1000
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    steps = [{each: answer(server.store, each, step)["answers"]["outcome"] for each in MEMBERS} for step in "35"]
+    assert steps == [{"anna": "stopped", "bert": "partnerLeft"}, {"anna": "stopped", "bert": "left"}]
+
+
+def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_before_the_game(launch):
+    """Their answer is given to the store while the others still play, and may be stored long after their game."""
+    section = {"maxPing": 1000, "pingSamples": 1, "afterAbsent": "policy", "substitute": "idle"}
+    server = launch_session(launch, trial=section)
+    form(server.store)
+    in_the_way = refuse_answers_of(server.store, "bert")
+
+    async def run():
+        async with (
+            far_away(server.port, 0.6) as port,
+            member(server, "anna") as anna,
+            member(server, "bert", port=port) as bert,
+        ):
+            reading = asyncio.create_task(bert.watch(60))
+            await anna.until(lambda: len(anna.frames) > 5)
+            await anna.say(command="stop")
+            assert await anna.closed() == 1000
+            reading.cancel()
+        await asyncio.sleep(1)  # well after LINGER_SECONDS
+        assert server.process.poll() is None, "an answer is not stored yet"
+        in_the_way.unlink()
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert outcomes(server.store) == {"anna": "stopped", "bert": "ping"}

@@ -66,7 +66,7 @@ class Alone:
         """The participant's browser has answered a ping. Only sessions measure it."""
 
     def saved(self, human: str) -> None:
-        """The answer of a member who does not play is stored. There is none."""
+        """A member's answer is stored. There is none."""
 
     # ---- what follows
 
@@ -109,7 +109,7 @@ class Alone:
         return None
 
     def has_answered(self, human: str) -> bool:
-        """Whether the member's answer is stored, while the others play."""
+        """Whether a member's answer is stored. There is none."""
         return False
 
     def answer_of(self, human: str) -> Mapping[str, Any] | None:

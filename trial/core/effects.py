@@ -224,7 +224,11 @@ class CloseRecording:
 
 @dataclass(frozen=True, slots=True)
 class SaveAnswer:
-    """Wait until all recordings are stored, then store the answers, if there are some; answered with `answer_saved`."""
+    """Wait until all recordings are stored, then store the answers, if there are some.
+
+    Answered with `member_saved` for each member's, and with `answer_saved` when all are stored, also those of earlier
+    `SaveMember`.
+    """
 
     answers: Mapping[str, Any] | None
     """The participant's; None in a session."""
@@ -234,7 +238,7 @@ class SaveAnswer:
 
 @dataclass(frozen=True, slots=True)
 class SaveMember:
-    """Store the answer of a member who does not play while the others do; answered with `member_saved`."""
+    """Store a member's answer; answered with `member_saved`. The core emits it for who is out while the others play."""
 
     human: str
     answers: Mapping[str, Any]

@@ -91,7 +91,7 @@ class Session:
         self._stopped: set[str] = set()
         """Members who have ended the game for all. Empty: it was not ended so, or on an earlier server."""
         self._stored: set[str] = set()
-        """Members whose answer is stored while the others play, by their id."""
+        """Members whose answer is stored, by their id."""
         self._broke = False  # a break was on when this was asked last
         self._met = resumed  # the game has begun, so that a member who is missing has left
         self._settled: int | None = None  # while the members' `version` is this one, and the game is on, it goes on
@@ -194,7 +194,7 @@ class Session:
         self.presence.pauses()
 
     def saved(self, human: str) -> None:
-        """The answer of a member who does not play is stored, while the others play."""
+        """The member's answer is stored."""
         self._stored.add(human)
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
@@ -311,7 +311,7 @@ class Session:
         return SaveAnswer(None, found)
 
     def has_answered(self, human: str) -> bool:
-        """Whether the member's answer is stored, while the others play."""
+        """Whether the member's answer is stored."""
         return human in self._stored
 
     def answer_of(self, human: str) -> Mapping[str, Any] | None:

@@ -142,6 +142,11 @@ class Trial:
         return self.phase is Phase.FINISHED
 
     @property
+    def played(self) -> bool:
+        """The game is over and recorded; the store may not have taken everything."""
+        return self.finished or (self.progress.over and self._ending.all_written)
+
+    @property
     def done(self) -> bool:
         """Nothing happens any more."""
         return self.phase in (Phase.FINISHED, Phase.CLOSED)
@@ -364,12 +369,13 @@ class Trial:
             return []
         self.phase = Phase.FINISHED
         for human, client in self._clients.by_human():
-            self._send_done(human, client)
+            if not self._session.has_answered(human):
+                self._send_done(human, client)
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
         return [Log(logging.INFO, text), *self._take_effects()]
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
-        """The answer of a member who does not play is stored."""
+        """The member's answer is stored: they go on, whatever the others do, or wait for."""
         self._now = now
         self._session.saved(human)
         for each, client in self._clients.by_human():

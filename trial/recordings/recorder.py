@@ -27,7 +27,6 @@ log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
 """Play that may be lost if the process is killed outright."""
-_NONE: Mapping[str, Mapping[str, Any]] = {}
 
 
 class Recorder:
@@ -166,18 +165,17 @@ class Recorder:
 
     # ---- the end
 
-    async def save(self, answers: Mapping[str, Any] | None, by_human: Mapping[str, Mapping[str, Any]] = _NONE) -> None:
+    async def save(self, answers: Mapping[str, Any] | None) -> None:
         """Wait until all recordings are stored, then store the answer: a reader of the answer finds them.
 
         If they cannot be stored for `recordings_first_seconds`, or the server ends (`hurry`), the answer does not wait
-        any longer. In a session there is one for each member in `by_human`. An answer that is there already stays as it
-        is.
+        any longer. An answer that is there already stays as it is. None in a session: each member's own answer follows
+        (`save_member`).
         """
         await self._store_recordings_first()
         settings, now = self._settings, datetime.now(UTC)
         if answers is not None:
             await self._create(settings.user_id, Answer(self._step, GAME, settings.group, now, answers))
-        await asyncio.gather(*(self.save_member(user_id, each) for user_id, each in by_human.items()))
 
     def hurry(self) -> None:
         """The server ends soon: an answer waits for recordings no longer."""

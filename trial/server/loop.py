@@ -136,7 +136,9 @@ class TrialLoop:
         return self._recorder.storing
 
     async def stored(self) -> None:
-        """Wait until all closed recordings are stored."""
+        """Wait until the answers, if there are some, and all closed recordings are stored."""
+        if self._saving is not None:
+            await asyncio.wait({self._saving})
         await self._recorder.stored()
 
     async def close(self, seconds: float) -> None:
@@ -397,8 +399,16 @@ class TrialLoop:
             self._apply(self.core.recording_opened(self._loop.time()))
 
     def _save(self, effect: SaveAnswer) -> None:
-        self._saving = asyncio.create_task(self._recorder.save(effect.answers, effect.by_human))
+        self._saving = asyncio.create_task(self._save_all(effect))
         self._saving.add_done_callback(self._saved)
+
+    async def _save_all(self, effect: SaveAnswer) -> None:
+        """Each member goes on when their own answer is stored; all are when those of earlier `SaveMember` are, too."""
+        await self._recorder.save(effect.answers)
+        for human, answers in effect.by_human.items():
+            self._save_member(SaveMember(human, answers))
+        if self._saving_members:
+            await asyncio.wait(self._saving_members)
 
     def _saved(self, task: asyncio.Task[None]) -> None:
         if task.cancelled():

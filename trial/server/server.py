@@ -396,16 +396,21 @@ class Server:
     # ---- trials
 
     def _trial_of(self, step: str | None) -> TrialLoop:
-        """The trial of this step; begins it if necessary. Raises CloseConnection."""
+        """The trial of this step; begins it if necessary. Raises CloseConnection.
+
+        A session may play on while the answer of one member to an earlier step is not stored: that member waits there.
+        """
         trial = self._trial
         if trial is not None and trial.core.broken:
             return trial
-        running = trial is not None and not trial.core.finished
         if step is None:
-            step = trial.core.step if trial is not None and running else self._next_step()
+            step = trial.core.step if trial is not None and not trial.core.finished else self._next_step()
         if trial is not None and trial.core.step == step:
             return trial
-        if running:
+        unstored = next((each for each in self._trials if each.core.step == step and each.core.saving), None)
+        if unstored is not None:
+            return unstored
+        if trial is not None and not trial.core.played:
             raise CloseConnection(4404, "another step's game is still going on")
         trial = self._trial = TrialLoop(
             self.settings,
@@ -417,27 +422,26 @@ class Server:
             assets=self._drawing.assets.table(),
         )
         self._trials.append(trial)
-        trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(self._trial_done)
+        trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(partial(self._trial_done, trial))
         return trial
 
     def _next_step(self) -> str:
         steps = self.settings.game_steps
         return next((step for step in steps if step not in self._finished_steps), steps[-1])
 
-    def _trial_done(self, done: asyncio.Future[None]) -> None:
-        trial = self._trial
+    def _trial_done(self, trial: TrialLoop, done: asyncio.Future[None]) -> None:
         if done.exception() is not None:
             log.error("the trial broke", exc_info=done.exception())
             self.end("error")
-        elif trial is not None and trial.core.broken:
+        elif trial.core.broken:
             self._lifetime.end_in(TELL_SECONDS, "error")
-        elif trial is not None and trial.core.finished:
+        elif trial.core.finished:
             self._finished_steps.add(trial.core.step)
             if trial.core.step == self.settings.game_steps[-1]:
                 self._keep(self._end_when_stored())
 
     async def _end_when_stored(self) -> None:
-        """All game steps have their answers: end the server once their recordings are stored, too."""
+        """The last game step has its answers: end the server once those of all steps, and recordings, are stored."""
         for trial in self._trials:
             await trial.stored()
         self._lifetime.end_in(self.settings.linger_seconds, "done")
