@@ -477,6 +477,34 @@ def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client)
     assert all(answer(server.store, each, step)["answers"]["session"] == SID for each in MEMBERS for step in "35")
 
 
+def test_no_member_opens_a_later_game_step_before_their_own_answer_to_the_one_before(launch, open_client):
+    """Else a member whose client names another step would keep all the others out of theirs."""
+    server = launch_session(launch, GAME_STEPS="3,5")
+    form(server.store)
+
+    async def run():
+        early = hello_of("bert", step="5")
+        assert "an earlier game step" in await refused(server, open_client, 4404, **early)
+        await both_play(server, open_client)
+        async with member(server, "bert", step="5"):
+            pass
+
+    asyncio.run(run())
+
+
+def test_the_next_server_finds_who_has_answered_an_earlier_game_step(launch, open_client):
+    server = launch_session(launch, GAME_STEPS="3,5", SERVER="pair-2")
+    form(server.store)
+    put(server.store, "study/users/anna/answers/3.json", b'{"answers": {}}')
+
+    async def run():
+        assert "an earlier game step" in await refused(server, open_client, 4404, **hello_of("bert", step="5"))
+        async with member(server, "anna", step="5"):
+            pass
+
+    asyncio.run(run())
+
+
 # ---- lifetime
 
 

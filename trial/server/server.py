@@ -20,6 +20,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from protocol import exits
+from protocol.keys import answer_key
 from trial.agent import match
 from trial.agent.agent import AgentAdapter
 from trial.agent.tracebacks import report
@@ -32,7 +33,7 @@ from trial.policies.policy import PolicyError
 from trial.programs import watch
 from trial.programs.environments import MOST, Environments
 from trial.recordings.spool import Spool, store_file
-from trial.recordings.store import Store, open_store
+from trial.recordings.store import Store, open_store, short_error
 from trial.server.assignment import Found, Search, set_environment
 from trial.server.drawing import Drawing
 from trial.server.handshake import (
@@ -325,6 +326,8 @@ class Server:
         now = asyncio.get_running_loop().time()
         if self.settings.session and not self._reconnects.allowed(hello.user_id or "", now):
             raise CloseConnection(4429, _TOO_OFTEN)
+        if self.settings.session and hello.step is not None:
+            await self._check_turn(hello.user_id or "", hello.step)
         return hello
 
     async def _admit(self, websocket: ServerConnection, hello: Hello) -> None:
@@ -343,6 +346,23 @@ class Server:
                 check_matches(hello.project_id, self.settings.project_id, OTHER_STUDY)
         else:
             check_matches(hello.user_id, self.settings.user_id)
+
+    async def _check_turn(self, user_id: str, step: str) -> None:
+        """Raises CloseConnection unless the member has answered every game step before this one.
+
+        Else a member whose client names a later step would begin its game, and keep the others out of theirs.
+        """
+        steps = self.settings.game_steps
+        earlier = [each for each in steps[: steps.index(step)] if each not in self._finished_steps]
+        for key in (answer_key(self.settings.project_id, user_id, each) for each in earlier):
+            try:
+                async with asyncio.timeout(self.settings.hello_seconds):
+                    found = await asyncio.to_thread(self._store.get, key)
+            except Exception as error:
+                log.warning("cannot look for an earlier answer (%s)", short_error(error))
+                raise CloseConnection(1013, _NOT_ASSIGNED) from error
+            if found is None:
+                raise CloseConnection(4404, "an earlier game step is not over for you")
 
     async def _wait_for_assignment(self, websocket: ServerConnection) -> None:
         """Look for the documents that say who plays here. Raises CloseConnection if they are not there in time."""
