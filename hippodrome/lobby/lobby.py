@@ -1,12 +1,17 @@
 """The lobby of projects whose sessions have several players: it matches participants, and forms their sessions.
 
-A *run* reads the document of decisions (`decisions.py`), lists the folder of those who wait (`entries.py`), decides
-(`rules.py`), and writes the document if something changed. Then it carries out what it has decided for good
-(`store.py`): the session's document, its server's start message, each member's membership; then it removes the entries,
-and marks the decision as done. If it is interrupted, the next request of a member, or the sweep, does all of that
-again. Runs are made by each request of a participant at the game step, and by the sweep. If another run has written the
-document meanwhile, a run reads it and decides again; mostly nothing is left to do. A request proposes sessions of all
-participants who are there, but forms and carries out only that of its own participant.
+This module does what a participant's request or start message does. Each request of a participant at the game step
+makes a *run*:
+1. It reads the document of decisions (`decisions.py`), and lists the folder of those who wait (`entries.py`).
+2. It looks up who can be a member, and which servers are ready (`lookups.py`).
+3. It decides (`rules.py`, by `run.py`), and writes the document if something has changed. If another run has written
+   the document meanwhile, it reads it and decides again; mostly nothing is left to do.
+4. It carries out what is decided for good (`store.py`): it writes the session's document, sends its server's start
+   message, and writes each member's membership; then it removes the entries, and marks the decision as done. If this is
+   interrupted, the next request of a member, or the sweep, does all of it again.
+
+The sweep makes runs, too (`repair.py`). A request proposes sessions of all participants who are there, but it forms
+and carries out that of its own participant, and only a few others (`Lookups.proposals_to_form`).
 
 A session whose server was started ahead waits in the document until a server is ready: the first that is goes to the
 session that was formed first. Only then it is decided for good, and its documents are written.
@@ -24,45 +29,30 @@ from datetime import timedelta
 from functools import partial
 from typing import Any
 
-import msgspec
-
 from hippodrome.lobby import entries as folder
 from hippodrome.lobby import matchmaking, questions, rules, servers_ahead, traits
-from hippodrome.lobby.decisions import Decisions, Formed, Matched, Proposal, Unmatched
+from hippodrome.lobby.decisions import Decisions, Formed, Proposal, Unmatched
 from hippodrome.lobby.entries import Entries, Person, Waiting
+from hippodrome.lobby.lookups import Lookups
 from hippodrome.lobby.matcher import Matcher
-from hippodrome.lobby.run import Run, Servers
+from hippodrome.lobby.repair import Repair
+from hippodrome.lobby.run import Servers
 from hippodrome.lobby.store import LobbyStore
-from hippodrome.log import failure, logger
-from hippodrome.model import ids, sessions
+from hippodrome.log import logger
+from hippodrome.model import ids
 from hippodrome.model.matching import field_of
 from hippodrome.model.memberships import Membership
-from hippodrome.model.messages import StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
-from hippodrome.ports import Platform, Topic
+from hippodrome.ports import Platform
 from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.repository import Repository
 from protocol.answer import UNMATCHED
 
 SEEN_ANEW = timedelta(seconds=1)
-"""A participant who was seen since then is not written down again, however often their page asks."""
-FORMED_LATE = timedelta(seconds=4)
-"""A session that all have confirmed and that was proposed before that is formed by requests of others, too."""
-FORMED_AT_ONCE = 10
-"""Sessions of others that one request forms."""
+"""The entry of a participant who waits is written anew only if it is older, however often their page asks."""
 DELETED_AT_ONCE = 5
 """Old entries that one request deletes."""
-LOOKED_AT = 5
-"""Servers of open sessions at which a request looks whose session is the first that waits for one."""
-LOOKED_AT_IN_NEED = 50
-"""The same, if the session's own server has ended."""
-WRITTEN_WITHIN = timedelta(seconds=60)
-"""No request that writes a session takes longer (`next_step` ends after 29 seconds; sweeps are minutes apart)."""
-NO_RECORD_AFTER = timedelta(minutes=3)
-"""If a server that was to start ahead has no record by then, its start message is sent again."""
-CLOSED_FOR_GOOD = timedelta(minutes=3)
-"""If the server of an open session has been closed for so long, it is not replaced any more."""
 Answers = Callable[[], Mapping[str, Any]]
 
 
@@ -106,6 +96,8 @@ class Lobby:
         self._repository = repository
         self._store = LobbyStore(platform, repository)
         self._matcher = Matcher(platform)
+        self._lookups = Lookups(platform, repository)
+        self._repair = Repair(platform, repository, self._store, self._matcher, self._lookups)
 
     # Participants
 
@@ -177,7 +169,7 @@ class Lobby:
                 now,
                 ids.new_session_id,
                 players=project.players,
-                open_for=self._open_for(project),
+                open_for=self._lookups.open_for(project),
             )
 
         after = self._store.change(project, settle)
@@ -187,66 +179,17 @@ class Lobby:
             if each.by == label:
                 self._store.start_server(project, each.id)
 
-    # The sweep
-
     def repair(self, project: Project) -> Collection[str]:
-        """Finish what was interrupted, and bring servers that were started ahead to their number.
+        """Finish what was interrupted, and bring servers that were started ahead to their number; for the sweep.
 
         Return the ids of all sessions that the lobby lists afterwards. A server of a session that is not among them is
         left over if the session has no document: the caller must have listed servers before this call, and looks for
         the document after it. Raises what reading and writing the document raises; one that cannot be read is made
         anew, empty.
         """
-        known, entries = self._store.read(project), self._store.entries(project)
-        self._store.delete(entries.outdated)
-        if project.asks_match:
-            self._matcher.forget(project)
-        is_whole = known.renewed is not None and self._platform.now() - known.renewed >= WRITTEN_WITHIN
-        if is_whole:
-            self._store.finish_sessions(project)
-        self._store.carry_out(project, rules.without_done(known, entries.done).for_good(), entries)
-        ahead = [*known.open, *(each.waits_for for each in known.formed if each.waits_for)]
-        servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
-        entries = self._store.entries(project)  # with the marks of what has just been carried out
-        confirmed = rules.confirmed(known, entries)
-        run = self._run(project, known, entries, confirmed, servers=Servers(servers))
-        closed = [each for each in servers.values() if each and each.closed]
-        over = [each.user_id for each in closed if each.closed and run.now - each.closed > CLOSED_FOR_GOOD]
-        wanted = servers_ahead.sessions_wanted(known, entries, project)
-        ended = servers_ahead.surplus(known, wanted, over, run.now, players=project.players, open_for=run.open_for)
+        return self._repair.run(project)
 
-        def settle(document: Decisions) -> Decisions:
-            if is_whole and document.renewed == known.renewed:
-                document = msgspec.structs.replace(document, renewed=None)
-            document = servers_ahead.without_open(run.decided(document), ended)
-            wanted = servers_ahead.sessions_wanted(document, entries, project)
-            return servers_ahead.open_sessions(
-                document,
-                wanted,
-                "",
-                run.now,
-                ids.new_session_id,
-                players=project.players,
-                open_for=run.open_for,
-            )
-
-        after = self._store.change(project, settle)
-        self._store.forget_done(project, after, entries)
-        for session_id in sorted(ended - after.session_ids()):
-            self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, session_id)))
-        waits_for = (each.waits_for for each in after.formed if each.waits_for)
-        for each in [*after.open, *waits_for]:
-            is_new = each.by == "" and each.asked == run.now
-            is_lost = each.id in servers and servers[each.id] is None and run.now - each.asked > NO_RECORD_AFTER
-            if is_new or is_lost:
-                self._store.start_server(project, each.id)
-        formed = tuple(each for each in after.for_good().formed if each not in known.formed)
-        self._store.carry_out(project, Decisions(formed=formed), entries)
-        if ended:
-            logger.info("servers that were ahead", extra={"project": project.id, "stopped": len(ended)})
-        return after.session_ids()
-
-    # A run
+    # A participant's request
 
     def _ask(self, project: Project, me: _Asking) -> LobbyState | NoServerYet | Membership:
         known = self._store.read(project)
@@ -263,9 +206,9 @@ class Lobby:
         if project.asks_match:
             come = partial(_person, me)
             wished = self._matcher.wished(project, me.label, come, known, entries)
-        ready = self._ready(known, entries, me.label)
-        servers = self._servers(project, known, me.label, ready)
-        run = self._run(project, known, entries, ready, servers=servers, wished=wished)
+        proposals = self._lookups.proposals_to_form(known, entries, me.label)
+        servers = self._lookups.servers(project, known, me.label, proposals)
+        run = self._lookups.run(project, known, entries, proposals, servers=servers, wished=wished)
         own = entries.waiting.get(me.label)
         before = known  # the document that this run has changed
 
@@ -316,8 +259,8 @@ class Lobby:
     ) -> NoServerYet | Membership:
         """The participant's session is formed, and waits for a server. Their entries are gone."""
         now, before = self._platform.now(), known
-        servers = self._servers(project, known, me.label, ())
-        open_for = self._open_for(project)
+        servers = self._lookups.servers(project, known, me.label, ())
+        open_for = self._lookups.open_for(project)
 
         def settle(document: Decisions) -> Decisions:
             nonlocal before
@@ -341,67 +284,8 @@ class Lobby:
             logger.info("the lobby's document keeps changing", extra={"project": project.id})
             return known
 
-    def _servers(self, project: Project, known: Decisions, label: str, ready: Sequence[Proposal]) -> Servers:
-        """The servers at which this participant's request looks: that of their session, if it has to be ready yet.
-
-        Whose session is the first that waits looks at some of those that no session has, too; whose server has ended,
-        at more.
-        """
-        formed = known.formed_of(label)
-        own = formed.waits_for if formed else next((each.ahead for each in ready if label in each.labels), None)
-        if own is None:
-            return Servers({})
-        waiting, now = known.without_server(), self._platform.now()
-        is_first = not waiting or waiting[0] is formed
-        open_for = self._open_for(project)
-        usable = [each.id for each in known.open if each.is_usable(own.players, now, open_for)]
-        some = usable[:LOOKED_AT] if is_first else []
-        found = self._records(project, [own.id, *some])
-        if own.id in found.over:
-            others = self._records(project, usable[len(some) : LOOKED_AT_IN_NEED])
-            return Servers({**found.records, **others.records})
-        return found
-
-    def _records(self, project: Project, session_ids: Sequence[str]) -> Servers:
-        acts = [partial(self._server, project, each) for each in session_ids]
-        return Servers(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
-
-    def _server(self, project: Project, session_id: str) -> Server | None:
-        """The record of a session's server; None also if it cannot be read, which the next request tries again."""
-        try:
-            return self._repository.server_of(project.id, session_id)
-        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
-            failure("the record of a server that was started ahead cannot be read", error, project=project.id)
-            return None
-
-    def _ready(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
-        """The confirmed proposals that this participant's request forms: their own, and some that have waited for long.
-
-        So in a crowd that writes faster than the document takes it, a write decides on several sessions.
-        """
-        now = self._platform.now()
-        confirmed = rules.confirmed(known, entries)
-        own = [each for each in confirmed if label in each.labels]
-        late = [each for each in confirmed if label not in each.labels and now - each.at > FORMED_LATE]
-        return [*own, *late[:FORMED_AT_ONCE]]
-
-    def _run(
-        self,
-        project: Project,
-        known: Decisions,
-        entries: Entries,
-        ready: Sequence[Proposal],
-        *,
-        servers: Servers,
-        wished: Sequence[Sequence[str]] = (),
-    ) -> Run:
-        """A run that may form these sessions, with what is to be known of them."""
-        members, broken = self._checked(project, ready, entries)
-        now, open_for = self._platform.now(), self._open_for(project)
-        return Run(project, known, entries, members, broken, now, open_for, servers, wished)
-
     def _be_seen(self, project: Project, me: _Asking, entries: Entries) -> Entries:
-        """Write down that the participant is there. At most once a second, however often they ask."""
+        """Write down that the participant is there, at most once in `SEEN_ANEW`."""
         now, found, left = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
         if found is not None and now - found.seen < SEEN_ANEW:
             return entries
@@ -427,48 +311,6 @@ class Lobby:
         entries = self._store.entries(project).with_confirmation(proposal.id, me.label)
         return entries.with_waiting(own) if own and me.label not in {*entries.waiting, *entries.left} else entries
 
-    def _checked(
-        self, project: Project, ready: Sequence[Proposal], entries: Entries
-    ) -> tuple[Mapping[str, Sequence[Matched]], Collection[str]]:
-        """The members of each of these sessions that can be formed, and the ids of those that cannot be.
-
-        A session cannot be formed if a member has left, or has a membership: a late request of a second tab may have
-        brought them back into the lobby; nor if the project has been registered with another number of players since.
-        Two reads for each member.
-        """
-        waiting = [entries.waiting[label] for each in ready for label in each.labels]
-        looked = self._platform.run_all([partial(self._member, project, one) for one in waiting])
-        found = {one.label: member for one, member in zip(waiting, looked, strict=True)}
-        members, broken = {}, []
-        for each in ready:
-            known = [found[label] for label in each.labels]
-            if any(isinstance(one, Exception) for one in known):
-                continue  # the next run looks again
-            able = [one for one in known if isinstance(one, Matched)]
-            if len(able) == len(known) and each.players in (0, project.players):
-                members[each.id] = able
-            else:
-                broken.append(each.id)
-        return members, broken
-
-    def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
-        """The participant who waits, as a member; None if they have left or have a membership. Errors are returned."""
-        try:
-            found = self._documents.get(folder.waiting_key(project.id, one))
-            person = folder.person(found.body) if found else None
-            if person is None or ids.server_label(project.id, person.user_id) != one.label:
-                return None
-            membership = self._repository.membership(project.id, person.user_id)
-        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
-            failure("a participant who waits cannot be read", error, project=project.id)
-            return error
-        if membership:
-            return None
-        return Matched(one.label, person.user_id, person.group, folder.seconds_since(one.joined, self._platform.now()))
-
-    def _open_for(self, project: Project) -> timedelta:
-        return sessions.open_for(project, self._platform.settings)
-
 
 def _person(me: _Asking) -> questions.Person:
     """The participant who asks, as the function `match` is told."""
@@ -476,10 +318,10 @@ def _person(me: _Asking) -> questions.Person:
 
 
 def _due(label: str, known: Decisions, before: Decisions, after: Decisions) -> Decisions:
-    """What this participant's request carries out. `known`: what it read; it has made `after` of `before`.
+    """What this participant's request carries out. It has read `known` and has changed `before` to `after`.
 
-    What it has decided on them, or what had been decided when it began; and the sessions of others to which it has
-    given a server. What another request has decided meanwhile, that one carries out.
+    It carries out what is decided on its own participant, and the sessions of others to which it has given a server. If
+    another request has decided on its participant since it read `known`, that request carries this out.
     """
     own = after.of(label) if known.is_decided(label) or not before.is_decided(label) else Decisions()
     waited = {each.labels for each in before.without_server()}

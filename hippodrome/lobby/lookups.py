@@ -1,0 +1,142 @@
+"""What a run of the lobby (`lobby.py`) looks up before it decides: who can be a member, and which servers are ready."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from datetime import timedelta
+from functools import partial
+
+from hippodrome.lobby import entries as folder
+from hippodrome.lobby import rules
+from hippodrome.lobby.decisions import Decisions, Matched, Proposal
+from hippodrome.lobby.entries import Entries, Waiting
+from hippodrome.lobby.run import Run, Servers
+from hippodrome.log import failure
+from hippodrome.model import ids, sessions
+from hippodrome.model.project import Project
+from hippodrome.model.server import Server
+from hippodrome.ports import Platform
+from hippodrome.storage.repository import Repository
+
+FORMED_LATE = timedelta(seconds=4)
+"""A confirmed session that was proposed longer ago is formed by requests of other participants, too."""
+FORMED_AT_ONCE = 10
+"""Sessions of others that one request forms."""
+LOOKED_AT = 5
+"""Servers of open sessions at which a request looks whose session is the first that waits for one."""
+LOOKED_AT_IN_NEED = 50
+"""The same, if the session's own server has ended."""
+
+
+class Lookups:
+    """The reads of a run, beside the document of decisions and the listing of entries."""
+
+    def __init__(self, platform: Platform, repository: Repository) -> None:
+        self._platform = platform
+        self._repository = repository
+
+    def open_for(self, project: Project) -> timedelta:
+        """For how long a server that was started ahead can be used."""
+        return sessions.open_for(project, self._platform.settings)
+
+    def run(
+        self,
+        project: Project,
+        known: Decisions,
+        entries: Entries,
+        proposals: Sequence[Proposal],
+        *,
+        servers: Servers,
+        wished: Sequence[Sequence[str]] = (),
+    ) -> Run:
+        """A run that may form the sessions of these proposals, which are confirmed. Two reads for each member."""
+        members, broken = self._members(project, proposals, entries)
+        now, open_for = self._platform.now(), self.open_for(project)
+        return Run(project, known, entries, members, broken, now, open_for, servers, wished)
+
+    def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
+        """The confirmed proposals that this participant's request forms: their own, and some that have waited for long.
+
+        In a crowd the document takes fewer writes than participants come: so a write decides on several sessions.
+        """
+        now = self._platform.now()
+        confirmed = rules.confirmed(known, entries)
+        own = [each for each in confirmed if label in each.labels]
+        late = [each for each in confirmed if label not in each.labels and now - each.at > FORMED_LATE]
+        return [*own, *late[:FORMED_AT_ONCE]]
+
+    # Servers that were started ahead
+
+    def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> Servers:
+        """The servers at which this participant's request looks.
+
+        None, unless their session (formed, or of `proposals`) needs one that was started ahead. Then that one; if no
+        other session waits before theirs, also some that are free; if theirs has ended, more of these.
+        """
+        formed = known.formed_of(label)
+        own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
+        if own is None:
+            return Servers({})
+        waiting, now = known.without_server(), self._platform.now()
+        is_first = not waiting or waiting[0] is formed
+        open_for = self.open_for(project)
+        usable = [each.id for each in known.open if each.is_usable(own.players, now, open_for)]
+        some = usable[:LOOKED_AT] if is_first else []
+        found = self._records(project, [own.id, *some])
+        if own.id in found.over:
+            others = self._records(project, usable[len(some) : LOOKED_AT_IN_NEED])
+            return Servers({**found.records, **others.records})
+        return found
+
+    def _records(self, project: Project, session_ids: Sequence[str]) -> Servers:
+        acts = [partial(self._server, project, each) for each in session_ids]
+        return Servers(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
+
+    def _server(self, project: Project, session_id: str) -> Server | None:
+        """The record of a session's server; None also if it cannot be read, which the next request tries again."""
+        try:
+            return self._repository.server_of(project.id, session_id)
+        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
+            failure("the record of a server that was started ahead cannot be read", error, project=project.id)
+            return None
+
+    # Members
+
+    def _members(
+        self, project: Project, proposals: Sequence[Proposal], entries: Entries
+    ) -> tuple[Mapping[str, Sequence[Matched]], Collection[str]]:
+        """The members of each session that can be formed, by the proposal's id; and the ids of the other proposals.
+
+        A session cannot be formed if a member has left, or has a membership: a late request of a second tab may have
+        brought them back into the lobby; nor if the project has been registered with another number of players since.
+        A proposal with a member who cannot be read is in neither: the next run looks again.
+        """
+        waiting = [entries.waiting[label] for each in proposals for label in each.labels]
+        looked = self._platform.run_all([partial(self._member, project, one) for one in waiting])
+        found = {one.label: member for one, member in zip(waiting, looked, strict=True)}
+        members, broken = {}, []
+        for each in proposals:
+            known = [found[label] for label in each.labels]
+            if any(isinstance(one, Exception) for one in known):
+                continue
+            able = [one for one in known if isinstance(one, Matched)]
+            if len(able) == len(known) and each.players in (0, project.players):
+                members[each.id] = able
+            else:
+                broken.append(each.id)
+        return members, broken
+
+    def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
+        """The participant who waits, as a member; None if they have left or have a membership. Errors are returned."""
+        try:
+            found = self._platform.documents.get(folder.waiting_key(project.id, one))
+            person = folder.person(found.body) if found else None
+            if person is None or ids.server_label(project.id, person.user_id) != one.label:
+                return None
+            membership = self._repository.membership(project.id, person.user_id)
+        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
+            failure("a participant who waits cannot be read", error, project=project.id)
+            return error
+        if membership:
+            return None
+        return Matched(one.label, person.user_id, person.group, folder.seconds_since(one.joined, self._platform.now()))

@@ -1,0 +1,92 @@
+"""What the sweep does in a lobby: it finishes what was interrupted, and keeps up the number of servers ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from datetime import timedelta
+
+import msgspec
+
+from hippodrome.lobby import rules, servers_ahead
+from hippodrome.lobby.decisions import Decisions
+from hippodrome.lobby.lookups import Lookups
+from hippodrome.lobby.matcher import Matcher
+from hippodrome.lobby.run import Servers
+from hippodrome.lobby.store import LobbyStore
+from hippodrome.log import logger
+from hippodrome.model import ids
+from hippodrome.model.messages import StopServer, to_message
+from hippodrome.model.project import Project
+from hippodrome.ports import Platform, Topic
+from hippodrome.storage.repository import Repository
+
+WRITTEN_WITHIN = timedelta(seconds=60)
+"""No request that writes a session takes longer (`next_step` ends after 29 seconds; sweeps are minutes apart)."""
+NO_RECORD_AFTER = timedelta(minutes=3)
+"""If a server that was to start ahead has no record by then, its start message is sent again."""
+CLOSED_FOR_GOOD = timedelta(minutes=3)
+"""If the server of an open session has been closed for so long, it is not replaced any more."""
+
+
+class Repair:
+    """The repair of all lobbies."""
+
+    def __init__(
+        self, platform: Platform, repository: Repository, store: LobbyStore, matcher: Matcher, lookups: Lookups
+    ) -> None:
+        self._platform = platform
+        self._repository = repository
+        self._store = store
+        self._matcher = matcher
+        self._lookups = lookups
+
+    def run(self, project: Project) -> Collection[str]:
+        """As `Lobby.repair`."""
+        known, entries = self._store.read(project), self._store.entries(project)
+        self._store.delete(entries.outdated)
+        if project.asks_match:
+            self._matcher.forget(project)
+        # The document was lost, and what the requests that had read it were writing has been written.
+        may_finish = known.renewed is not None and self._platform.now() - known.renewed >= WRITTEN_WITHIN
+        if may_finish:
+            self._store.finish_sessions(project)
+        self._store.carry_out(project, rules.without_done(known, entries.done).for_good(), entries)
+        ahead = [*known.open, *(each.waits_for for each in known.formed if each.waits_for)]
+        servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
+        entries = self._store.entries(project)  # with the marks of what has just been carried out
+        run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=Servers(servers))
+        closed = [each for each in servers.values() if each and each.closed]
+        over = [each.user_id for each in closed if each.closed and run.now - each.closed > CLOSED_FOR_GOOD]
+        wanted = servers_ahead.sessions_wanted(known, entries, project)
+        ended = servers_ahead.surplus(known, wanted, over, run.now, players=project.players, open_for=run.open_for)
+
+        def settle(document: Decisions) -> Decisions:
+            if may_finish and document.renewed == known.renewed:
+                document = msgspec.structs.replace(document, renewed=None)
+            document = servers_ahead.without_open(run.decided(document), ended)
+            wanted = servers_ahead.sessions_wanted(document, entries, project)
+            return servers_ahead.open_sessions(
+                document,
+                wanted,
+                "",
+                run.now,
+                ids.new_session_id,
+                players=project.players,
+                open_for=run.open_for,
+            )
+
+        after = self._store.change(project, settle)
+        self._store.forget_done(project, after, entries)
+        for session_id in sorted(ended - after.session_ids()):
+            self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, session_id)))
+        waits_for = (each.waits_for for each in after.formed if each.waits_for)
+        for each in [*after.open, *waits_for]:
+            is_new = each.by == "" and each.asked == run.now
+            is_lost = each.id in servers and servers[each.id] is None and run.now - each.asked > NO_RECORD_AFTER
+            if is_new or is_lost:
+                self._store.start_server(project, each.id)
+        formed = tuple(each for each in after.for_good().formed if each not in known.formed)
+        self._store.carry_out(project, Decisions(formed=formed), entries)
+        if ended:
+            logger.info("servers that were ahead", extra={"project": project.id, "stopped": len(ended)})
+        return after.session_ids()
