@@ -1,4 +1,4 @@
-"""Processes of `python -m MODULE` that begin with their imports done: a process that has loaded them forks for each test.
+"""Processes of `python -m MODULE` or `python SCRIPT` that begin with their imports done: a process that has loaded them forks for each test.
 
 To load numpy and gymnasium takes a trial server longer than most tests with it. What a process does from there on, and all that
 the system shows of it, is its own: memory, files, time, signals, session; only its command line is another's. Tests of the
@@ -23,11 +23,13 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[1]
 LOADED = ("trial.__main__", "gymnasium", "local.__main__", "local.check.__main__", "local.rehearsal.__main__")
 AGENT = "local.check.agent_process"
+EXPERIMENT = "experiment.py"
 _COMMANDS = ("operate.doctor", "operate.status", "operate.logs", "operate.stop", "operate.data", "cost.cost")
 OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     AGENT: ((AGENT,), {"PYTHONDONTWRITEBYTECODE": "1"}),  # nothing else: it reports what an agent has loaded
@@ -35,8 +37,10 @@ OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
         ("deploy.__main__", *(f"deploy.{name}" for name in _COMMANDS)),
         {"PYTHONUTF8": "1", "COLUMNS": "160", "TERM": "dumb"},  # its consoles are made when it is loaded
     ),
+    # Only what every experiment of Interactive Gym imports itself: what it has loaded becomes part of its project.
+    EXPERIMENT: (("trial.interactive_gym.server_app", "gymnasium", "yaml"), {"PYTHONDONTWRITEBYTECODE": "1"}),
 }
-"""Modules that are forked from a process of their own: what that has loaded, and the variables with which it started."""
+"""Modules and scripts that are forked from a process of their own: what that has loaded, and the variables with which it started."""
 
 
 class Forked:
@@ -108,12 +112,19 @@ def start(
 ) -> Forked | subprocess.Popen[str]:
     """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's, and `safe_path` is Python's -P.
 
+    A `module` that ends with `.py` is a script in `cwd`: `python SCRIPT ARGUMENTS`.
     `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
     """
     kind = module if module in OTHERS else ""
     if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment(kind)):
         return subprocess.Popen(
-            [sys.executable, *(["-P"] if safe_path else []), "-m", module, *arguments],
+            [
+                sys.executable,
+                *(["-P"] if safe_path else []),
+                *([] if _is_script(module) else ["-m"]),
+                module,
+                *arguments,
+            ],
             cwd=cwd,
             env=env,
             stdin=subprocess.DEVNULL,
@@ -158,6 +169,10 @@ def popen(command: Sequence[str], **options: Any) -> Forked | subprocess.Popen[s
     return start(AGENT, command[len(tries_agent) :], safe_path=True, **options)
 
 
+def _is_script(module: str) -> bool:
+    return module.endswith(".py")
+
+
 def _of_python(env: Mapping[str, str]) -> dict[str, str]:
     """The variables that Python reads as it starts; `_text` heeds PYTHONUNBUFFERED."""
     return {name: value for name, value in env.items() if name.startswith("PYTHON") and value} | {
@@ -188,7 +203,7 @@ def _forker(kind: str) -> socket.socket:
 # -- in that process
 
 
-def _serve(requests: socket.socket) -> dict[str, Any] | None:
+def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[str, Any] | None:
     """Fork for each request, and tell the exit code of each process. Returns a request in its new process, None at the end."""
     running: dict[int, tuple[socket.socket, int]] = {}  # by the file that tells of the end
     while True:
@@ -209,6 +224,7 @@ def _serve(requests: socket.socket) -> dict[str, Any] | None:
                 for open_socket in (requests, told, *(one for one, _ in running.values())):
                     open_socket.detach()  # `_become` closes their files
                 wanted: dict[str, Any] = json.loads(body)
+                wanted["env"].update(told_by_imports)
                 _become(wanted, *fds[1:])
                 return wanted
             for file in fds[1:]:
@@ -235,6 +251,13 @@ def _become(request: dict[str, Any], stdout: int, stderr: int) -> None:
     sys.path[:1] = [] if request["safe_path"] else [request["cwd"]]
 
 
+def _run_script(path: Path) -> None:
+    """As `python SCRIPT` does; `runpy.run_path` would change sys.argv."""
+    main = sys.modules["__main__"] = ModuleType("__main__")
+    main.__file__ = str(path)
+    exec(compile(path.read_bytes(), path, "exec"), vars(main))
+
+
 def _text(number: int, errors: str) -> io.TextIOWrapper:
     unbuffered = bool(os.environ.get("PYTHONUNBUFFERED"))
     file: Any = open(number, "wb", buffering=0 if unbuffered else -1, closefd=False)  # noqa: SIM115
@@ -243,6 +266,7 @@ def _text(number: int, errors: str) -> io.TextIOWrapper:
 
 def _main() -> dict[str, Any] | None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests'; they end this process
+    before = dict(os.environ)
     with socket.socket(fileno=int(sys.argv[1])) as requests:
         for name in sys.argv[2:]:
             importlib.import_module(name)
@@ -250,9 +274,12 @@ def _main() -> dict[str, Any] | None:
                 del sys.modules[name]  # it runs as the main module
         gc.collect()
         gc.freeze()
-        return _serve(requests)
+        return _serve(requests, dict(os.environ.items() - before.items()))  # gymnasium sets one for pygame
 
 
 if __name__ == "__main__":
-    if wanted := _main():
+    wanted = _main()
+    if wanted and _is_script(wanted["module"]):
+        _run_script(Path(wanted["module"]).absolute())
+    elif wanted:
         runpy.run_module(wanted["module"], run_name="__main__", alter_sys=True)

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from hippodrome.config import read_project
 from local.check import agent
 from testing import preloaded
 from tests.local.conftest import write_study
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, environment, run_experiment
 from trial.server import process_group
 
 TELLS = """
@@ -168,3 +170,28 @@ def test_what_make_check_tries_an_agent_in_is_the_same_forked(tmp_path: Path, mo
     first, second = (json.loads(text.partition(": ")[2]) for text in told)
     assert first == second
     assert "numpy" in first[1]
+
+
+EXPERIMENT_TELLS = """
+import json, os, sys
+files = {name: getattr(module, "__file__", None) or "" for name, module in list(sys.modules.items())}
+print(json.dumps([
+    __name__, __file__, __spec__, vars(sys.modules["__main__"]) is globals(), sys.argv, sys.path, os.getcwd(),
+    sys.dont_write_bytecode, dict(os.environ),
+    sorted(name for name, file in files.items() if "site-packages" in file or name.startswith("trial")),
+]))
+sys.exit("in the end")
+"""
+
+
+def test_an_experiment_is_the_same_forked(tmp_path: Path) -> None:
+    """What is loaded, too: an experiment's project holds what the experiment has imported."""
+    (tmp_path / "how.html").write_text("<h1>How</h1>")
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / preloaded.EXPERIMENT).write_text(ALONE + RUN.replace("SERVE", "False") + EXPERIMENT_TELLS)
+    forked = run_experiment(tmp_path)
+    command = [sys.executable, preloaded.EXPERIMENT]
+    new = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    assert "The project is in" in forked.stdout
+    assert json.loads(forked.stdout.splitlines()[-1]) == json.loads(new.stdout.splitlines()[-1])
+    assert (forked.returncode, forked.stderr) == (new.returncode, new.stderr) == (1, "in the end\n")

@@ -1,4 +1,13 @@
-"""Experiments for the tests, as researchers write them."""
+"""Experiments for the tests, as researchers write them, and how they are run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+
+from testing import preloaded
 
 ALONE = """
 import gymnasium
@@ -121,3 +130,25 @@ PEOPLE = TOGETHER.replace('"brains/two.txt"', "configuration_constants.PolicyTyp
     )""",
 )
 """TOGETHER, with two humans."""
+
+
+def environment() -> dict[str, str]:
+    """The variables of a process that finds `trial`."""
+    return {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def run_experiment(folder: Path) -> subprocess.CompletedProcess[str]:
+    """`python experiment.py` in this folder, to its end; gymnasium is loaded already (`testing/preloaded.py`)."""
+    with tempfile.TemporaryFile("w+") as errors:
+        process = preloaded.start(
+            preloaded.EXPERIMENT, cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=errors
+        )
+        try:
+            said, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
+            assert process.stdout is not None
+            process.stdout.close()
+        errors.seek(0)
+        assert process.returncode is not None
+        return subprocess.CompletedProcess([preloaded.EXPERIMENT], process.returncode, said, errors.read())

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, run_experiment
 from tests.trial.sessions import SID, answer, form, member, recordings
 from trial.interactive_gym import playing
 from trial.interactive_gym.remote_config import RemoteConfig
@@ -34,10 +34,7 @@ def project(folder: Path, source: str) -> Path:
     (folder / "how.html").write_text("<h1>How</h1>")
     (folder / "brains").mkdir()
     (folder / "brains/two.txt").write_text("2")
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [sys.executable, "experiment.py"], cwd=folder, env=env, capture_output=True, text=True, check=False
-    )
+    done = run_experiment(folder)
     assert done.returncode == 0, done.stderr
     return folder / "experiment-study"
 

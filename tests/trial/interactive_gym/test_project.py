@@ -17,16 +17,15 @@ from jinja2 import Environment
 from hippodrome.config import read_project
 from protocol.players import ONNXRUNTIME
 from testing import onnx_files
-from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER
+from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, environment, run_experiment
 
 ROOT = Path(__file__).resolve().parents[3]
 MAKE = RUN.replace("SERVE", "False")
 
 
 def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True, check=False
+        [sys.executable, *arguments], cwd=folder, env=environment(), capture_output=True, text=True, check=False
     )
 
 
@@ -40,14 +39,14 @@ def write(folder: Path, source: str = ALONE, name: str = "experiment.py") -> Non
 
 def made(folder: Path, source: str = ALONE) -> tuple[Path, str]:
     write(folder, source)
-    done = python(folder, "experiment.py")
+    done = run_experiment(folder)
     assert done.returncode == 0, done.stderr
     return folder / "experiment-study", done.stdout
 
 
 def refused(folder: Path, source: str) -> str:
     write(folder, source)
-    done = python(folder, "experiment.py")
+    done = run_experiment(folder)
     assert done.returncode == 1
     assert not (folder / "experiment-study").exists()
     assert done.stderr.startswith("This experiment cannot be played here: "), done.stderr
@@ -156,7 +155,7 @@ def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
 def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> None:
     package = tmp_path / "examples" / "car"
     write(package, ALONE.replace("import helper", "from examples.car import helper"))
-    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "PYTHONDONTWRITEBYTECODE": "1"}
+    env = {**environment(), "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     done = subprocess.run(
         [sys.executable, str(package / "experiment.py")], env=env, capture_output=True, text=True, check=False
     )
@@ -184,7 +183,7 @@ def test_it_is_made_anew_and_what_was_changed_by_hand_stays(tmp_path: Path) -> N
     (project / "data/answer").write_text("kept")
     (tmp_path / "key.png").unlink()
     (tmp_path / "experiment.py").write_text((ALONE + MAKE).replace("Mountain car", "Another name"))
-    done = python(tmp_path, "experiment.py")
+    done = run_experiment(tmp_path)
     assert done.returncode == 0, done.stderr
     assert "steps/welcome.html was changed by hand and stays; delete it to have it made anew" in done.stdout
     assert (project / "steps/welcome.html").read_text() == "<h1>Mine</h1>"
@@ -198,7 +197,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
     mine.mkdir()
     (mine / "thesis.txt").write_text("years of work")
     write(tmp_path)
-    done = python(tmp_path, "experiment.py")
+    done = run_experiment(tmp_path)
     assert done.returncode == 1
     assert f"{mine} holds something else" in done.stderr
     assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
@@ -214,7 +213,7 @@ def test_a_file_that_the_experiment_reads_as_it_is_imported_is_found_on_a_server
 def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config, serve=False)\n")
-    assert python(tmp_path, "experiment.py").returncode == 0
+    assert run_experiment(tmp_path).returncode == 0
     done = python(tmp_path / "experiment-study", "-c", "import agent; print(agent.Agent.__name__)")
     assert (done.returncode, done.stdout) == (0, "Agent\n"), done.stderr
 
@@ -254,7 +253,7 @@ def test_a_config_that_is_no_variable_of_the_file_is_refused(tmp_path: Path) -> 
     source = ALONE.replace("config = (", "def build(): return (")
     write(tmp_path, source)
     (tmp_path / "experiment.py").write_text(source + "\nserver_app.run(build(), serve=False)\n")
-    done = python(tmp_path, "experiment.py")
+    done = run_experiment(tmp_path)
     assert "the config must be a variable of the experiment's file" in done.stderr
 
 
@@ -304,7 +303,7 @@ if __name__ == "__main__":
 def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", "game"))
-    done = python(tmp_path, "experiment.py")
+    done = run_experiment(tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Remark: restart_pyodide has no effect" in done.stdout
     project = tmp_path / "experiment-study"
@@ -330,7 +329,7 @@ def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
 def test_scenes_that_cannot_be_are_refused(tmp_path: Path, scenes: str, said: str) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", scenes))
-    done = python(tmp_path, "experiment.py")
+    done = run_experiment(tmp_path)
     assert done.returncode == 1
     assert said in done.stderr
 
