@@ -89,7 +89,7 @@ class SessionDriver:
     def works(self):
         """Let the agent and the store answer what they were asked for, but take no step."""
         while True:
-            call = self.trial._call
+            call = self.trial._agent.call
             if isinstance(call, ResetCall):
                 self.steps = 0
                 self.event("call_returned", call, Begun(b"reset", FRAME, self.view()), self.now)
@@ -145,7 +145,7 @@ class SessionDriver:
 
     def take(self, *, rewards=None, terminated=False):
         """Take the step that has begun, if one has."""
-        call = self.trial._call
+        call = self.trial._agent.call
         if isinstance(call, StepCall):
             self.steps += 1
             call.heard = len(call.feedback)

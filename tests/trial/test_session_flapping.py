@@ -43,9 +43,9 @@ def test_a_page_that_stops_and_goes_on_all_the_time_is_no_better() -> None:
     session, since = driver.trial._session, driver.now
     assert session is not None
     while driver.now - since < 600 and not driver.trial.progress.over:
-        session.sleeps("left", driver.now)
+        session.stalls("left", driver.now)
         driver.wait(0.1)
-        session.wakes("left", driver.now)
+        session.answers_again("left", driver.now)
         driver.wait(0.1)
     assert driver.now - since < 60
     assert driver.outcomes == {"P0": "left", "P1": "partnerLeft"}

@@ -71,8 +71,8 @@ def test_a_hidden_page_that_stops_answering_and_answers_again_is_still_hidden() 
     driver = SessionDriver().begin().wait(1).say(1, hidden=True)
     session = driver.trial._session
     assert session is not None
-    session.sleeps("right", driver.now)
-    session.wakes("right", driver.now)
+    session.stalls("right", driver.now)
+    session.answers_again("right", driver.now)
     driver.wait(1)
     assert people(driver, 0)["right"] == "away"
     assert driver.presence()[-1] == ("right", "left")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trial.core import messages
+from trial.core import commands, messages
 from trial.core.controls import Controls
 from trial.pictures import frames
 from trial.server.watchdog import Watchdog
@@ -90,7 +90,7 @@ def test_a_message_is_read_and_recorded(fields, message, recorded):
 def test_feedback_and_commands_are_those_of_the_wire():
     assert sorted(messages.FEEDBACK) == ["bad", "good", "trainOffline", "trainOnline"]
     assert sorted(messages.PLAIN_COMMANDS) == ["pause", "requestUI", "reset", "start", "stop"]
-    assert sorted(messages.ALWAYS_ALLOWED) == ["requestUI", "start"]
+    assert sorted(commands.ALWAYS_ALLOWED) == ["requestUI", "start"]
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_what_the_server_says_is_json_with_the_names_of_the_wire(next_in):
     ],
 )
 def test_what_the_projects_ui_leaves_out_is_not_offered(said, ui, missing):
-    assert messages.not_offered(messages.Message(**said), ui) == missing
+    assert commands.not_offered(messages.Message(**said), ui) == missing
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 from trial.core import records
 from trial.core.effects import SaveAnswer
 from trial.core.flow_control import Window
-from trial.core.messages import CommandRefused, Message
+from trial.core.messages import Message
 from trial.core.progress import Progress
 
 
@@ -37,15 +37,13 @@ class Alone:
         if not closing:
             self._progress.leave(player)
 
-    def sleeps(self, player: str, now: float) -> bool:
+    def stalls(self, player: str, now: float) -> bool:
         """The participant's page has stopped answering, as if they had gone. Whether that is new."""
         self._progress.leave(player)
         return True
 
-    def hears(self, player: str, message: Message, window: Window, now: float) -> bool:
-        """A message has come; whether it is read. Raises CommandRefused."""
-        if message.hidden is not None:
-            raise CommandRefused("unknown field 'hidden'")
+    def receive(self, player: str, message: Message, window: Window, now: float) -> bool:
+        """A message has come; whether it is read: always."""
         return True
 
     def start(self, player: str, now: float) -> None:

@@ -1,40 +1,66 @@
-"""What a client asks for: whether it may, and what that does to the game. Pure."""
+"""What a client asks for: whether it may, what that does to the game, and what it is told if it may not. Pure."""
 
 from __future__ import annotations
+
+import re
+from collections.abc import Collection
 
 from protocol.trial import Trial
 from trial.core import messages
 from trial.core.alone import Alone
+from trial.core.clients import Client, Clients
 from trial.core.controls import ARROWS, KEY
+from trial.core.message_log import MessageLog
 from trial.core.messages import CommandRefused, Message
 from trial.core.progress import Progress
 from trial.core.session import Session
 from trial.core.timing import Timing
 
+ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
+"""Commands that no project's `ui` can take away: without `start` a game could not be played."""
+_COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
+
 
 class Commands:
     """The clients' commands, actions and keys. `reset` and `stop` wait for the end of a step."""
 
-    def __init__(self, config: Trial) -> None:
+    def __init__(self, config: Trial, clients: Clients, message_log: MessageLog) -> None:
         shown = config.ui.shown()
         self._config = config
         self._offered = (*shown, *ARROWS) if config.keys else shown
+        self._clients = clients
+        self._message_log = message_log
         self.waiting: list[str] = []
         """Those that wait for the end of a step."""
         self.closed = False
         """The server must end, which has ended what was on: commands do nothing any more."""
 
-    def check(self, message: Message, progress: Progress) -> None:
-        """Raise CommandRefused, with words for the client, if the project does not offer what is asked for."""
+    def receive(
+        self, client: Client, message: Message, progress: Progress, session: Alone | Session, now: float
+    ) -> None:
+        """Record a client's message and do what it asks for. If that is refused, tell the client why."""
+        try:
+            self._check(message, progress, session)
+            self._message_log.add(message, int(now * 1e9), session.name_of(client.player))
+            if message.command == "requestUI":
+                self._clients.send_controls(client, progress, session, now)
+            self._carry_out(message, client.player, progress, session, now)
+        except CommandRefused as refused:
+            self._clients.send(client, messages.error(str(refused)))
+
+    def _check(self, message: Message, progress: Progress, session: Alone | Session) -> None:
+        """Raise CommandRefused if the project does not offer what is asked for. Then nothing of it is recorded."""
+        if message.hidden is not None and isinstance(session, Alone):
+            raise CommandRefused("unknown field 'hidden'")
         if message.frame_rate is not None and not self._config.allow_frame_rate_change:
             raise CommandRefused("the frame rate of this game is fixed")
-        missing = messages.not_offered(message, self._offered)
+        missing = not_offered(message, self._offered)
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
         if messages.is_feedback(message.command) and progress.over:
             raise CommandRefused("the game is over, and no command has an effect any more")
 
-    def carry_out(
+    def _carry_out(
         self, message: Message, player: str, progress: Progress, session: Alone | Session, now: float
     ) -> None:
         """Do what the human who plays `player` asks for. Raises CommandRefused if it is not possible now."""
@@ -67,3 +93,18 @@ class Commands:
                 session.stopped()
             else:
                 progress.reset()
+
+
+def not_offered(message: Message, ui: Collection[str]) -> str | None:
+    """The control that this message needs and that the project's `ui` leaves out; None if all of it is offered."""
+    command, wish, name = message.command, message.frame_rate, message.action
+    if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
+        return command
+    if wish is not None:
+        control = messages.FRAME_RATE_CONTROLS.get(wish, "fpsSet") if isinstance(wish, str) else "fpsSet"
+        if control not in ui:
+            return control
+    if name is not None and _COMBINED.fullmatch(name):
+        keys = re.findall("up|down|left|right", name)
+        return next((key for key in keys if key not in ui), None)
+    return None

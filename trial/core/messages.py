@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,13 +12,10 @@ from protocol.trial import Trial
 
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
-ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
-"""Commands that no project's `ui` can take away: without `start` a game could not be played."""
 FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
 """The keys of `ui` that offer these changes; a number is offered by `fpsSet`."""
 _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
 """HIPPO's front end presses an action with these controls."""
-_COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
 _FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden"})
 
@@ -315,21 +311,6 @@ def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:
     scores = {"score": tidy(score), "episodeScore": tidy(episode_score)}
     return scores if next_in is None or math.isinf(next_in) else scores | {"nextIn": round(next_in, 3)}
-
-
-def not_offered(message: Message, ui: Collection[str]) -> str | None:
-    """The control that this message needs and that the project's `ui` leaves out; None if all of it is offered."""
-    command, wish, name = message.command, message.frame_rate, message.action
-    if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
-        return command
-    if wish is not None:
-        control = FRAME_RATE_CONTROLS.get(wish, "fpsSet") if isinstance(wish, str) else "fpsSet"
-        if control not in ui:
-            return control
-    if name is not None and _COMBINED.fullmatch(name):
-        keys = re.findall("up|down|left|right", name)
-        return next((key for key in keys if key not in ui), None)
-    return None
 
 
 def done(episodes: int, score: float, outcome: str | None = None) -> str:

@@ -36,7 +36,7 @@ class _Member:
     until: float | None = None
     """The clock runs: so long do the others wait."""
     connected: bool = False
-    asleep: bool = False
+    stalled: bool = False
     hidden: bool = False
     met: bool = False
     gone_on: bool = False
@@ -44,7 +44,7 @@ class _Member:
 
     @property
     def takes_part(self) -> bool:
-        return self.connected and not self.asleep and not self.hidden and self.over != "ping"
+        return self.connected and not self.stalled and not self.hidden and self.over != "ping"
 
     @property
     def here(self) -> bool:
@@ -99,7 +99,7 @@ class Presence:
         self._give_time_back(now)
         member = self._members[player]
         returned, member.met = member.met, True
-        member.connected, member.asleep, member.hidden = True, False, False
+        member.connected, member.stalled, member.hidden = True, False, False
         if member.over == "absent":
             member.over = None
         self._changed(now)
@@ -111,30 +111,30 @@ class Presence:
         self._members[player].connected = False
         self._changed(now)
 
-    def sleeps(self, player: str, now: float) -> bool:
+    def stalls(self, player: str, now: float) -> bool:
         """The member's page has stopped answering; whether they are away only since then."""
         member = self._members[player]
-        return self._turns_away(member, now, asleep=True, hidden=member.hidden)
+        return self._turns_away(member, now, stalled=True, hidden=member.hidden)
 
     def hides(self, player: str, now: float) -> bool:
         """The member looks at another page; whether they are away only since then."""
         member = self._members[player]
-        return self._turns_away(member, now, asleep=member.asleep, hidden=True)
+        return self._turns_away(member, now, stalled=member.stalled, hidden=True)
 
-    def _turns_away(self, member: _Member, now: float, *, asleep: bool, hidden: bool) -> bool:
+    def _turns_away(self, member: _Member, now: float, *, stalled: bool, hidden: bool) -> bool:
         self._give_time_back(now)
-        new = not member.asleep and not member.hidden
-        member.asleep, member.hidden = asleep, hidden
+        new = not member.stalled and not member.hidden
+        member.stalled, member.hidden = stalled, hidden
         if new:
             self._changed(now)
         return new
 
-    def wakes(self, player: str) -> bool:
+    def answers_again(self, player: str) -> bool:
         """The member's page answers; whether they were away because it did not, so that they are to `come`."""
         member = self._members[player]
         if member.hidden:
-            member.asleep = False
-        return member.asleep
+            member.stalled = False
+        return member.stalled
 
     def hidden(self, player: str) -> bool:
         """Whether the member looks at another page."""

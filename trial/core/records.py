@@ -54,6 +54,20 @@ def member_answers(
     return answers(progress, seconds, trial_id) | own
 
 
+def result(
+    progress: Progress, player: str, answers: Mapping[str, Any] | None, *, in_session: bool
+) -> tuple[int, float, str | None]:
+    """What a client is told of the trial that is over: episodes, the player's score, and in a session the outcome.
+
+    `answers` is the answer, if it is known: of the participant, or of the member.
+    """
+    if answers is None:
+        return progress.episodes_played, progress.scores[player], None
+    scores = {} if in_session else answers.get("scores") or {}
+    score = scores.get(player, answers.get("score", 0))
+    return answers.get("episodes", 0), score, answers.get("outcome") if in_session else None
+
+
 def number(over: Episode | Break) -> int:
     """The number of the episode that is over, or of the one before the break."""
     return over.after if isinstance(over, Break) else over.number

@@ -134,16 +134,16 @@ class Session:
         self.presence.go(player, now)
         self._record(player, "left")
 
-    def sleeps(self, player: str, now: float) -> bool:
+    def stalls(self, player: str, now: float) -> bool:
         """The member's page has stopped answering: as if they had gone. Whether that is new."""
-        new = self.presence.sleeps(player, now)
+        new = self.presence.stalls(player, now)
         if new:
             self._turned_away(player)
         return new
 
-    def wakes(self, player: str, now: float) -> None:
+    def answers_again(self, player: str, now: float) -> None:
         """The member's page answers again, if it did not."""
-        if self.presence.wakes(player):
+        if self.presence.answers_again(player):
             self.come(player, now)
 
     def _hides(self, player: str, hidden: bool, now: float) -> None:
@@ -153,14 +153,14 @@ class Session:
         elif hidden and self.presence.hides(player, now):
             self._turned_away(player)
 
-    def hears(self, player: str, message: messages.Message, window: Window, now: float) -> bool:
+    def receive(self, player: str, message: messages.Message, window: Window, now: float) -> bool:
         """A message has come; whether it is read: not from a member whose round trip was too long."""
         if self.presence.over(player) == "ping":
             return False
         if message.hidden is not None:
             self._hides(player, message.hidden, now)
         if not window.stalled(now):
-            self.wakes(player, now)
+            self.answers_again(player, now)
         self._progress.choices.said_at(player, int(now * 1e9))
         return True
 

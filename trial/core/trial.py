@@ -25,7 +25,8 @@ This module decides what comes next and whom each event concerns. What the parts
   choices, policies, turns, controls     what each player does at the next step
   progress                               episodes, breaks, scores, and how the trial ends
   timing, episode_time                   when a step, a turn, a break or an episode is over
-  commands                               what a client may ask for, and what that does
+  commands                               what a client may ask for, what that does, and what a refused client is told
+  agent_call                             the one call that the agent has
   alone, session, presence               who is here, and what follows: of one participant, or of several
   beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
   recording, records, message_log        what is recorded and answered
@@ -43,6 +44,7 @@ from enum import Enum
 from typing import Any, Literal
 
 from trial.core import messages, records
+from trial.core.agent_call import AgentCall
 from trial.core.alone import Alone
 from trial.core.beginning import Beginning
 from trial.core.clients import Client, Clients, state_of
@@ -115,7 +117,8 @@ class Trial:
         self._timing = Timing(self.config)
         self._recording = Recording(self._emit)
         self._clients = Clients(self.config, self._timing, self._emit, assets)
-        self._commands = Commands(self.config)
+        self._commands = Commands(self.config, self._clients, self._messages)
+        self._agent = AgentCall(self._emit)
         emit, timing, message_log, recording = self._emit, self._timing, self._messages, self._recording
         self._beginning = Beginning(
             settings, timing=timing, recording=recording, message_log=message_log, new_seed=new_seed, emit=emit
@@ -123,9 +126,6 @@ class Trial:
         self._steps = Steps(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
         self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
         self._session: Alone | Session = Alone(self.progress, trial_id)
-        self._call: Call | None = None  # the agent has this call
-        self._agent_hangs = False  # a call was given up, so the agent's thread takes no other
-        self._give_up_at: float | None = None
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._closing = False
@@ -264,14 +264,9 @@ class Trial:
         """A client's message. One from a connection that was replaced changes nothing."""
         self._now = now
         client = self._clients.of(connection)
-        if client is None:
+        if client is None or not self._session.receive(client.player, message, client.window, now):
             return []
-        try:
-            if not self._session.hears(client.player, message, client.window, now):
-                return []
-            self._handle(client, message)
-        except messages.CommandRefused as error:
-            self._clients.send(client, messages.error(str(error)))
+        self._commands.receive(client, message, self.progress, self._session, now)
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
@@ -288,9 +283,9 @@ class Trial:
 
     def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:
         """The agent's call came back. One that was given up changes nothing."""
-        if call is not self._call:
+        if not self._agent.has_ended(call):
             return []
-        self._now, self._call, self._give_up_at = now, None, None
+        self._now = now
         if isinstance(call, StepCall):
             self._steps.taken(call, result, self.progress, now)
         elif isinstance(call, FeedbackCall):
@@ -304,15 +299,15 @@ class Trial:
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
         """The agent's call raised this error; AgentTimeout: it has not come back."""
-        if call is not self._call:
+        hangs = isinstance(error, AgentTimeout)
+        if not self._agent.has_ended(call, hangs=hangs):
             return []
-        self._now, self._call, self._give_up_at = now, None, None
-        hangs = self._agent_hangs = isinstance(error, AgentTimeout)
+        self._now = now
         if isinstance(call, ReplayCall) and not hangs:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
             self._emit(Log(logging.WARNING, text))
-            self._start_call(self._beginning.begin_again(self.progress, self._session))
+            self._agent.make(self._beginning.begin_again(self.progress, self._session))
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
             self._recording.agent_failed(error, records.number(self.progress.ended[0]), self.progress.steps)
             if hangs:
@@ -351,7 +346,7 @@ class Trial:
         """The recording that was asked for is open."""
         self._now = now
         self._recording.opened()
-        self._start_call(self._beginning.opened(self.progress, self._session, self._ns()))
+        self._agent.make(self._beginning.opened(self.progress, self._session, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
@@ -389,12 +384,11 @@ class Trial:
         """Do all that can be done at this time. Every other event does this, too."""
         self._now = now
         self.wake_at = None
-        if self._give_up_at is not None and now >= self._give_up_at:
-            self._call, self._give_up_at, self._agent_hangs = None, None, True
-        while self._call is None and not self._recording.is_awaited and self._go_on():
+        self._agent.give_up(now)
+        while self._agent.call is None and not self._recording.is_awaited and self._go_on():
             pass
-        if self._call is not None:
-            self.wake_at = self._give_up_at
+        if self._agent.call is not None:
+            self.wake_at = self._agent.give_up_at
         elif self.phase is Phase.PLAYING and not self._closing:
             wake_at = self._session.wake_at(now)
             if wake_at is not None:
@@ -406,8 +400,8 @@ class Trial:
     def close(self, now: float) -> list[Effect]:
         """The server must end: stop where the game stands. There is no answer unless the trial is over."""
         self._closing = self._commands.closed = self._ending.closing = True
-        if self._call is not None:
-            self._give_up_at = now + LAST_CALL_SECONDS
+        if self._agent.call is not None:
+            self._agent.give_up_at = now + LAST_CALL_SECONDS
         if self.phase is Phase.STARTING:
             self.phase = Phase.CLOSED
         return self.advance(now)
@@ -438,12 +432,12 @@ class Trial:
         if due is Due.STEP:
             if self._paused_by_stalled():
                 return True
-            self._start_call(self._steps.take(progress, self._now))
+            self._agent.make(self._steps.take(progress, self._now))
             return False
         if due is Due.RESET:
             call = self._beginning.begin(progress, self._session)
             if call is not None:
-                self._start_call(call)
+                self._agent.make(call)
         elif due is Due.NOTHING:
             self.wake_at = self._timing.wake_at
             return False
@@ -458,21 +452,17 @@ class Trial:
 
     def _paused_by_stalled(self) -> bool:
         """Pause if a page has stopped answering; whether that is so."""
-        stalled = [each for each in self._clients.stalled(self._now) if self._session.sleeps(each.player, self._now)]
+        stalled = [each for each in self._clients.stalled(self._now) if self._session.stalls(each.player, self._now)]
         for client in stalled:
             self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering", client)
         return bool(stalled)
 
-    def _start_call(self, call: Call) -> None:
-        self._call = call
-        self._emit(call)
-
     def _write_end(self) -> bool:
         """Record the end of an episode or a break. The agent hears the last feedback of it before."""
         call = self._ending.last_feedback(self.progress)
-        if (call.feedback or self.callbacks) and not self._agent_hangs:
-            self._start_call(call)
+        if (call.feedback or self.callbacks) and not self._agent.hangs:
+            self._agent.make(call)
             return False
         self._ending.record(call, self.progress, self._session)
         return True
@@ -499,17 +489,8 @@ class Trial:
         self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
-        if self.callbacks and self.phase is Phase.PLAYING and not self._agent_hangs:
+        if self.callbacks and self.phase is Phase.PLAYING and not self._agent.hangs:
             self._emit(TellMoved(callback, player))
-
-    def _handle(self, client: Client, message: messages.Message) -> None:
-        """Do what a client asks for. Raises CommandRefused with words for the client."""
-        progress, session = self.progress, self._session
-        self._commands.check(message, progress)
-        self._messages.add(message, self._ns(), session.name_of(client.player))
-        if message.command == "requestUI":
-            self._clients.send_controls(client, progress, session, self._now)
-        self._commands.carry_out(message, client.player, progress, session, self._now)
 
     def _note(self, event: str, client: Client) -> None:
         """Keep for the recording an event that no message reports."""
@@ -519,19 +500,14 @@ class Trial:
         return int(self._now * 1e9)
 
     def _send_done(self, human: str, client: Client) -> None:
-        progress, answers = self.progress, self._earlier_answers
-        if answers is not None and self.settings.session:
-            answers = answers.get(human)
-        elif answers is None:
-            answers = self._session.answer_of(human)
+        """Tell a client that the trial is over, as the answer says: an earlier server's, or this one's."""
+        answers = self._earlier_answers
         if answers is None:
-            episodes, score = progress.episodes_played, progress.scores[client.player]
-            self._clients.send_done(client, episodes, score)
-            return
-        scores = {} if self.settings.session else answers.get("scores") or {}
-        score = scores.get(client.player, answers.get("score", 0))
-        outcome = answers.get("outcome") if self.settings.session else None
-        self._clients.send_done(client, answers.get("episodes", 0), score, outcome)
+            answers = self._session.answer_of(human)
+        elif self.settings.session:
+            answers = answers.get(human)
+        result = records.result(self.progress, client.player, answers, in_session=bool(self.settings.session))
+        self._clients.send_done(client, *result)
 
     def _take_effects(self) -> list[Effect]:
         effects = self._effects.copy()
