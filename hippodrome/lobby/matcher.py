@@ -42,31 +42,9 @@ class Matcher:
     ) -> Sequence[Sequence[str]]:
         """Sessions that `match` has chosen, by their members' labels; and ask it again if it is time.
 
-        The participant with this label asks, and is written down if they are new: then `come` says who they are. Two
-        reads; two calls more if something is written.
+        The participant with this label asks, and is written down if they are new: then `come` says who they are. None
+        are wished if others change the question all the time. Two reads; two calls more if something is written.
         """
-        try:
-            return self._wished(project, label, come, document, entries)
-        except RetryLater:  # many come at once; the next request does it
-            logger.info("the question to match keeps changing", extra={"project": project.id})
-            return ()
-
-    def forget(self, project: Project) -> None:
-        """Delete questions and answers that are old. Two listings. Nothing is lost: who waits is written down again."""
-        now = self._platform.now()
-        for folder in (questions_folder(project.id), groups_folder(project.id)):
-            for entry in self._documents.list(folder):
-                if now - entry.modified > FORGOTTEN:
-                    self._documents.delete(entry.key)
-
-    def _wished(
-        self,
-        project: Project,
-        label: str,
-        come: Callable[[], Person],
-        document: Decisions,
-        entries: Entries,
-    ) -> Sequence[Sequence[str]]:
         now, key = self._platform.now(), waiting_key(project.id)
         question = self._read(key, project)
         answer = self._answer(project, question)
@@ -92,11 +70,24 @@ class Matcher:
                 now=now,
             )
 
-        if change(question) != question:
+        if change(question) == question:
+            return chosen
+        try:
             changed = self._shared.change(key, Question, change, renew=True)
-            if answer and answer.problem and changed.before.id == question.id != changed.after.id:
-                logger.warning("%s; it is left out", answer.problem, extra={"project": project.id})
+        except RetryLater:  # many come at once; the next request does it
+            logger.info("the question to match keeps changing", extra={"project": project.id})
+            return ()
+        if answer and answer.problem and changed.before.id == question.id != changed.after.id:
+            logger.warning("%s; it is left out", answer.problem, extra={"project": project.id})
         return chosen
+
+    def forget(self, project: Project) -> None:
+        """Delete questions and answers that are old. Two listings. Nothing is lost: who waits is written down again."""
+        now = self._platform.now()
+        for folder in (questions_folder(project.id), groups_folder(project.id)):
+            for entry in self._documents.list(folder):
+                if now - entry.modified > FORGOTTEN:
+                    self._documents.delete(entry.key)
 
     def _read(self, key: str, project: Project) -> Question:
         try:
