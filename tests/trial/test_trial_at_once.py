@@ -134,6 +134,21 @@ def test_an_acknowledgement_is_heard_as_it_comes_and_the_rest_is_left() -> None:
     talked(talk)
 
 
+def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def talk(connection: Connection, _: Any) -> None:
+        parsed: list[bytes] = []
+        monkeypatch.setattr(connection.websocket.protocol, "receive_data", parsed.append)
+        connection.hear_acknowledgements(Inbound(connection.window))
+        connection.window.sent(1, 0.0)
+        of_no_frame = text('{"ack": 2}')
+        for data in (text('{"ack": 1}'), of_no_frame):
+            connection.websocket.data_received(data)
+        assert connection.window.acknowledging
+        assert parsed == [of_no_frame]
+
+    talked(talk)
+
+
 def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes:
     """A message of a client, or a part of one, as it comes from the network."""
     return RawFrame(opcode, said.encode(), fin=last).serialize(mask=True)

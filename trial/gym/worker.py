@@ -24,12 +24,13 @@ from websockets.frames import CloseCode, Opcode
 from websockets.protocol import Protocol, Side
 from websockets.protocol import State as Connected
 
-from trial.gym import frames, linux
+from trial.gym import linux
 from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
 from trial.gym.forms import Form
 from trial.gym.limits import Limits
 from trial.gym.recordings import Recorder
 from trial.gym.session import Session
+from trial.wire import websocket_frames as frames
 
 _READ = 256 * 1024
 _SEND_SECONDS = 30  # that a client may leave a reply unread

@@ -6,14 +6,11 @@ import socket
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from websockets.client import ClientProtocol
 from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 
 from testing.gym_server import GymServer
-from trial.gym import frames
 
 WITHIN = 15.0
 
@@ -132,16 +129,3 @@ def test_a_close_is_answered(raw: Raw) -> None:
     raw.say(frame(b"\x03\xe8", Opcode.CLOSE))
     assert raw.hear().data == b"\x03\xe8"
     assert raw.socket.recv(1) == b""
-
-
-@given(st.binary(max_size=200), st.booleans())
-def test_frames_are_read_as_websockets_writes_them(said: bytes, mask: bool) -> None:
-    data = Frame(Opcode.BINARY, said).serialize(mask=mask)
-    start, length = frames.extent(data)
-    assert (start + length, length) == (len(data), len(said))
-    assert all(frames.extent(data[:few]) in ((0, 0), (start, length)) for few in range(len(data)))
-
-
-@pytest.mark.parametrize("length", [0, 125, 126, 65535, 65536])
-def test_frames_are_written_as_websockets_does(length: int) -> None:
-    assert frames.framed(frames.BINARY, bytes(length)) == Frame(Opcode.BINARY, bytes(length)).serialize(mask=False)

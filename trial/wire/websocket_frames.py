@@ -1,7 +1,8 @@
-"""Frames of a WebSocket (RFC 6455, 5.2), as far as the usual request and its answer need them. Pure.
+"""Frames of a WebSocket (RFC 6455, 5.2), as far as the usual messages need them. Pure.
 
 The package `websockets` reads and writes every other frame. For a message of a hundred bytes that costs it as much as
-a step of a small environment, so the one case that all requests are is taken here.
+a step of a small environment. So the one case that nearly all messages are is taken here: pictures and their
+acknowledgements (`player_socket.py`), and requests at `/gym` with their answers (`trial/gym/worker.py`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ try:
 except ImportError:  # a platform for which `websockets` has no wheel
     from websockets.utils import apply_mask as unmasked
 
-__all__ = ["BINARY", "TEXT", "UNMASKED", "WHOLE", "extent", "framed", "unmasked"]
+__all__ = ["BINARY", "TEXT", "UNMASKED", "WHOLE", "extent", "framed", "short_text", "unmasked"]
 
 TEXT, BINARY = 0x81, 0x82
 """First bytes of a message in one frame."""
@@ -22,6 +23,7 @@ WHOLE = (TEXT, BINARY)
 UNMASKED = [2] * 126 + [4, 10]
 """Where what a frame holds begins, by the seven bits of its length, if it is not masked."""
 
+_MASKED_HEADER = 6  # bytes before a short text of a client: two, and the mask
 _MIDDLE = struct.Struct("!BBH")
 _LONG = struct.Struct("!BBQ")
 
@@ -37,6 +39,14 @@ def extent(data: bytes) -> tuple[int, int]:
     if length > 125:
         length = int.from_bytes(data[2:start], "big")
     return start + (4 if data[1] & 0x80 else 0), length
+
+
+def short_text(data: bytes) -> bytes | bytearray | None:
+    """What a client says, if the data are just one whole text message of up to 125 bytes."""
+    length = len(data) - _MASKED_HEADER
+    if not 0 <= length <= 125 or data[0] != TEXT or data[1] != 0x80 | length:
+        return None
+    return unmasked(data[_MASKED_HEADER:], data[2:_MASKED_HEADER])
 
 
 def framed(first: int, payload: bytes) -> bytes:
