@@ -84,7 +84,7 @@ class Fetcher:
         for left in self.incoming.iterdir():
             left.unlink()
         self._state.begin_run()
-        with self._state.together() as commit:
+        with self._state.in_transactions() as commit:
             self._all(tally, commit)
         return tally
 
@@ -138,7 +138,7 @@ class Fetcher:
                 (about if item.kind is Kind.SESSION else rest).append(item)
             owner, unit, then = Members(unit.user), Unit(unit.user, about), Unit(unit.user, rest)
         elif unit.user and known is None:
-            owner = self._state.meet(unit.user, self._wanted.apart)
+            owner = self._state.find_or_add(unit.user, self._wanted.apart)
         mark = known.mark if known else ""
         fetch, seen = choose(self._state, unit, self._wanted, tally, self._damaged, mark=mark)
         self._listed += len(unit.items)
@@ -270,7 +270,7 @@ def _folder(owner: Person | Members) -> str:
 def forget_gone(state: State, folder: Path) -> int:
     """Remove here what is gone from the source, such as an erased participant. Return how many files that were."""
     count = 0
-    with state.together():
+    with state.in_transactions():
         for key, user, kind, step, path, raw in state.unseen():
             for old in filter(None, (path, raw)):
                 (folder / old).unlink(missing_ok=True)

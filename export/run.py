@@ -80,7 +80,7 @@ def look(source: Source, project_id: str, folder: Path, options: Options) -> Tal
 def _checked(folder: Path, source: Source, project_id: str, options: Options) -> Iterator[tuple[State, frozenset[str]]]:
     _refuse_foreign(folder)
     try:
-        state = State.only_read(folder / _STATE)
+        state = State.read_only(folder / _STATE)
     except sqlite3.DatabaseError:
         raise _broken_state(folder) from None
     try:
@@ -120,7 +120,7 @@ def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Op
         private.chmod(0o700)
     except OSError as error:
         raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
-    with _alone(folder):
+    with _locked(folder):
         try:
             state = State(folder / _STATE)
         except sqlite3.DatabaseError:
@@ -216,7 +216,7 @@ def _chain(shown: list[Kept], state: State) -> Iterator[Kept]:
 
 def _datasets(folder: Path, state: State, project_id: str, options: Options) -> list[dict[str, Any]]:
     """Minari datasets: made if asked for; thrown away where they no longer fit the recordings."""
-    now, before = state.recordings_print(), state.fact("minari")
+    now, before = state.recordings_fingerprint(), state.fact("minari")
     if "minari" not in options.formats and before != now:
         shutil.rmtree(folder / "minari", ignore_errors=True)
         state.set_fact("minari", "")
@@ -331,7 +331,7 @@ def _numbers_of_before(state: State, folder: Path, write: bool) -> None:
         for row in csv.DictReader(file):
             user, number = (row.get("userId") or "").removeprefix("'"), row.get("participant") or ""
             if user and number:
-                state.meet(user, True, number)
+                state.find_or_add(user, True, number)
 
 
 def _damaged(folder: Path, state: State) -> frozenset[str]:
@@ -344,7 +344,7 @@ def _damaged(folder: Path, state: State) -> frozenset[str]:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     """One run at a time in a folder; the lock goes with the process."""
     import fcntl  # noqa: PLC0415 - not on every system
 

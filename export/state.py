@@ -1,4 +1,4 @@
-"""What a folder of data holds already: a SQLite file: a run goes on where another was cut off, in little memory.
+"""What a folder of data holds already, in a SQLite file: a run goes on where another was cut off, in little memory.
 
 It holds ids and answers: it lies in the folder's `private/`.
 """
@@ -98,7 +98,7 @@ class State:
         self._db.executescript(_TABLES)
 
     @classmethod
-    def only_read(cls, path: Path) -> State:
+    def read_only(cls, path: Path) -> State:
         """For a look: nothing can be written. An empty one if there is no such file.
 
         Opened like any other all the same: what a killed run left half-written must be taken back first.
@@ -144,8 +144,8 @@ class State:
         """Whether anything of sessions is known here."""
         return self._db.execute("SELECT 1 FROM files WHERE kind IN ('session', 'membership')").fetchone() is not None
 
-    def meet(self, user: str, apart: bool, number: str = "") -> Person:
-        """The participant, with a number of their own from the first time on: random, unless ids may be seen."""
+    def find_or_add(self, user: str, apart: bool, number: str = "") -> Person:
+        """The participant. A new one gets this number; else a random one if ids are kept `apart`, or their id."""
         known = self.person(user)
         if known:
             return known
@@ -195,10 +195,10 @@ class State:
         return {key: Known(version, path, raw) for key, version, path, raw in rows}
 
     @contextlib.contextmanager
-    def together(self) -> Iterator[Callable[[], None]]:
-        """Write what follows in transactions, each as long as what it yields is not called: a disk takes its time.
+    def in_transactions(self) -> Iterator[Callable[[], None]]:
+        """Write what follows in transactions. Call what this yields to commit one: the disk takes its time for each.
 
-        What was written when the block is left, even by an error, stays.
+        The last one is committed when the block is left, even by an error.
         """
         self._db.execute("BEGIN")
 
@@ -347,7 +347,7 @@ class State:
             "foreign": kinds.get("foreign", 0),
         }
 
-    def recordings_print(self) -> str:
+    def recordings_fingerprint(self) -> str:
         """Another one whenever a recording is added, changed or gone."""
         import hashlib  # noqa: PLC0415 - only for this
 

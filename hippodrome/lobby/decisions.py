@@ -139,7 +139,7 @@ class Decisions(Record, frozen=True):
         return next((each for each in self.unmatched if each.label == label), None)
 
     def is_decided(self, label: str) -> bool:
-        """Whether it is decided for good where this participant belongs: also on which server."""
+        """Whether it is decided for good that they are unmatched, or play in a session that has its server."""
         return self.of(label) != Decisions()
 
     def of(self, label: str) -> Decisions:

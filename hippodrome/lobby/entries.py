@@ -95,7 +95,7 @@ class Entries:
 
 
 def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta) -> Entries:
-    """Read a listing of `folder(project_id)`. `way` is for how long an entry says that someone is under way."""
+    """Read a listing of `folder(project_id)`. `way`: for how long a participant counts as under way."""
     prefix = folder(project_id)
     waiting: dict[str, Waiting] = {}
     confirmed: dict[str, set[str]] = {}

@@ -54,13 +54,15 @@ def with_ready_servers(
     coming: Collection[str] = (),
     open_for: timedelta,
 ) -> Decisions:
-    """Give servers that are ready to the sessions that were formed first, whichever they had been given before.
+    """Give the servers that are ready to the sessions that were formed first, whichever server each has waited for.
 
-    `ready` are ids of servers that are ready; one of an open session is taken first, then that of the session that was
-    formed last, which gets the other's instead. `over` are those that have ended and are not replaced, and `coming`
-    those that start: a session whose own is over waits for one that starts, if an open session has it. A session that
-    finds no other keeps its own, and its members are told why. So does one that has waited for `SERVER_WITHIN`. A
-    server is only given to a session of as many players as it was started for.
+    * `ready`: servers that are ready, by their sessions' ids. A session gets one of an open session; if there is none,
+      it exchanges servers with the session that was formed last of those whose server is ready.
+    * `over`: servers that have ended and are not replaced. `coming`: servers that start. A session whose server is over
+      waits for one that starts instead, if an open session has one.
+    * A session that finds no other server keeps its own, and its members are told why that one has ended. A session
+      that has waited for `SERVER_WITHIN` keeps its own as well.
+    * A session only gets a server that was started for as many players.
     """
     sessions = document.without_server()
     if not ready and not over and not (sessions and now - sessions[0].at >= SERVER_WITHIN):
@@ -111,7 +113,7 @@ def surplus(
 ) -> frozenset[str]:
     """The ids of the open sessions that can no longer be used, of those in `over`, and of those beyond `wanted`.
 
-    Of these, the ones that were asked for last: their servers are least far.
+    The servers that were asked for last are beyond `wanted`: they have the longest time to wait until they are ready.
     """
     usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
     return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])

@@ -87,5 +87,5 @@ class Hold:
             os.pwrite(self._handle, note.encode(), 0)
 
     def release(self) -> None:
-        """Let it go."""
+        """Release the lock."""
         os.close(self._handle)

@@ -98,7 +98,7 @@ def message_for(error: BaseException) -> str:
 
 
 def reports_errors(port: type[P]) -> type[P]:
-    """For the class of a port: what its public methods raise as OSError is told to its `retry`, and raised on."""
+    """Decorate the class of a port: an OSError of a public method is reported to `retry`, and raised again."""
     for name, method in list(vars(port).items()):
         if not name.startswith("_") and inspect.isfunction(method):
             setattr(port, name, _listing(method) if inspect.isgeneratorfunction(method) else _telling(method))

@@ -394,7 +394,7 @@ def test_two_runs_in_one_folder_at_once(place: Place) -> None:
 
     crowd(place.put, place.tmp, 2)
     place.done()
-    with run._alone(place.out):
+    with run._locked(place.out):
         ran = place.run()
     assert (ran.code, "Another run" in ran.err) == (Exit.FAILED, True)
 
@@ -492,7 +492,7 @@ def test_names_that_some_machines_confuse(place: Place) -> None:
     from export.state import State
 
     state = State(None)
-    folders = [state.meet(user, False).folder for user in ("Ann", "ann", "ANN", "con", "NUL", "com1", "x")]
+    folders = [state.find_or_add(user, False).folder for user in ("Ann", "ann", "ANN", "con", "NUL", "com1", "x")]
     assert len({name.lower() for name in folders}) == len(folders)
     assert not {"con", "nul", "com1"} & {name.lower() for name in folders}
 

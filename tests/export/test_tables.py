@@ -57,7 +57,7 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
     state = State(None)
     state.begin_run()
     for user, steps in people.items():
-        state.meet(user, apart)
+        state.find_or_add(user, apart)
         made = [File(f"{user}/participant.json", "participant", "1", 1, document=participant(user, **changes))]
         for step, sent in steps.items():
             made.append(File(f"{user}/{step}", "answer", "1", 1, step=step, document=answer(step, sent)))

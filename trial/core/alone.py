@@ -58,7 +58,7 @@ class Alone:
         """The participant is to end the game, after the step that is being taken."""
 
     def stopped(self) -> None:
-        """The game has ended so."""
+        """The game has ended because the participant has stopped it."""
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
         """The participant's browser has answered a ping. Only sessions measure it."""
@@ -72,7 +72,7 @@ class Alone:
         """Bring the game into line with who is here. One participant's game follows their commands alone."""
 
     def wake_at(self, now: float) -> float | None:
-        """When to look again if nothing happens; there is no need to."""
+        """When to call `attend` again if nothing happens: there is no need to."""
         return None
 
     # ---- recordings and answers
@@ -95,7 +95,7 @@ class Alone:
     # ---- what the participant is told
 
     def state(self) -> None:
-        """Another value whenever the members are to be told of each other anew."""
+        """Changes whenever members are to be told of each other again: never."""
         return None
 
     def told(self, now: float) -> Mapping[str, Any] | None:

@@ -125,7 +125,7 @@ class Choices:
         self.turns.choose(player, Action(index, controls.names[index], "human", pressed_at=controls.time))
 
     def said_at(self, player: str, ns: int) -> None:
-        """The message of this human that is being read came then: what it chooses says so, with `timed_keys`."""
+        """Note when the message came that is read now. With `timed_keys`, an action that it chooses has this time."""
         self.controls[player].time = ns
 
     def let_go(self, player: str | None = None) -> None:
@@ -199,9 +199,9 @@ class Choices:
                     turns.choose(name, action)
 
     def turn_over(self, steps: int) -> bool:
-        """The time of the turn is over: choose for the humans who did not; whether the episode ends (`turnEnds`).
+        """The time of the turn is over: choose for the humans who did not, and return whether the episode ends.
 
-        What a program advises counts before that.
+        What a program has advised is taken first; else `turnEnds` decides.
         """
         turns = self.turns
         for name in self._waiting():
@@ -242,8 +242,8 @@ class Choices:
     def advise(self, action: int, player: str | None = None) -> None:
         """A program advises this action for the next step, or chooses it for a player that it plays.
 
-        `player` is the one that a program plays, or the first human, if it is not given. Raises CommandRefused if there
-        is no such action or player.
+        Without `player` it is the first player that a program plays, or else the first human. Raises CommandRefused if
+        there is no such action or player.
         """
         known = self._player_of_program(player)
         player = known.name

@@ -52,7 +52,7 @@ class Clients:
         return client
 
     def replace(self, human: str) -> Client | None:
-        """Close the connection of a human who opens another one; the one that was closed."""
+        """Close the connection of a human who opens another one, and return it; None if they have none."""
         client = self._by_human.pop(human, None)
         if client is not None:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
@@ -93,7 +93,7 @@ class Clients:
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
     def send_state(self, progress: Progress, session: Alone | Session, now: float) -> None:
-        """Send the state to those clients that were sent another one, with the times as they are then, if there are."""
+        """Send the state to each client that was last sent another one, with the seconds that are left of all times."""
         progress.told = session.state()
         for client in self._by_human.values():
             player = client.player
@@ -132,7 +132,7 @@ class Clients:
         return list(self._by_human.items())
 
     def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Tell a client that the trial is over and stored; a member of a session, with which outcome for them."""
+        """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for them."""
         self._emit(SendDone(client.connection, episodes, score, outcome))
 
 

@@ -33,7 +33,7 @@ class Commands:
         self.waiting: list[str] = []
         """Those that wait for the end of a step."""
         self.closed = False
-        """The server must end, which has ended what was on: commands do nothing any more."""
+        """The server must end: commands do nothing any more."""
 
     def receive(
         self, client: Client, message: Message, progress: Progress, session: Alone | Session, now: float

@@ -96,7 +96,8 @@ class Policies:
     def go_on(self, actions: Mapping[str, int], failures: Mapping[str, int]) -> None:
         """The episode goes on where an earlier server left it.
 
-        These actions of policies go on until the next ones, and so often they have failed in a row.
+        `actions`: what each policy chose last, which is taken until it chooses again. `failures`: how often each has
+        failed in a row.
         """
         for player, count in failures.items():
             if player in self._places:
@@ -227,7 +228,7 @@ class Policies:
             return _idle(player, mask, "late")
         place.asked = None
         place.failures += 1
-        return _idle(player, mask, "late", place.asked_after)  # it looks all the same, and remembers that
+        return _idle(player, mask, "late", place.asked_after)  # it has observed this all the same, and may remember it
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
         """A turn begins: programs have their time from now on, and nothing counts that was chosen before."""

@@ -80,7 +80,7 @@ class Presence:
     paused: bool = False
     """A member has paused the game."""
     version: int = 0
-    """Becomes another number whenever something changes that members are told."""
+    """Changes whenever something changes that members are told."""
     _members: dict[str, _Member] = field(init=False)
     _counts_until: float | None = None
     _page_until: float | None = None
@@ -95,7 +95,7 @@ class Presence:
     # ---- what happens
 
     def come(self, player: str, now: float) -> Literal["joined", "returned"]:
-        """The member has connected. Whoever was replaced finds their place."""
+        """The member has connected. One whose time was over plays again."""
         self._give_time_back(now)
         member = self._members[player]
         returned, member.met = member.met, True
@@ -112,12 +112,12 @@ class Presence:
         self._changed(now)
 
     def stalls(self, player: str, now: float) -> bool:
-        """The member's page has stopped answering; whether they are away only since then."""
+        """The member's page has stopped answering. Return whether they were here until now."""
         member = self._members[player]
         return self._turns_away(member, now, stalled=True, hidden=member.hidden)
 
     def hides(self, player: str, now: float) -> bool:
-        """The member looks at another page; whether they are away only since then."""
+        """The member looks at another page. Return whether they were here until now."""
         member = self._members[player]
         return self._turns_away(member, now, stalled=member.stalled, hidden=True)
 
@@ -130,7 +130,7 @@ class Presence:
         return new
 
     def answers_again(self, player: str) -> bool:
-        """The member's page answers; whether they were away because it did not, so that they are to `come`."""
+        """The member's page answers. Return whether they were away because it did not: then call `come`."""
         member = self._members[player]
         if member.hidden:
             member.stalled = False
@@ -271,7 +271,7 @@ class Presence:
         return None if until == math.inf else max(0.0, until - now)
 
     def wake_at(self, now: float, *, on_break: bool) -> float:
-        """When to look again if nothing happens; infinite if there is no need to."""
+        """When to call `look` again if nothing happens; infinite if there is no need to."""
         counts = math.inf if self._counts_until is None else self._counts_until
         return min(self._until(now, reads=on_break), counts)
 

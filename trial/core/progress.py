@@ -77,7 +77,7 @@ class Progress:
         self._failures = 0
         self._good_episodes = 0
         self.told: Hashable = None
-        """In a session: becomes another value whenever members are to be told of each other anew."""
+        """In a session: changes whenever members are to be told of each other again."""
 
     @property
     def several(self) -> bool:

@@ -92,9 +92,9 @@ class Session:
         """Members who have ended the game for all. Empty: it was not ended so, or on an earlier server."""
         self._stored: set[str] = set()
         """Members whose answer is stored, by their id."""
-        self._broke = False  # a break was on when this was asked last
+        self._broke = False  # a break was on when `attend` was called last
         self._met = resumed  # the game has begun, so that a member who is missing has left
-        self._settled: int | None = None  # while the members' `version` is this one, and the game is on, it goes on
+        self._settled: int | None = None  # the `version` of the members with which the game was last found to be on
         self._waiting: list[RecordLine] = []
         progress.choices.timed_keys = True
         for player, outcome in (recorded.outcomes if recorded is not None else {}).items():
@@ -121,7 +121,7 @@ class Session:
     # ---- what happens
 
     def come(self, player: str, now: float) -> None:
-        """The member has connected. Whoever a policy plays for plays again, from the next step on."""
+        """The member has connected. If a policy plays in their place, they play again from the next step on."""
         if self._progress.over:
             return  # too late: the outcomes stand
         what = self.presence.come(player, now)
@@ -135,7 +135,7 @@ class Session:
         self._record(player, "left")
 
     def stalls(self, player: str, now: float) -> bool:
-        """The member's page has stopped answering: as if they had gone. Whether that is new."""
+        """The member's page has stopped answering, as if they had gone. Return whether they were here until now."""
         new = self.presence.stalls(player, now)
         if new:
             self._turned_away(player)
@@ -185,7 +185,7 @@ class Session:
         self._stopped.add(player)
 
     def stopped(self) -> None:
-        """The game has ended so: say it to the others."""
+        """The game has ended because a member has stopped it: tell the others."""
         self._say_why_over(self.presence.players)
 
     def pause(self, now: float) -> None:
@@ -246,7 +246,7 @@ class Session:
 
     @property
     def settled(self) -> bool:
-        """The game is on, and nothing has changed since it was looked whether it may be: most steps find it so."""
+        """The game is on, and nothing has changed since it was decided that it may be. So it is at most steps."""
         return self._settled == self.presence.version and self._progress.playing
 
     def _begin(self) -> None:
@@ -354,7 +354,7 @@ class Session:
     # ---- what members are told
 
     def wake_at(self, now: float) -> float | None:
-        """When to look again if nothing happens; None: there is no need to."""
+        """When to call `attend` again if nothing happens; None: there is no need to."""
         progress = self._progress
         if progress.over or self.settled:
             return None
@@ -362,7 +362,7 @@ class Session:
         return wake_at if wake_at < math.inf else None
 
     def state(self) -> Hashable:
-        """Another value whenever the members are to be told of each other anew."""
+        """Changes whenever members are to be told of each other again."""
         return self.presence.version, self._progress.choices.waits_for
 
     def told(self, now: float) -> dict[str, Any]:

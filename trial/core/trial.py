@@ -409,7 +409,7 @@ class Trial:
     # ---- what comes next
 
     def _go_on(self) -> bool:
-        """Do the next thing; whether there is another one to do at this time."""
+        """Do what is next; return whether more can be done at this time."""
         if self.phase is Phase.PLAYING:
             return self._play()
         if self.phase is Phase.SAVING and not self._ending.all_written:
@@ -451,7 +451,7 @@ class Trial:
         self._beginning.repeat_feedback(unfinished, self._ns())
 
     def _paused_by_stalled(self) -> bool:
-        """Pause if a page has stopped answering; whether that is so."""
+        """Pause if a page has stopped answering; return whether one has."""
         stalled = [each for each in self._clients.stalled(self._now) if self._session.stalls(each.player, self._now)]
         for client in stalled:
             self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
