@@ -46,3 +46,25 @@ def test_a_walk_leads_to_what_exists(what: str, file: Path | None, names: list[s
         if not re.search(rf"^(?: *(?:async )?(?:def|class) {name}\b|{name}(?:: \S+)? = )", code, re.M)
     ]
     assert missing == []
+
+
+def in_rooms() -> Iterator[tuple[Path, str]]:
+    """Each folder and file that the tables of rooms name, with the folder of its row."""
+    rooms = (ROOT / "docs/architecture.md").read_text().partition("\n## Rooms\n")[2].partition("\n## ")[0]
+    for row in re.finditer(r"^\| `(?P<folder>[\w/]+/)` \| (?P<there>.*) \|$", rooms, re.M):
+        yield ROOT / row["folder"], "."
+        for named in re.findall(r"`([\w/]+(?:\.py|\.js|/))`", row["there"]):
+            yield ROOT / row["folder"], named
+
+
+@pytest.mark.parametrize(("folder", "named"), list(in_rooms()))
+def test_what_the_tables_of_rooms_name_is_there(folder: Path, named: str) -> None:
+    assert (folder / named).exists() or (ROOT / named).exists()
+
+
+def test_each_folder_of_the_large_packages_has_its_row() -> None:
+    rows = {folder for folder, named in in_rooms() if named == "."}
+    folders = {
+        file.parent for package in ("hippodrome", "trial", "deploy") for file in ROOT.glob(f"{package}/*/__init__.py")
+    }
+    assert folders - rows == set()
