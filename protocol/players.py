@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -83,8 +84,16 @@ def _plays(value: object, where: str) -> str:
         if fits and (file.startswith("/") or ".." in file.split("/")):
             raise ValueError(f"{where}must be a file below the project's folder, not {show(plays)}")
     if not fits:
-        raise ValueError(f"{where}must be {WHO}, not {show(plays)}")
+        raise ValueError(f"{where}must be {WHO}, not {show(plays)}{_meant(plays)}")
     return plays
+
+
+def _meant(plays: str) -> str:
+    """What was probably meant by what plays nobody; empty if nobody knows."""
+    near = difflib.get_close_matches(plays.lower(), (HUMAN, "random", "idle"), n=1)
+    if near:
+        return f"; did you mean {near[0]}?"
+    return f"; a class of agent.py is {AGENT_PLAYER}{plays}" if _CLASS.fullmatch(plays) else ""
 
 
 def _one(check: values.Check, value: object, where: str) -> Any:

@@ -263,6 +263,12 @@ class Trial:
         return math.inf if isinstance(self.between_episodes, str) else self.between_episodes
 
     @property
+    def most_steps(self) -> float:
+        """Steps after which an episode is truncated if nothing holds it up; infinite without a limit."""
+        timed = math.ceil(self.episode_seconds * self.starting_frame_rate) or math.inf
+        return min(self.max_steps or math.inf, timed)
+
+    @property
     def pages(self) -> Mapping[str, str]:
         """The files of the folder of pages that the game page shows, by the key that names each."""
         named = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
@@ -271,6 +277,12 @@ class Trial:
     def keys_of(self, player: str) -> Mapping[str, str]:
         """The actions of a player's keys by combination (`protocol.keyboard`); empty if the actions' names decide."""
         return dict(self.key_maps()).get((player,) if self.keys_differ else (), {})
+
+    def labels_of(self, player: str) -> Mapping[str, str]:
+        """The texts of a player's buttons by action: not of what the keys of other players do and theirs do not."""
+        own = set(self.keys_of(player).values())
+        others = {action for _, keys in self.key_maps() for action in keys.values()} - own
+        return {action: text for action, text in self.labels.items() if action not in others}
 
     @property
     def keys_differ(self) -> bool:

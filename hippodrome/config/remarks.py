@@ -151,7 +151,8 @@ def without_observations(source: Source, config: Config) -> Iterator[Remark]:
 def keys_of_sessions(source: Source, config: Config) -> Iterator[Remark]:
     """What to say about keys that are for several participants, if each participant plays alone."""
     if not config.project.has_sessions:
-        yield from (Remark(path, sessions.NO_EFFECT) for path in sessions.OF_SESSIONS if source.names(path))
+        said = sessions.no_effect(config.trial)
+        yield from (Remark(path, said) for path in sessions.OF_SESSIONS if source.names(path))
 
 
 def remarks(config: Config) -> Iterator[Remark]:

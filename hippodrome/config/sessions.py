@@ -25,7 +25,13 @@ OF_SESSIONS: tuple[Keys, ...] = (
     *(("trial", key) for key in SESSION_KEYS),
 )
 """The keys that matter with `project.players` only."""
-NO_EFFECT = "no effect: project.players is 1, so each participant plays alone; write players: 2 under project"
+
+
+def no_effect(trial: Trial) -> str:
+    """What to say about each of these keys where the project has no `players`."""
+    most = max((len(humans) for _, humans in trial.humans()), default=0)
+    alone = "project.players is 1, so each participant plays alone"
+    return f"no effect: {alone}; write players: {max(2, most)} under project"
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
@@ -113,6 +119,7 @@ def remarks(config: Config) -> Iterator[Remark]:
         said = f"below players, which is {project.players}: a participant finds no other to play with"
         yield Remark(("project", "maxParticipants"), said)
     yield from _one_for_all(trial)
+    yield from _without_keys(trial)
     yield from _too_short(config)
     if trial.pace == "turns" and not trial.turn_seconds:
         said = "0: a participant who does nothing keeps the others waiting without end; write turnSeconds: 20"
@@ -120,6 +127,15 @@ def remarks(config: Config) -> Iterator[Remark]:
     if trial.absent == 0 and trial.after_absent == "end":
         said = "0: a connection that is lost for a moment ends the game for all; write absent: 30"
         yield Remark(("trial", "absent"), said)
+
+
+def _without_keys(trial: Trial) -> Iterator[Remark]:
+    """Participants of whose keys `keys` says nothing, though it has a section for each player."""
+    humans = dict.fromkeys(name for _, names in trial.humans() for name in names)
+    lacking = [name for name in humans if trial.keys_differ and name not in trial.keys]
+    if lacking:
+        names = printable(", ".join(lacking), 100)
+        yield Remark(("trial", "keys"), f"says nothing of {names}: the names of the actions decide their keys")
 
 
 def _too_short(config: Config) -> Iterator[Remark]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import difflib
 import warnings
 from pathlib import Path
 
-from hippodrome.config import Diagnostic, layout
+from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.config.layout import AGENT
+from hippodrome.model.matching import MATCH
 from local.check.wording import short
+from trial.agent.callbacks import NAMES
 
 
 def label_of(folder: Path) -> str | None:
@@ -35,15 +38,49 @@ def read_agent(folder: Path) -> list[Diagnostic]:
     return []
 
 
+def never_called(folder: Path, config: Config) -> list[Diagnostic]:
+    """Remarks on a method whose name is nearly a callback's, and on a `match` that config.yml does not ask for."""
+    path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (OSError, ValueError, SyntaxError):
+        return []
+    used = {part.attr for part in ast.walk(tree) if isinstance(part, ast.Attribute)}
+    used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)}
+    agents = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
+    methods = [method for made in agents for method in _functions(made.body, used)]
+    said = [(method.lineno, _nearly_a_callback(method.name)) for method in methods]
+    if config.project.has_sessions and config.project.matching != MATCH:
+        asks = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
+        said += [(beside.lineno, asks) for beside in _functions(tree.body, used) if beside.name == MATCH]
+    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in said if sentence]
+
+
+def _functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
+    """Those that the file itself does not use."""
+    return [part for part in body if isinstance(part, ast.FunctionDef) and part.name not in used]
+
+
+def _nearly_a_callback(name: str) -> str:
+    if name in NAMES or not name.startswith("on_"):
+        return ""
+    near = difflib.get_close_matches(name, NAMES, n=1, cutoff=0.7)
+    return f"{name} is no callback, so it is never called; did you mean {near[0]}?" if near else ""
+
+
 def line_of(path: Path, method: str) -> int | None:
-    """Where the method of class Agent is written; else the class. Without that class, where the function is."""
+    """Where the method of class Agent is written; else the class. Without that class, where the function is.
+
+    `match` is a function beside the class, also where there is one.
+    """
     try:
         body = ast.parse(path.read_bytes()).body
     except (OSError, ValueError, SyntaxError):
         return None
     for agent in body:
         if isinstance(agent, ast.ClassDef) and agent.name == "Agent":
-            return _last(agent.body, method) or agent.lineno
+            beside = _last(body, method) if method == "match" else None
+            return beside or _last(agent.body, method) or agent.lineno
     return _last(body, method)
 
 

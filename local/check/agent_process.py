@@ -93,7 +93,7 @@ def _try(report: Path) -> None:
         return player.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
-    if question and not progress.call("match", lambda: _match(adapter, question)):
+    if question and not progress.call("match", lambda: _match(adapter, question, progress)):
         return
     spaces = {PLAYER: player.action_space} if isinstance(player, AgentAdapter) else player.action_spaces
     progress.known = _actions(player, config)
@@ -114,19 +114,23 @@ def _try(report: Path) -> None:
     if count is not None and len(player.action_space) > int(count):
         first = int(getattr(space, "start", 0))
         progress.foreign = _foreign_actions(env, range(first, first + int(count)))
-    played = _play(player, progress, reset, config.max_episodes)
+    played = _play(player, progress, reset, config)
     if played and _seen_idle(player, players, config, progress) and progress.call("close", player.close):
         progress.over()
 
 
-def _match(adapter: AgentAdapter, question: dict[str, Any]) -> None:
+def _match(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress) -> None:
     """Ask the function `match` about made-up people. Raises AgentError, and what `match` raises."""
     function = match.function_of(adapter.agent_module)
     if function is None:
-        raise AgentError("agent.py has no function match(waiting), and config.yml says matching: match")
-    _, problem = match.groups(function, question)
+        inside = (
+            "; write it beside the class Agent, not in it, and without self" if match.in_class(adapter.agent) else ""
+        )
+        raise AgentError(f"agent.py has no function match(waiting), and config.yml says matching: match{inside}")
+    found, problem = match.groups(function, question)
     if problem:
         raise AgentError(problem)
+    progress.matched = len(found)
 
 
 def _reader(config: Trial, folder: Path, progress: _Progress) -> PictureReader:
@@ -221,14 +225,14 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
     return found
 
 
-def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most: int) -> bool:
+def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], config: Trial) -> bool:
     """Play up to the end of the last episode, or of the time; False if something failed.
 
     Each action comes once in turn, then they are at random.
     """
     callbacks = progress.callbacks
     random = Random(1)  # noqa: S311 - the same each time
-    for episode in range(1, most + 1):
+    for episode in range(1, config.max_episodes + 1):
         reset = first_reset if episode == 1 else partial(player.reset, episode)
         if not progress.call("reset", reset):
             return False
@@ -236,11 +240,12 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
         if not progress.call("render", player.render):
             return False
         callbacks.episode_began(episode, {PLAYER: observation}, {PLAYER: info})
-        ended = False
+        steps, ended = 0, False
         while not ended:
             if progress.time_over():
                 callbacks.session_ended()
                 return True
+            steps += 1
             actions = len(player.action_space)
             progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
             began = time.monotonic()
@@ -248,7 +253,7 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], most
                 return False
             progress.steps += 1
             outcome = progress.result
-            ended = outcome.terminated or outcome.truncated
+            ended = outcome.terminated or outcome.truncated or steps >= config.most_steps
             if not progress.call("render", player.render):
                 return False
             progress.pace.took(time.monotonic() - began)
@@ -267,6 +272,8 @@ class _Progress:
     def __init__(self, report: Path, folder: Path, outside: Outside) -> None:
         self._report, self._folder, self._outside = report, folder, outside
         self.episodes = self.steps = 0
+        self.matched: int | None = None
+        """How many sessions `match` made of made-up people, if it was asked."""
         self.action: Any = 0  # or by player
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
@@ -320,7 +327,7 @@ class _Progress:
 
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
-        far["pace"] = asdict(self.pace)
+        far["pace"], far["matched"] = asdict(self.pace), self.matched
         if self.callbacks is not None:
             far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
         if self.undrawn:

@@ -55,6 +55,7 @@ class AgentReport:
             *self._too_large(),
             *self._idle(),
             *self._turns(),
+            *self._nobody_matched(),
             *self._not_on_aws(),
         ]
 
@@ -226,7 +227,7 @@ class AgentReport:
                 )
             ]
         place = (self._name(error["file"]), error["line"]) if error["file"] else None
-        if error["type"] in ("AgentError", "FrameError", "SceneError"):
+        if error["type"] in ("AgentError", "BadGroups", "FrameError", "SceneError"):
             return [self._breach(error["text"], place)]
         told = self._of_players(error, place)
         if told is not None:
@@ -274,6 +275,15 @@ class AgentReport:
             )
             found.append(self._at(self._place_of(told["late"]), text, remark=True))
         return found
+
+    def _nobody_matched(self) -> list[Diagnostic]:
+        """A function `match` that puts nobody into a session. Told once, of the first group."""
+        if self._group or self._report.get("matched") != 0:
+            return []
+        said = (
+            f"match() made no session of {3 * self._config.project.players} made-up participants: such people wait on"
+        )
+        return [self._at(self._place_of("match"), said, remark=True)]
 
     def _place_of(self, method: str) -> tuple[str, int | None]:
         return self._label or AGENT, line_of(self._code / AGENT, method)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hippodrome.config import Config, Diagnostic, agent_imports, remarks
-from local.check.agent_file import read_agent
+from local.check.agent_file import never_called, read_agent
 from local.check.pages import check_pages
 from local.check.sessions import check_sessions
 
@@ -18,4 +18,6 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
         found += agent_imports.requirement_remarks(folder)
     if config:
         found += check_sessions(folder, config)
+    if config and plays:
+        found += never_called(folder, config)
     return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

@@ -92,7 +92,7 @@ class Game:
                 return False
             callbacks.episode_began(episode, now.observations, now.infos)
             steps = 0
-            while not now.over:
+            while not now.over and steps < self._config.most_steps:
                 if over():
                     callbacks.session_ended()
                     return True
@@ -114,7 +114,7 @@ class Game:
                 progress.returned(now.infos.values(), now.extra)
                 callbacks.stepped(actions, now.rewards, now.observations, now.infos)
             progress.episodes = episode
-            callbacks.episode_ended(now.why)
+            callbacks.episode_ended(now.why if now.over else "truncated")
         callbacks.session_ended()
         return True
 

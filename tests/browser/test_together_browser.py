@@ -418,6 +418,14 @@ def test_whoever_was_away_is_told_so_and_not_that_the_others_are_missing(
     shows(tab, "#overlay-hint", "If they are not here in 8 seconds")
 
 
+def test_whoever_is_still_measured_is_not_told_that_they_were_away(together: World, tab: Any) -> None:
+    running(together, tab)
+    together.stands = {"state": "ready", "heldFor": 8, "you": "blue", "people": {"blue": "awaited", "red": "here"}}
+    together.connections[0].send(json.dumps(together.stands))
+    tab.wait_for_selector("#overlay-title:text-is('One moment, please')")
+    assert tab.inner_text("#overlay-hint") == "The game begins as soon as everybody is here."
+
+
 def test_players_have_the_names_that_the_researcher_gives_them(together: World, tab: Any) -> None:
     together.trial = {"afterAbsent": "end", "playerNames": {"blue": "The left slime"}}
     running(together, tab)

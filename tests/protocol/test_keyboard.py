@@ -85,6 +85,15 @@ def test_keys_are_for_all_players_or_by_player() -> None:
     assert [by_player.keys_of(f"player_{number}") for number in range(3)] == [{"a": "left"}, {" ": "1"}, {}]
 
 
+def test_a_player_has_no_label_of_what_only_the_keys_of_others_do() -> None:
+    labels = {"left": "Go left", "say": "Warm!", "both": "Wait", "touch": "No key"}
+    by_player = found(labels=labels, keys={"seeker": {"a": "left", "w": "both"}, "knower": {"h": "say", "w": "both"}})
+    assert list(by_player.labels_of("seeker")) == ["left", "both", "touch"]
+    assert list(by_player.labels_of("knower")) == ["say", "both", "touch"]
+    assert found(labels=labels, keys={"a": "left"}).labels_of("seeker") == labels
+    assert found(labels=labels).labels_of("seeker") == labels
+
+
 def test_two_names_of_one_combination_are_refused() -> None:
     assert said(keys={"a+b": "left", "b+A": "right"}) == ["keys.b+A: is the same as a+b; keep one of them"]
     assert said(keys={"Space": "left", " ": "right"}) == ["keys. : is the same as Space; keep one of them"]

@@ -118,7 +118,7 @@ def load(folder: Path) -> Any:
         return made()
     missing = _missing(module)
     if len(missing) == len(_METHODS):
-        raise AgentError(f"{path.name} has no class Agent")
+        raise AgentError(f"{path.name} has no class Agent{_meant(module)}")
     if missing:
         raise AgentError(f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}")
     return module
@@ -126,6 +126,13 @@ def load(folder: Path) -> Any:
 
 def _missing(methods: Any) -> list[str]:
     return [name for name in _METHODS if not callable(getattr(methods, name, None))]
+
+
+def _meant(module: Any) -> str:
+    """A question about the class of the file whose name is nearly `Agent`; empty if there is none."""
+    classes = {name.lower(): name for name, found in vars(module).items() if isinstance(found, type)}
+    near = difflib.get_close_matches("agent", classes, n=1, cutoff=0.75)
+    return f"; is {classes[near[0]]} meant to be Agent?" if near else ""
 
 
 def _nearly(name: str, made: type) -> list[str]:

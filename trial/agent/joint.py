@@ -298,6 +298,7 @@ _KEYS = {
 }
 """What each part may be called in a dict, as HIPPO's agents return one."""
 _MAPS = frozenset({dict})
+_ENDS = ("terminations", "truncations")
 _WANTED = "step() must return (observations, rewards, terminations, truncations, infos), each of them by player"
 
 
@@ -331,6 +332,7 @@ def _read(result: Any) -> _Returned:
         raise AgentError(f"{_WANTED}, or a dict of these")
     for name, part in zip(_KEYS, parts, strict=True):
         if part is not None and type(part) is not dict and not isinstance(part, Mapping):
-            raise AgentError(f"{_WANTED}; its {name} are {type(part).__name__}")
+            for_all = f', and {{"__all__": {part}}} is for all players' if name in _ENDS else ""
+            raise AgentError(f"{_WANTED}; its {name} are {type(part).__name__}{for_all}")
     observations, rewards, terminated, truncated, infos = (part or {} for part in parts)
     return _Returned(observations, rewards, terminated, truncated, infos, extra)

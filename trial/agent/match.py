@@ -25,6 +25,11 @@ def function_of(module: ModuleType | None) -> Callable[..., Any] | None:
     return found if callable(found) else None
 
 
+def in_class(agent: Any) -> bool:
+    """Whether `match` is a method of the agent, where it is not looked for."""
+    return callable(getattr(agent, NAME, None))
+
+
 def people(question: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What `match` is given: a dict for each participant who waits, in the order in which they came."""
     return [{"waited": 0, "group": None, "answers": {}} | each for each in json.loads(json.dumps(question["waiting"]))]

@@ -192,6 +192,6 @@ def _scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str
 
 def _input(config: Trial, player: str) -> dict[str, Any]:
     """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
-    keys, labels = config.keys_of(player), config.labels
+    keys, labels = config.keys_of(player), config.labels_of(player)
     said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
     return {name: value for name, value in said.items() if value}

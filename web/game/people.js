@@ -102,13 +102,19 @@ function sayWhoseTurn({ state, toAct, turnOf }) {
 function coverPicture() {
   const name = coverName();
   if (game.state === "break" || (find("play").hidden && name !== "begins")) return showWhoReads();
-  const title = missing().length ? `Waiting for ${pair ? theOther : missing().map(playerName).join(", ")}` : "You were away for a moment";
+  const title = titleOfHold();
   if (name === presence.shown && (name !== "held" || title === overlays.held.title)) return countSeconds();
   if (name === "held") releaseAll();
   overlays.begins.title = game.state === "paused" ? "The game goes on" : "The game begins";
   overlays.held.title = title;
   showOverlay(name);
   countSeconds();
+}
+
+// A participant is awaited by the others, and was not away, until the connection has been measured (`maxPing`).
+function titleOfHold() {
+  if (missing().length) return `Waiting for ${pair ? theOther : missing().map(playerName).join(", ")}`;
+  return presence.people[presence.you] === "awaited" ? "One moment, please" : "You were away for a moment";
 }
 
 function coverName() {

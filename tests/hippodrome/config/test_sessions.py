@@ -188,6 +188,21 @@ def test_keys_of_sessions_have_no_effect_on_one_who_plays_alone(folder: Path) ->
     ]
 
 
+def test_keys_of_sessions_name_as_many_players_as_are_human(folder: Path) -> None:
+    text = small(project="patience: 60\n", trial="players: {a: human, b: human, c: human}\n")
+    said = [line for line in remarked(folder, text) if line.startswith("project.patience: ")]
+    assert said[0].endswith("; write players: 3 under project")
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("Partner", "; a class of agent.py is agent:Partner"), ("randm", "; did you mean random?"), ("a b", "")],
+)
+def test_what_can_be_no_policy_is_told_with_what_was_meant(folder: Path, written: str, meant: str) -> None:
+    (line,) = mistakes(folder, pair(trial=TWO + f"substitute: {written}\n"))
+    assert line.endswith(f', not "{written}"{meant}')
+
+
 def test_a_substitutes_file_is_found(folder: Path) -> None:
     (folder / "policies").mkdir()
     (folder / "policies/partner.onnx").touch()

@@ -372,6 +372,8 @@ def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
     ("old", "new", "said"),
     [
         ("class Agent:", "class Other:", "agent.py: there is no class Agent"),
+        ("class Agent:", "class Agnet:", "agent.py: there is no class Agent; is Agnet meant to be Agent?"),
+        ("class Agent:", "class agent:", "agent.py: there is no class Agent; is agent meant to be Agent?"),
         ("def render(self):\n        return self.env", "def rendr(self):\n        return self.env", "agent.py:15: Agent has no render"),
         ("def step(self, action):", "def step(self, a, b, c):", "agent.py:21: step(a, b, c) cannot be called; write step(action) or step(env, action)"),
         ("import numpy", "import no_such_thing; import numpy", "agent.py:1: start(\"none\") fails: ModuleNotFoundError: No module named 'no_such_thing'; install its package: .venv/bin/pip install no_such_thing"),
@@ -453,6 +455,30 @@ def test_a_game_without_an_end_is_played_for_a_while_and_that_is_said(
     said: list[str] = []
     assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
     assert re.fullmatch(r"played: 0 of 1 episodes to the end, \d+ steps \(its time was over\)", said[0])
+
+
+def test_a_method_that_is_nearly_a_callback_is_remarked_on(folder: Path) -> None:
+    agent(folder, "    def close", "    def on_episode_over(self, session):\n        pass\n\n    def close")
+    (line,) = looked(folder)
+    assert re.fullmatch(
+        r"agent\.py:\d+: remark: on_episode_over is no callback, so it is never called; did you mean on_episode_end\?",
+        line,
+    )
+    agent(
+        folder,
+        "    def close",
+        "    def on_episode_end(self, session):\n        self.on_episode_over(session)\n\n    def close",
+    )
+    assert looked(folder) == []
+
+
+@pytest.mark.parametrize("limit", ["maxSteps: 12", "episodeSeconds: 0.2"])
+def test_an_episode_ends_at_its_limit(folder: Path, limit: str) -> None:
+    agent(folder, "self.n >= 30", "False")
+    config(folder, "  maxEpisodes: 1\n", f"  maxEpisodes: 2\n  {limit}\n")
+    said: list[str] = []
+    assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
+    assert said == ["played: 2 of 2 episodes to the end, 24 steps"]
 
 
 @pytest.mark.parametrize(("names", "remark"), [("[noop, left, right]", False), ("[noop]", True)])

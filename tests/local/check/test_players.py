@@ -89,6 +89,22 @@ def test_whole_episodes_are_played(folder: Path, plays: str) -> None:
     assert (found, said) == ([], ["played: 3 of 3 episodes to the end, 60 steps"])
 
 
+@pytest.mark.parametrize("limit", ["maxSteps: 12", "episodeSeconds: 0.4"])
+def test_an_episode_ends_at_its_limit(folder: Path, limit: str) -> None:
+    agent = folder / "agent.py"
+    agent.write_text(agent.read_text().replace("self.n == 20", "False"))
+    said: list[str] = []
+    assert tried(folder, "random", "maxEpisodes", f"startingFrameRate: 30\n  {limit}\n  maxEpisodes", said) == []
+    assert said == ["played: 3 of 3 episodes to the end, 36 steps"]
+
+
+def test_one_end_for_all_players_is_written_as_a_map(folder: Path) -> None:
+    agent = folder / "agent.py"
+    agent.write_text(agent.read_text().replace('{"__all__": self.n == 20}', "self.n == 20"))
+    (line,) = tried(folder, "random")
+    assert line.endswith('its terminations are bool, and {"__all__": False} is for all players')
+
+
 @pytest.mark.parametrize(("input", "between"), [("held", 2), ("single", 0)])
 def test_between_two_choices_a_policy_does_what_it_does_on_a_server(folder: Path, input: str, between: int) -> None:
     agent = folder / "agent.py"

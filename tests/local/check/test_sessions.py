@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -200,17 +201,47 @@ def test_a_function_that_matches_must_be_there(folder: Path) -> None:
     assert line == "agent.py:5: there is no function match(waiting), and config.yml says matching: match"
 
 
+def test_a_function_that_matches_stands_beside_the_class(folder: Path) -> None:
+    inside = "    def match(self, waiting):\n        return []\n\n    def close"
+    (folder / "agent.py").write_text(AGENT.replace("    def close", inside))
+    (line,) = tried(configured(folder, "  matching: match\n"))
+    assert line.endswith("matching: match; write it beside the class Agent, not in it, and without self")
+
+
+def test_a_function_that_matches_is_asked_for_in_config_yml(folder: Path) -> None:
+    (folder / "agent.py").write_text(f"{AGENT}\n\ndef match(waiting):\n    return []\n")
+    (line,) = looked(folder)
+    assert re.fullmatch(
+        r"agent\.py:\d+: remark: match\(\) is never called; matching: match under project of config.yml asks for it",
+        line,
+    )
+    assert looked(configured(folder, "  matching: match\n")) == []
+    (folder / "agent.py").write_text(f"{AGENT}\n\ndef match(waiting):\n    return []\n\nmatch([])\n")
+    assert looked(configured(folder)) == []
+
+
+def test_a_player_without_keys_is_remarked_on_where_players_have_keys_of_their_own(folder: Path) -> None:
+    (line,) = looked(configured(folder, trial="  keys: {left: {a: up}}\n"))
+    assert line.endswith(": remark: trial.keys: says nothing of right: the names of the actions decide their keys")
+    assert looked(configured(folder, trial="  keys: {left: {a: up}, right: {b: down}}\n")) == []
+    assert looked(configured(folder, trial="  keys: {a: up}\n")) == []
+
+
 @pytest.mark.parametrize(
     ("code", "said"),
     [
         ("return [[one['id'] for one in waiting[:2]]]", None),
         ("return [[waiting[0]['id'], waiting[1]['answers']['language'] and waiting[1]['id']]]", None),
-        ("return None", "match() must return a list of groups"),
+        ("return None", "match() must return a list of groups, and returned NoneType"),
+        ("return ['made-up-0']", "each group that match() returns must be a list of ids; one is str"),
         ("return [waiting[:3]]", "match() made a group of 3, and project.players is 2"),
-        ("return [nobody]", "nobody"),
+        ("return []", "remark: match() made no session of 6 made-up participants: such people wait on"),
+        ("return [nobody]", "match() fails: NameError: name 'nobody' is not defined"),
     ],
 )
 def test_match_is_called_with_made_up_people(folder: Path, code: str, said: str | None) -> None:
-    (folder / "agent.py").write_text(f"{AGENT}\n\ndef match(waiting):\n    {code}\n")
+    before = f"{AGENT}\n\n"
+    (folder / "agent.py").write_text(f"{before}def match(waiting):\n    {code}\n")
     found = tried(configured(folder, "  matching: match\n"))
-    assert (found == []) if said is None else (len(found) == 1 and said in found[0])
+    line = before.count("\n") + (2 if said and "NameError" in said else 1)
+    assert found == ([f"agent.py:{line}: {said}"] if said else [])
