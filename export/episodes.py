@@ -133,7 +133,7 @@ _NO_NAME = re.compile("[^A-Za-z0-9_-]")
 def _look(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
     """What a converted recording is like for each human, and their highest action, without reading it all.
 
-    `people` are the participants of a session's players. A player who is none's any more has no dataset.
+    `people` are the participants of a session's players. A player whose participant was erased has no dataset.
     """
     import pyarrow.parquet as pq
 

@@ -37,9 +37,10 @@ class Unit(NamedTuple):
 
 
 class Members(NamedTuple):
-    """Who plays in a session: numbers by seat, and what gives them away with what to write instead.
+    """Who plays in a session. `people`: their numbers, by seat.
 
-    `mark` is another one whenever a recording of the session has to be converted anew for one of these.
+    `identities`: texts that would show who they are, each with what to write instead. `mark` changes with all of this,
+    so that the session's recordings are converted again.
     """
 
     session: str
@@ -100,7 +101,7 @@ def _is_session(key: str) -> bool:
 
 
 def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
-    """The listing by participant and session; what is of one stands together, in any order."""
+    """The listing by participant and session: all lines of one, in any order, then all of the next."""
     user, items = "", list[Item]()
     for line in listed:
         item = keys.read(project, line)

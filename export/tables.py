@@ -102,7 +102,7 @@ def _in_session(found: Mapping[str, Any], player: str | None) -> list[Any]:
 def _whose(person: Person | None, found: Mapping[str, Any]) -> list[tuple[str | None, str | None, float | None]]:
     """Whose an episode is: number, player and score. A session's is each human player's.
 
-    The number is missing if the participant was erased, or the player was never one's.
+    The number is missing if the participant was erased, or if no participant ever played this player.
     """
     people = found.get("people")
     if person is not None or not people:

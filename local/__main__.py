@@ -160,7 +160,7 @@ def _more_files() -> None:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[int]:
-    """A handle from which a byte can be read once the process is asked to end. Who asks twice gets it at once.
+    """A handle from which a byte can be read once the process is asked to end. Asked twice, it ends at once.
 
     Python writes the byte as the signal arrives (`set_wakeup_fd`), in any thread. The handler runs later, in the main
     thread, which the signal does not wake if another thread got it, or if it was just about to read.

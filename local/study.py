@@ -70,11 +70,11 @@ class Study:
             written=activity_log.wrote,
             named_port=named_port,
             subdomain=names,
-            say=activity_log.trouble,
+            say=activity_log.warn,
         )
         installed.use(self._platform)
         self._config = self._platform.publish()
-        app = App(FUNCTIONS, activity_log.trouble, origins)
+        app = App(FUNCTIONS, activity_log.warn, origins)
         site = self._authority.context("localhost", HOST, *sorted(TLS_NAMES)) if self._authority else None
         self.server = WebServer(app, listen(port), self._platform.retry.report, site)
         self._names: Names | None = None
@@ -112,7 +112,7 @@ class Study:
         self._activity_log.study(step.key for step in changed.steps)
         installed.use(self._platform)  # functions forget the pages they have kept
         if not changed.project.live:
-            self._activity_log.trouble(_NOT_LIVE)
+            self._activity_log.warn(_NOT_LIVE)
 
     def _banner(self) -> None:
         project, url = self._config.project, self.server.url

@@ -28,7 +28,7 @@ class Complaints(logging.Handler):
             return  # it has been told in one sentence what this machine refuses
         if record.getMessage() in _TOLD:
             return
-        self._activity_log.trouble(complaint(record.getMessage(), vars(record)))
+        self._activity_log.warn(complaint(record.getMessage(), vars(record)))
 
 
 def complaint(message: str, fields: Mapping[str, object]) -> str:

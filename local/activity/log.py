@@ -74,11 +74,11 @@ class ActivityLog:
         """Show something that concerns all participants."""
         self._line("", text)
 
-    def trouble(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         """Show something that the researcher should look at."""
         self._line("", text, "yellow")
 
-    def person(self, user_id: str, text: str, style: str = "") -> None:
+    def participant(self, user_id: str, text: str, style: str = "") -> None:
         """Show something that happens to a participant."""
         self._line(_short(user_id), text, style)
 
@@ -103,7 +103,7 @@ class ActivityLog:
             timer, text = self._held.pop(user_id, (None, ""))
         if timer:
             timer.cancel()
-            self.person(user_id, text)
+            self.participant(user_id, text)
 
     def _line(self, who: str, text: str, style: str = "") -> None:
         line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
@@ -129,13 +129,13 @@ class ActivityLog:
         elif found and found[2] == "participant":
             self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
-            self.person(found[1], "arrived" if group is None else f"arrived, group {group}")
+            self.participant(found[1], "arrived" if group is None else f"arrived, group {group}")
             self._now(found[1])
         elif together:
             self._plays_together(together[1], record)
         elif found and found[2] == "session":
             if record.get("unmatched"):
-                self.person(found[1], "found no others to play with", "yellow")
+                self.participant(found[1], "found no others to play with", "yellow")
         elif found and found[2].startswith("answers/"):
             self._catch_up(key.partition("/answers/")[0])
             self._answer(key, found[1], record)
@@ -150,7 +150,7 @@ class ActivityLog:
         names = ", ".join(_short(str(each.get("userId"))) for each in members)
         lacking = int(record.get("players", 0)) - len(members)
         rest = f"; a policy plays in {lacking} place{'s' if lacking > 1 else ''}" if lacking > 0 else ""
-        self.person(session_id, f"{names} {'play together' if len(members) > 1 else 'plays'}{rest}")
+        self.participant(session_id, f"{names} {'play together' if len(members) > 1 else 'plays'}{rest}")
 
     def _forget(self, folder: str) -> None:
         """Forget the answers of a participant who arrives: they have none yet, if the data was deleted."""
@@ -165,9 +165,9 @@ class ActivityLog:
         step, page = str(record.get("step", "?")), str(record.get("page", ""))
         kind = type_of(page)
         done = "played" if kind.on_server else "answered"
-        self.person(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
+        self.participant(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
         if step == self._last_step:
-            self.person(user_id, "came to the end of the study", "green")
+            self.participant(user_id, "came to the end of the study", "green")
         self._now(user_id)
 
     def _server(self, record: dict[str, Any]) -> None:
@@ -186,13 +186,13 @@ class ActivityLog:
         elif state == "starting" and attempt == 1:
             self._later(user_id, "server starting")
         elif state == "starting":
-            self.person(user_id, f"server starting, attempt {attempt}")
+            self.participant(user_id, f"server starting, attempt {attempt}")
         elif state == "ready":
             self._now(user_id)
             which = "has a warm server" if record.get("spare") else "server ready"
             # A name may be the id of a person.
             where = "its name, port " if self.named else f"ws://{record.get('host')}:"
-            self.person(user_id, f"{which} at {where}{record.get('port')}")
+            self.participant(user_id, f"{which} at {where}{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
             text = f"server gone ({_GONE.get(reason, reason)})"
@@ -200,7 +200,7 @@ class ActivityLog:
                 self._later(user_id, text)
                 return
             self._now(user_id)
-            self.person(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
+            self.participant(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     def _warm_server(self, record: dict[str, Any], state: str) -> None:
         """Show the state of a warm server. Once it is assigned, its lines are the participant's."""
@@ -211,14 +211,14 @@ class ActivityLog:
             self.say("no slot for another warm server just now: maxServers or maxServerHours is reached")
         elif state == "closed" and reason != "taken":
             text = f"a warm server is gone ({_GONE.get(reason, reason)})"
-            (self.say if reason in ("stopped", "deadline") else self.trouble)(text)
+            (self.say if reason in ("stopped", "deadline") else self.warn)(text)
 
     # What servers write
 
     def follow(self, tasks: ProcessTasks, data: Path) -> None:
         """Follow the running servers until `close`. Lines from before this run are not shown again."""
         self._look(tasks, data, anew=False)
-        self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="story", daemon=True)
+        self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="activity", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -261,7 +261,7 @@ class ActivityLog:
         for key, body in watched.answers():
             self._answer(key, key.split("/")[2], _json(body))
         for text in watched.complaints():
-            self.person(watched.user_id, text, "yellow")
+            self.participant(watched.user_id, text, "yellow")
 
 
 def _short(user_id: str) -> str:

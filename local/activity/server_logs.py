@@ -73,7 +73,7 @@ class WatchedServer:
         return (self._data / folder / "answers").glob("[!.]*.json")
 
     def _find_members(self) -> None:
-        """Look whether the session is formed. What its members have answered before it was is theirs, not its own."""
+        """Look whether the session is formed. Answers that are there by then are not those of its game."""
         with contextlib.suppress(OSError, BadSession):
             found = session.parse((self._data / self.folder / "session.json").read_bytes())
             project, ids = self.folder.partition("/")[0], [member.user_id for member in found.members if member.user_id]

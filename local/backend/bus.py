@@ -38,7 +38,7 @@ RETRY = (1, 2, 6, 24)
 
 
 @dataclass(order=True)
-class _Letter:
+class _QueuedMessage:
     """A message on its way; ordered by when it is due."""
 
     due: float
@@ -63,7 +63,7 @@ class _Queue:
         self._dead = dead
         self._say = say
         self._changed = threading.Condition()
-        self._waiting: list[_Letter] = []
+        self._waiting: list[_QueuedMessage] = []
         self._busy = 0
         self._open = False
         self._threads: list[threading.Thread] = []
@@ -77,19 +77,19 @@ class _Queue:
             kept = files.read_json(path)
             try:
                 id_, received = name.removesuffix(".json").rsplit(".", 1)
-                letter = _Letter(kept["due"], kept["sent"], id_, kept["body"], int(received))
+                queued = _QueuedMessage(kept["due"], kept["sent"], id_, kept["body"], int(received))
             except (TypeError, KeyError, ValueError):
                 self._say(f"a message in {path} cannot be read")
                 continue
-            heapq.heappush(self._waiting, letter)
+            heapq.heappush(self._waiting, queued)
 
     def put(self, message: Mapping[str, Any], seconds: float = 0) -> None:
         now = time.time()
         body = json.dumps(message, separators=(",", ":"))
-        letter = _Letter(now + seconds, now, str(uuid.uuid4()), body)
-        files.write_json(self._folder / letter.file, {"sent": letter.sent, "due": letter.due, "body": body})
+        queued = _QueuedMessage(now + seconds, now, str(uuid.uuid4()), body)
+        files.write_json(self._folder / queued.file, {"sent": queued.sent, "due": queued.due, "body": body})
         with self._changed:
-            heapq.heappush(self._waiting, letter)
+            heapq.heappush(self._waiting, queued)
             self._changed.notify()
 
     def start(self) -> None:
@@ -110,10 +110,10 @@ class _Queue:
 
     def take_all(self) -> list[Any]:
         with self._changed:
-            letters, self._waiting = sorted(self._waiting), []
-        for letter in letters:
-            (self._folder / letter.file).unlink(missing_ok=True)
-        return [json.loads(letter.body) for letter in letters]
+            several, self._waiting = sorted(self._waiting), []
+        for queued in several:
+            (self._folder / queued.file).unlink(missing_ok=True)
+        return [json.loads(queued.body) for queued in several]
 
     def stop(self, until: float) -> None:
         """Deliver nothing more; wait for running handlers, at most until `until` (monotonic)."""
@@ -135,7 +135,7 @@ class _Queue:
                     self._busy -= 1
                     self._changed.notify_all()
 
-    def _take(self) -> list[_Letter]:
+    def _take(self) -> list[_QueuedMessage]:
         """The next messages that are due, at most a batch; waits for them. Empty if the queue is closed."""
         with self._changed:
             while self._open:
@@ -144,75 +144,75 @@ class _Queue:
                     # At most half a minute: the machine may sleep, and its clock may be set.
                     self._changed.wait(None if wait is None else min(wait, 30.0))
                     continue
-                batch: list[_Letter] = []
+                batch: list[_QueuedMessage] = []
                 while self._waiting and len(batch) < BATCH and self._waiting[0].due <= time.time():
                     batch.append(heapq.heappop(self._waiting))
                 self._busy += 1
                 return batch
         return []
 
-    def _deliver(self, batch: Sequence[_Letter]) -> None:
-        batch = [letter for letter in batch if self._count(letter)]
+    def _deliver(self, batch: Sequence[_QueuedMessage]) -> None:
+        batch = [queued for queued in batch if self._count(queued)]
         if not batch:
             return
         failed = self._call(batch)
         # If this machine refused something lately, even in another function, the failure may come of it: not counted.
         counts = not self._retry.reported_within(RETRY[-1])
-        self._again([letter for letter in batch if letter.id in failed], counts=counts)
-        done = [letter for letter in batch if letter.id not in failed]
-        self._again([letter for letter in done if not self._remove(letter)], counts=False)
+        self._again([queued for queued in batch if queued.id in failed], counts=counts)
+        done = [queued for queued in batch if queued.id not in failed]
+        self._again([queued for queued in done if not self._remove(queued)], counts=False)
 
-    def _remove(self, letter: _Letter) -> bool:
+    def _remove(self, queued: _QueuedMessage) -> bool:
         """Remove the file of a message that has been handled; if that fails, the message comes again."""
         try:
-            (self._folder / letter.file).unlink(missing_ok=True)
+            (self._folder / queued.file).unlink(missing_ok=True)
         except OSError as error:
             self._retry.report(error)
             return False
         return True
 
-    def _count(self, letter: _Letter) -> bool:
+    def _count(self, queued: _QueuedMessage) -> bool:
         """Count one more receive in the file's name; return False if the file was removed. Raises OSError."""
-        before, after = self._folder / letter.file, replace(letter, received=letter.received + 1).file
+        before, after = self._folder / queued.file, replace(queued, received=queued.received + 1).file
         try:
             before.rename(self._folder / after)
         except FileNotFoundError:
             self._say(f"the message in {before} is gone: another program removed it")
             return False
-        letter.received += 1
+        queued.received += 1
         return True
 
-    def _call(self, batch: Sequence[_Letter]) -> set[str]:
+    def _call(self, batch: Sequence[_QueuedMessage]) -> set[str]:
         """Call the function; return the ids of messages that failed: all if it raised or its answer is invalid."""
-        everything = {letter.id for letter in batch}
+        everything = {queued.id for queued in batch}
         if self.handler is None:
             return everything
         try:
-            answer = self.handler({"Records": [_record(letter, self.name) for letter in batch]}, None)
+            answer = self.handler({"Records": [_record(queued, self.name) for queued in batch]}, None)
             failed = {item["itemIdentifier"] for item in (answer or {}).get("batchItemFailures") or ()}
         except Exception:  # noqa: BLE001 - as SQS: whatever it was, the batch comes again
             self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
             return everything
         return failed if failed <= everything else everything
 
-    def _again(self, letters: Sequence[_Letter], *, counts: bool) -> None:
+    def _again(self, several: Sequence[_QueuedMessage], *, counts: bool) -> None:
         """Deliver these again later. If failures count, a message that has failed too often is put aside."""
-        for letter in letters:
-            if counts and letter.received > len(RETRY) and self._put_aside(letter):
+        for queued in several:
+            if counts and queued.received > len(RETRY) and self._put_aside(queued):
                 continue
-            letter.due = time.time() + RETRY[min(max(0, letter.received - 1), len(RETRY) - 1)]
+            queued.due = time.time() + RETRY[min(max(0, queued.received - 1), len(RETRY) - 1)]
             with self._changed:
-                heapq.heappush(self._waiting, letter)
+                heapq.heappush(self._waiting, queued)
                 self._changed.notify()
 
-    def _put_aside(self, letter: _Letter) -> bool:
+    def _put_aside(self, queued: _QueuedMessage) -> bool:
         try:
             disk.make_folder(self._dead)
-            (self._folder / letter.file).rename(self._dead / letter.file)
+            (self._folder / queued.file).rename(self._dead / queued.file)
         except OSError as error:
             self._retry.report(error)
             return False
-        self._say(f"a message failed {letter.received} times and was put aside: {self._dead / letter.file}")
+        self._say(f"a message failed {queued.received} times and was put aside: {self._dead / queued.file}")
         return True
 
 
@@ -273,20 +273,20 @@ class FolderBus:
             queue.stop(until)
 
 
-def _record(letter: _Letter, queue: str) -> dict[str, Any]:
-    sent = str(int(letter.sent * 1000))
+def _record(queued: _QueuedMessage, queue: str) -> dict[str, Any]:
+    sent = str(int(queued.sent * 1000))
     return {
-        "messageId": letter.id,
-        "receiptHandle": letter.file,
-        "body": letter.body,
+        "messageId": queued.id,
+        "receiptHandle": queued.file,
+        "body": queued.body,
         "attributes": {
-            "ApproximateReceiveCount": str(letter.received),
+            "ApproximateReceiveCount": str(queued.received),
             "SentTimestamp": sent,
             "SenderId": "local",
             "ApproximateFirstReceiveTimestamp": sent,
         },
         "messageAttributes": {},
-        "md5OfBody": hashlib.md5(letter.body.encode(), usedforsecurity=False).hexdigest(),
+        "md5OfBody": hashlib.md5(queued.body.encode(), usedforsecurity=False).hexdigest(),
         "eventSource": "aws:sqs",
         "eventSourceARN": f"arn:aws:sqs:local:000000000000:{queue}",
         "awsRegion": "local",

@@ -122,7 +122,7 @@ def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
 )
 def test_an_id_is_never_shown_beyond_six_characters(user: str, shown: str) -> None:
     activity_log, text = _activity_log()
-    activity_log.person(user, "arrived")
+    activity_log.participant(user, "arrived")
     assert text.getvalue().split()[1] == shown
 
 

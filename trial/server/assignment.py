@@ -84,7 +84,7 @@ class Search:
                     await self._asked.wait()
 
     async def look(self) -> None:
-        """Wait for the end of a look that begins after this was called."""
+        """Look once more, from now on, and wait for its end."""
         looked = self._looked
         self._asked.set()
         await looked.wait()
