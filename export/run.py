@@ -178,6 +178,9 @@ def _run(
             if any(found.get("callbacks") for _, _, found in state.episodes()):
                 lines = tables.callbacks(state, folder, shared)
                 written += table_files.write(folder / "callbacks", tables.of_callbacks(shared), lines, either)
+            if shared:
+                seen = tables.presence(state, folder)
+                written += table_files.write(folder / "presence", tables.PRESENCE, seen, either)
         only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
         written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)
@@ -243,7 +246,7 @@ def _sound_minari(folder: Path) -> bool:
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Tables of an earlier run that this one did not write would be out of date; half-written files are of no use."""
-    for name in ("answers", "answers-long", "episodes", "callbacks", "problems"):
+    for name in ("answers", "answers-long", "episodes", "callbacks", "presence", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:
                 path.unlink()

@@ -1,4 +1,4 @@
-"""The tables besides the answers': episodes, callbacks, identities and problems.
+"""The tables besides the answers': episodes, callbacks, presence, identities and problems.
 
 Everything is read from the state a row at a time, so that memory does not grow with the study.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from export import scrub
-from export.recording_columns import MOST_PLAYERS, when
+from export.recording_columns import MOST_PLAYERS, as_number, when
 from export.scrub import clean, texts
 from export.state import Person, State
 from export.table_files import BATCH, Column, fit
@@ -138,29 +138,87 @@ def callbacks(state: State, folder: Path, in_sessions: bool = False) -> Iterator
 
     In a session, a line has the participant whose player it names, if it names one.
     """
+    for person, first, path, row in _lines(state, folder, "callbacks", ("callback",)):
+        more = _more(row)
+        player = more.get("player") if isinstance(more.get("player"), str) else None
+        number = person.number if person else first.get("people", {}).get(player)
+        yield [
+            number,
+            first["step"],
+            first["attempt"],
+            *_callback(row, more),
+            path,
+            *([first.get("session"), None if player is None else clean(player)] if in_sessions else ()),
+        ]
+
+
+PRESENCE = (
+    Column("participant"),
+    Column("session"),
+    Column("player"),
+    Column("studyStep"),
+    Column("attempt", "whole"),
+    Column("trial"),
+    Column("episode", "whole"),
+    Column("step", "whole"),
+    Column("time", "time"),
+    Column("what"),
+    Column("roundTrip", "number"),
+    Column("file"),
+)
+
+
+def presence(state: State, folder: Path) -> Iterator[list[Any]]:
+    """Who of a session came, left and was back, and each round trip: a row for each member whom a line names.
+
+    `folder` holds the converted recordings. Round trips are in milliseconds.
+    """
+    for _, first, path, row in _lines(state, folder, "session", ("presence", "ping")):
+        more, people = _more(row), first.get("people", {})
+        for player, what, trip in _seen(more):
+            yield [
+                people.get(player),
+                first["session"],
+                clean(player),
+                first["step"],
+                first["attempt"],
+                _text(row["trial"]),
+                row["episode"],
+                row["step"],
+                row["time"],
+                what,
+                trip,
+                path,
+            ]
+
+
+def _seen(more: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
+    """Of whom a line says what; of a round trip also how long it took."""
+    player, what, trips = more.get("player"), more.get("what"), more.get("roundTrip")
+    if isinstance(player, str) and isinstance(what, str):
+        yield player, clean(what), None
+    elif isinstance(trips, Mapping):
+        yield from ((name, "ping", as_number(trip)) for name, trip in trips.items())
+
+
+def _lines(
+    state: State, folder: Path, has: str, kinds: Sequence[str]
+) -> Iterator[tuple[Person | None, Mapping[str, Any], str, Mapping[str, Any]]]:
+    """The lines of these kinds, of the recordings in one of whose episodes `has` stands.
+
+    Whose the recording is, what is known of its first episode, its file, and the line.
+    """
     import pyarrow.parquet as pq
 
     wanted = ["kind", "trial", "episode", "step", "time", "error", "other"]
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         rows = list(several)
-        if not any(found.get("callbacks") for _, _, found in rows):
+        if not any(found.get(has) for _, _, found in rows):
             continue
         person, _, first = rows[0]
         with pq.ParquetFile(folder / path) as file:
             for batch in file.iter_batches(batch_size=BATCH, columns=wanted):
-                for row in batch.to_pylist():
-                    if row["kind"] == "callback":
-                        more = _more(row)
-                        player = more.get("player") if isinstance(more.get("player"), str) else None
-                        number = person.number if person else first.get("people", {}).get(player)
-                        yield [
-                            number,
-                            first["step"],
-                            first["attempt"],
-                            *_callback(row, more),
-                            path,
-                            *([first.get("session"), None if player is None else clean(player)] if in_sessions else ()),
-                        ]
+                yield from ((person, first, path, row) for row in batch.to_pylist() if row["kind"] in kinds)
 
 
 def _more(row: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -26,6 +26,7 @@ from tests.export.session_world import (
     packed,
     pair,
     recording_key,
+    round_trip,
     session,
     study,
 )
@@ -84,6 +85,33 @@ def test_an_episode_says_for_each_member_in_how_many_steps_the_substitute_played
     ]
 
 
+def test_the_table_of_presence_says_who_came_and_went_and_how_long_round_trips_took(place: Place) -> None:
+    study(place.put, place.tmp)
+    place.done()
+    found = place.rows("presence")
+    assert {(row["session"], row["studyStep"], row["attempt"], row["trial"]) for row in found} == {
+        (SID, "3", "1", "t-1")
+    }
+    names = ("participant", "player", "episode", "step", "what", "roundTrip")
+    trips = [(user, player, "", "", "ping", str(round_trip(user))) for user, player in ((ANN, "left"), (BOB, "right"))]
+    moves = [
+        (user, player, "1", "3", what, "")
+        for user, player in ((ANN, "left"), (BOB, "right"))
+        for what in ("left", "returned")
+    ]
+    joined = [(ANN, "left", "", "", "joined", ""), (BOB, "right", "", "", "joined", "")]
+    assert [tuple(row[name] for name in names) for row in found] == [*joined, *trips, *moves]
+    assert all((place.out / row["file"]).exists() and row["time"] for row in found)
+
+
+def test_the_table_of_presence_names_nobody_where_identities_are_apart(place: Place) -> None:
+    study(place.put, place.tmp)
+    place.done("--identities", "apart")
+    numbers = {row["participant"] for row in place.rows("episodes")}
+    assert {row["participant"] for row in place.rows("presence")} == numbers
+    assert ANN not in (place.out / "presence.csv").read_text()
+
+
 def test_answers_say_session_player_and_outcome_and_who_had_no_partner(place: Place) -> None:
     study(place.put, place.tmp)
     place.done()
@@ -114,6 +142,7 @@ def test_a_study_without_sessions_has_none_of_these_columns_and_one_listing(plac
     assert set(listed) == {"maze/users/"}
     assert not {"session", "seat", "unmatched", "waited"} & {*place.rows()[0]}
     assert not {"session", "player", "framesByPolicy"} & {*place.rows("episodes")[0]}
+    assert not (place.out / "presence.csv").exists()
     assert not [name for name in table(place.out)[0] if name == "session" or name.startswith("participant.")]
 
 
