@@ -65,7 +65,7 @@ def _enter(platform: Platform, project: Project) -> Project:
         keys.add_project_secrets(listed.secrets())
         salt = listed.salt(project.id)  # a project whose secret an earlier version made has the salt ""
         salt = secrets.token_hex(8) if salt is None else salt
-        entry = msgspec.structs.replace(project, salt=salt, version=secrets.token_hex(4))
+        entry = msgspec.structs.replace(project.following(before), salt=salt, version=secrets.token_hex(4))
         body = write_list(listed.without_secrets().with_project(entry))
         try:
             if found:

@@ -75,6 +75,7 @@ class NoServerYet:
     session: str
     members: int
     record: Server | None
+    players: int  # with the places that nobody has; 0 in documents of earlier versions
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +178,7 @@ class Lobby:
             self._documents.delete(way)
         for each in after.open:
             if each.by == label:
-                self._store.start_server(project, each.id)
+                self._store.start_server(project, each.id, each.players)
 
     def repair(self, project: Project) -> Collection[str]:
         """Finish what was interrupted, and bring servers that were started ahead to their number; for the sweep.
@@ -235,7 +236,7 @@ class Lobby:
             return made[me.label]
         self._store.delete(entries.outdated[:DELETED_AT_ONCE])
         if formed := after.formed_of(me.label):
-            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id))
+            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
         seconds = folder.seconds_since(own.joined, run.now) if own else 0.0
         here = rules.here(after, entries, project, me.label, run.now)
         is_proposed = after.proposal_of(me.label) is not None or after.is_decided(me.label)
@@ -252,7 +253,7 @@ class Lobby:
         self._store.delete(key for each in fresh for label in each.labels for key in entries.keys.get(label, ()))
         for each in fresh:
             if servers.records.get(each.id, ...) is None:
-                self._store.start_server(project, each.id)
+                self._store.start_server(project, each.id, each.players)
 
     def _wait_for_server(
         self, project: Project, me: _Asking, known: Decisions, formed: Formed
@@ -268,13 +269,13 @@ class Lobby:
             return servers.given(document, now, open_for)
 
         if settle(known) is known:  # mostly
-            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id))
+            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
         after = self._change(project, known, settle)
         made = self._store.carry_out(project, _due(me.label, known, before, after), Entries())
         if me.label in made:
             return made[me.label]
         formed = after.formed_of(me.label) or formed
-        return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id))
+        return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
 
     def _change(self, project: Project, known: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
         """Change the document; `known` if others change it all the time: the next request, in two seconds, decides."""

@@ -84,7 +84,7 @@ class Repair:
             is_new = each.by == "" and each.asked == run.now
             is_lost = each.id in servers and servers[each.id] is None and run.now - each.asked > NO_RECORD_AFTER
             if is_new or is_lost:
-                self._store.start_server(project, each.id)
+                self._store.start_server(project, each.id, each.players)
         formed = tuple(each for each in after.for_good().formed if each not in known.formed)
         self._store.carry_out(project, Decisions(formed=formed), entries)
         if ended:

@@ -121,9 +121,10 @@ class LobbyStore:
         missing = [each for each in found.members if each.user_id]
         missing = [each for each in missing if self._repository.membership(project.id, each.user_id) is None]
         if missing and self._repository.server_of(project.id, found.id) is None:
-            self.start_server(project, found.id)
+            self.start_server(project, found.id, found.players)
         for each in missing:
-            self._write_membership(project, each.user_id, Membership(found.id, each.seat, len(found.members)))
+            membership = Membership(found.id, each.seat, len(found.members), players=found.players)
+            self._write_membership(project, each.user_id, membership)
 
     def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
         """Remove the marks of decisions that have left the document, which must have been read after the listing."""
@@ -138,9 +139,9 @@ class LobbyStore:
                 record = participant.new_answer(project, user_id, step, answers, self._platform.now())
                 self._create(answer_key(project.id, user_id, step.key), answer.to_json(record))
 
-    def start_server(self, project: Project, session_id: str) -> None:
-        """Send the start message of a session."""
-        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, session_id)))
+    def start_server(self, project: Project, session_id: str, players: int) -> None:
+        """Send the start message of a session of so many players."""
+        self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, session_id, players=players)))
 
     def _write_session(self, project: Project, formed: Formed) -> Mapping[str, Membership]:
         members = tuple(session.Member(each.user_id, each.group, seat) for seat, each in enumerate(formed.members))
@@ -153,10 +154,12 @@ class LobbyStore:
         )
         self._create(session_key(project.id, formed.id), made.to_json())
         if not formed.ahead or self._repository.server_of(project.id, formed.id) is None:
-            self.start_server(project, formed.id)
+            self.start_server(project, formed.id, made.players)
         return {
             each.label: self._write_membership(
-                project, each.user_id, Membership(formed.id, seat, len(members), waited=each.waited)
+                project,
+                each.user_id,
+                Membership(formed.id, seat, len(members), waited=each.waited, players=made.players),
             )
             for seat, each in enumerate(formed.members)
             if each.label

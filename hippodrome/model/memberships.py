@@ -12,7 +12,8 @@ from hippodrome.model.records import Record, from_json
 class Membership(Record, frozen=True, omit_defaults=False):
     """The document. `session` is None for a participant who was not matched.
 
-    `seat` counts the human players of the environment from 0; `members` is how many participants the session has. An
+    `seat` counts the human players of the environment from 0; `members` is how many participants the session has, and
+    `players` is how many it is for, with the places that nobody has; 0 in documents of earlier versions. An
     unmatched participant is shown `completion_code`, which is another one than that of `participant.json`. `waited`:
     the seconds that the participant spent in the lobby.
     """
@@ -23,6 +24,7 @@ class Membership(Record, frozen=True, omit_defaults=False):
     unmatched: bool = False
     completion_code: str = ""
     waited: float | None = None
+    players: int = 0
 
 
 def read(body: bytes) -> Membership:

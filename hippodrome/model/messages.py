@@ -33,12 +33,14 @@ class StartServer(Record, frozen=True):
     """Start topic: start this participant's server. `attempt` is from 1.
 
     `user_id` may also be a warm server's id, or a session's. If sessions of the project have several players, a
-    participant's message starts no server of their own: it says that they are under way to the game.
+    participant's message starts no server of their own: it says that they are under way to the game. `players`: of a
+    session, for how many it is; 0 if its record says that, or for as many as are registered now.
     """
 
     project_id: str
     user_id: str
     attempt: int = 1
+    players: int = 0
 
 
 class StopServer(Record, frozen=True):

@@ -63,6 +63,18 @@ class Ssl(Record, frozen=True):
     privkey: str | None = None
 
 
+class ForPlayers(Record, frozen=True):
+    """What servers run for sessions of so many players: of the last registration with that number. As in `Project`."""
+
+    players: int
+    trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
+    game_pages: Mapping[str, int] = msgspec.field(default_factory=dict)
+    task_definition: str | None = None
+    server_port: int = LEGACY_PORT
+    use_a_w_s: bool = msgspec.field(default=False, name="useAWS")
+    aws_setup: AwsSetup | None = None
+
+
 class Project(Record, frozen=True):
     """One entry of `project_master_list.json`."""
 
@@ -100,6 +112,7 @@ class Project(Record, frozen=True):
     page_folder: Literal["steps", ""] = (
         STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
     )
+    other_numbers: tuple[ForPlayers, ...] = ()  # of several players that were registered before
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
     secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` fills it in; earlier versions stored it
@@ -128,6 +141,26 @@ class Project(Record, frozen=True):
     def has_sessions(self) -> bool:
         """Whether several participants share a server."""
         return self.players > 1
+
+    def following(self, before: Project | None) -> Project:
+        """This registration, after the one `before`: sessions of other numbers of players keep what they run."""
+        kept = {each.players: each for each in (before.other_numbers if before else ())}
+        if before is not None and before.has_sessions:
+            kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
+        others = tuple(kept[players] for players in sorted(kept.keys() - {self.players}))
+        return msgspec.structs.replace(self, other_numbers=others)
+
+    def for_session(self, players: int) -> Project | None:
+        """The project as a session of so many players runs it; None if no such number is known. 0: as it is.
+
+        If another number was registered since, it is played as its own was registered last. No warm server does that.
+        """
+        if players in (0, self.players):
+            return self
+        found = next((each for each in self.other_numbers if each.players == players), None)
+        if found is None:
+            return None
+        return msgspec.structs.replace(self, **msgspec.structs.asdict(found), warm_servers=0)
 
     @property
     def asks_match(self) -> bool:

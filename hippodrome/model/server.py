@@ -109,6 +109,7 @@ class Server(Record, frozen=True):
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # it may store their answers; as in the project when it was started
     may_match: bool = False  # `matching: match`: until there are members, it may say who plays with whom
+    players: int = 0  # of a session: how many its trial is for; 0 in records of earlier versions
 
     @property
     def label(self) -> str:
@@ -230,6 +231,7 @@ def new_attempt(
         nonce=nonce,
         game_steps=tuple(project.game_steps),
         may_match=is_session_id(user_id) and project.asks_match,
+        players=project.players if is_session_id(user_id) else 0,
     )
 
 

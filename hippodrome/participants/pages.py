@@ -49,7 +49,7 @@ class StepView:
 class GameView:
     """The game page for one participant, who waits on it and then plays."""
 
-    project: Project
+    project: Project  # as the participant's session runs it (`Project.for_session`)
     step: Step
     user_id: str
     state: Mapping[str, Any]  # as the poll address answers, see docs/pages.md
@@ -126,7 +126,7 @@ def game_page(view: GameView) -> Page:
     together = view.project.has_sessions
     if together:
         trial = view.project.trial
-        data |= {"players": view.project.players, "absentEnds": trial.get("afterAbsent") != "policy"}
+        data |= {"players": _players(view), "absentEnds": trial.get("afterAbsent") != "policy"}
         data |= {"names": names} if (names := trial.get("playerNames")) else {}
     main = fill(
         "game.html",
@@ -249,7 +249,7 @@ def _stages(state: str) -> Html:
 
 def _lobby(view: GameView) -> Html:
     """Where participants wait for each other (`web/game/lobby.js` fills it in). Hidden once they are matched."""
-    players = view.project.players
+    players = _players(view)
     two = players == 2
     return fill(
         "lobby.html",
@@ -257,6 +257,11 @@ def _lobby(view: GameView) -> Html:
         title="Waiting for another participant" if two else "Waiting for other participants",
         text="Two people play this game together." if two else f"{players} people play this game together.",
     )
+
+
+def _players(view: GameView) -> int:
+    """How many play together: in a session of another number than is registered now, its own."""
+    return int(view.state.get("players", view.project.players))
 
 
 def _prepared(view: StepView) -> Fragment:

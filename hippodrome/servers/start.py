@@ -56,6 +56,8 @@ class Start:
         if project.has_sessions and ids.is_user_id(message.user_id):
             self._services.lobby.under_way(project, message.user_id)
             return
+        if is_session_id(message.user_id):
+            project = self._for_session(project, message)
         self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
         stored = self._create_or_find(project, message)
         if stored is None:
@@ -67,6 +69,23 @@ class Start:
         own = self._assign_warm_server(project, stored)
         if own is not None:
             self._start(project, own)
+
+    def _for_session(self, project: Project, message: StartServer) -> Project:
+        """The project as this session runs it, also if another number of players is registered since.
+
+        A read of its record if the message does not say for how many it is, as those of replacements.
+        """
+        players = message.players
+        if not players:
+            stored = self._repository.server(ids.server_label(project.id, message.user_id))
+            players = stored.server.players if stored else 0
+        found = project.for_session(players)
+        if found is None:  # the number may have been registered since the list was read
+            now = self._services.project_cache.live_project(project.id, timedelta(0))
+            found = now and now.for_session(players)
+        if found is None:
+            logger.error("nothing is registered for a session of so many players", extra={"project": project.id})
+        return found or project
 
     def _cancel_start(self, message: StartServer) -> None:
         """The project is closed, or has no sessions any more: start nothing, and stop what was already started."""

@@ -215,6 +215,22 @@ def test_the_page_says_who_plays_when_it_is_opened_anew(
     assert tab.inner_text("#company") == says
 
 
+def test_the_page_is_made_anew_for_another_number_of_players_and_does_not_leave_the_lobby(
+    together: World, tab: Any
+) -> None:
+    """The study was registered again. What a page says of the others, and its modules, are those of one number."""
+    tab.goto(together.url)
+    assert tab.inner_text("#lobby-here") == "You are the first of 2"
+    together.more = {"players": 3}
+    together.state = {**LOBBY, "players": 3, "here": 2}
+    shows(tab, "#lobby-here", "2 of 3 are here, you included")
+    assert "3 people play this game together." in tab.inner_text("#lobby")
+    together.more = {"players": 4}
+    together.state = {**MATCHED, "players": 4, "members": 4}
+    shows(tab, "#company", "You play with 3 other participants.")
+    assert together.posts == []
+
+
 @pytest.mark.parametrize("state", ["unmatched", "ended"])
 def test_who_could_not_be_matched_gets_the_next_page(together: World, tab: Any, state: str) -> None:
     tab.goto(together.url)
@@ -388,7 +404,7 @@ def test_the_button_that_ends_the_game_says_that_it_ends_for_everybody(together:
 
 
 def test_of_many_players_the_page_says_how_many_are_there(together: World, tab: Any) -> None:
-    together.more = {"players": 16}
+    together.more, together.state = {"players": 16}, {**together.state, "players": 16}
     running(together, tab)
     there = {f"player_{number}": "here" for number in range(16)}
     tell(together, state="paused", heldFor=5, you="player_3", people={**there, "player_5": "away", "player_9": "away"})
@@ -481,7 +497,7 @@ def test_players_that_are_numbers_are_named_as_players(together: World, tab: Any
 
 
 def test_whoever_else_goes_away_meanwhile_is_named_too(together: World, tab: Any) -> None:
-    together.more = {"players": 3}
+    together.more, together.state = {"players": 3}, {**together.state, "players": 3}
     running(together, tab)
     tell(together, state="paused", heldFor=9, **people(red="away", green="here"))
     shows(tab, "#overlay-title", "Waiting for Red")

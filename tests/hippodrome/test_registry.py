@@ -173,6 +173,24 @@ def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:
     assert {p.id for p in listed(platform).projects} == {"old", "maze"}
 
 
+def test_a_study_that_is_registered_for_another_number_of_players_keeps_the_one_before(platform: FakePlatform) -> None:
+    steps = [
+        {"key": "1", "page": "consent", "variants": 2},
+        {"key": "2", "page": "game", "variants": 0},
+        {"key": "finalStep", "page": "bye", "variants": 0},
+    ]
+    places = dict.fromkeys(("red", "blue", "green"), "human")
+    for players in (2, 3):
+        named = dict(list(places.items())[:players])
+        asked = registration(players=players, steps=steps, trial={"game": f"for {players}", "players": named})
+        assert register(asked)["registered"] == "maze"
+    project = ProjectCache(platform, SecretCache(platform.documents)).project("maze")
+    assert project is not None
+    before = project.for_session(2)
+    assert before is not None
+    assert (project.trial["game"], before.trial["game"]) == ("for 3", "for 2")
+
+
 def test_a_study_of_several_participants_does_not_become_one_for_each_alone(platform: FakePlatform) -> None:
     steps = [
         {"key": "1", "page": "consent", "variants": 2},

@@ -24,6 +24,8 @@ async function waitForOthers() {
     const asked = performance.now();
     const state = await pollUntilAnswered();
     const took = performance.now() - asked;
+    // The study was registered for another number of players: this page was made for the one before.
+    if (state.players && state.players !== data.players) await makeAnew();
     if (state.state === "lobby") {
       // The clock of a participant who was away begins anew.
       if (state.seconds < lobby.state.seconds - CLOCKS_DIFFER) {
@@ -34,6 +36,12 @@ async function waitForOthers() {
       if (took > ASK_EVERY) await pause(took); // a site that is slow is asked less often
     } else await proceed(state);
   }
+}
+
+// Loads the page again without leaving the lobby. Never resolves.
+function makeAnew() {
+  lobby.waits = false;
+  return loadPage();
 }
 
 // The participant is matched, or the study goes on without the game.

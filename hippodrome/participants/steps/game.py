@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import timedelta
 from typing import Any
@@ -42,8 +43,9 @@ class GameStep:
             state, proof = self._state_together(visit), {"ticket": ticket}
         else:
             state, proof = self._state_alone(visit), {}
+        played = project.for_session(state.get("players", 0)) or project
         view = pages.GameView(
-            project=project,
+            project=played,
             step=step,
             user_id=visit.user_id,
             state=state,
@@ -55,7 +57,8 @@ class GameStep:
         )
         if request.wants_json:
             return http.as_json(200, {"page": _page_for_program(view, request.method), "css": frame.style(), **state})
-        sources = {page.key: source_of(self._services, visit, page) for page in project.pages_in_game}
+        shown = project.pages_in_game if played is project else self._still_there(visit, played.pages_in_game)
+        sources = {page.key: source_of(self._services, visit, page) for page in shown}
         view = replace(
             view,
             texts={key: (source.text, source.values) for key, source in sources.items()},
@@ -64,6 +67,11 @@ class GameStep:
         with rendering(visit, *sources.values()):
             page = pages.game_page(view)
         return http.html(200, page.html, page.headers)
+
+    def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:
+        """Those of the pages that an earlier registration names which have not been removed since."""
+        project, cache = visit.project, self._services.project_cache
+        return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
 
     def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
         """Request another server, if the form asks for a restart and the participant may have one."""
@@ -90,15 +98,15 @@ class GameStep:
         if standing.is_unmatched:
             raise StepAnswered
         if standing.session is not None:
-            self._request_if_overdue(visit, standing.session, standing.record)
+            self._request_if_overdue(visit, standing.session, standing.record, standing.players)
         return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))
 
-    def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None) -> None:
-        """Send a start message that was lost, for the participant or the session that owns the server."""
+    def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
+        """Send a start message that was lost, for the participant or the session of `players` that owns the server."""
         project, step = visit.project, visit.step
         attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:
-            self._request_server(project, owner, attempt)
+            self._request_server(project, owner, attempt, players)
 
     def _first_attempt_if_lost(self, visit: Visit) -> int | None:
         """Return 1 if there should be a server by now, so that its start message was lost; else None."""
@@ -120,8 +128,9 @@ class GameStep:
         stuck = record.state is State.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 
-    def _request_server(self, project: Project, owner: str, attempt: int) -> None:
-        self._services.platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
+    def _request_server(self, project: Project, owner: str, attempt: int, players: int = 0) -> None:
+        start = StartServer(project.id, owner, attempt, players)
+        self._services.platform.bus.publish(Topic.START, to_message(start))
 
 
 def _page_for_program(view: pages.GameView, method: str) -> str:

@@ -39,6 +39,11 @@ class Standing:
         return self.found.session if isinstance(self.found, Membership | NoServerYet) else None
 
     @property
+    def players(self) -> int:
+        """For how many their session is; 0 if they have none, or in documents of earlier versions."""
+        return self.found.players if isinstance(self.found, Membership | NoServerYet) else 0
+
+    @property
     def is_unmatched(self) -> bool:
         """Whether they were not matched with others."""
         return isinstance(self.found, Membership) and self.found.unmatched
@@ -96,7 +101,7 @@ class SharedGame:
             return state
         if standing.is_unmatched:
             state["state"] = UNMATCHED
-        return state | {"session": True, "players": project.players, "members": found.members}
+        return state | {"session": True, "players": standing.players or project.players, "members": found.members}
 
     def _standing(self, project: Project, found: LobbyState | NoServerYet | Membership) -> Standing:
         if isinstance(found, NoServerYet):

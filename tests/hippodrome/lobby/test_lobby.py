@@ -15,7 +15,7 @@ from hippodrome.lobby.lobby import LobbyState, NoServerYet
 from hippodrome.model import ids, server, sessions
 from hippodrome.model.memberships import Membership
 from hippodrome.model.records import to_json
-from hippodrome.ports import Entry
+from hippodrome.ports import Entry, Topic
 from protocol.keys import membership_key
 from testing.port_faults import Fault
 from tests.hippodrome.lobby.interleaved import Crossing
@@ -602,7 +602,7 @@ def test_a_pair_whose_server_is_not_ready_is_formed_and_waits_for_the_first_that
     first, second = room.started()
     room.serve(first, second, state=server.State.STARTING)
     told = room.poll("ann", "bob", seconds=4)
-    assert told["ann"] == NoServerYet(first, 2, room.repository.server_of("maze", first))
+    assert told["ann"] == NoServerYet(first, 2, room.repository.server_of("maze", first), 2)
     assert (room.membership("ann"), room.stored(f"sessions/{first}/session.json")) == (None, None)
     assert [name for name in room.entries() if not name.endswith(".way")] == [], "they need no entries any more"
     room.serve(second)
@@ -972,3 +972,14 @@ def test_a_group_whose_own_requests_could_not_write_is_formed_by_others_after_a_
     if is_formed:
         room.visit("ann")
         assert room.together("ann", "bob")
+
+
+def test_each_start_message_says_for_how_many_the_session_is(room: WaitingRoom) -> None:
+    """A start that comes after another number was registered is for the number of its session."""
+    room.arrive_at_start("ann", ready=False)  # ahead
+    room.wait(200)
+    room.lobby.repair(room.project)  # the server has no record: its message may be lost
+    room.poll("bob", "cem", "dan", "eve", seconds=4)  # formed: one pair with the server ahead, one without
+    sent = [message for topic, message in room.platform.bus.sent if topic is Topic.START]
+    assert len(sent) > 3
+    assert {message["players"] for message in sent} == {2}

@@ -93,7 +93,7 @@ class WaitingRoom:
         seats = {member.user_id: member.seat for member in found.members}
         return set(seats) == set(users) and all(
             (membership := self.membership(user)) is not None
-            and replace(membership, waited=None) == Membership(found.id, seats[user], len(users))
+            and replace(membership, waited=None) == Membership(found.id, seats[user], len(users), players=found.players)
             for user in users
         )
 

@@ -7,7 +7,7 @@ import pytest
 
 from hippodrome.model import ids
 from hippodrome.model.project import AwsSetup, Events, MasterList, Project, Step, step_key
-from hippodrome.model.records import from_json
+from hippodrome.model.records import from_json, to_json
 from testing.studies import study
 
 
@@ -100,6 +100,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "warm_servers": 0,
         "signed_links": False,
         "players": 1,
+        "other_numbers": (),
         "matching": "arrival",
         "patience": 300,
         "after_patience": "unmatched",
@@ -114,3 +115,34 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
     }
     assert from_json(b'{"key": "1", "page": "a"}', Step).variants == 0
     assert from_json(b'{"id": "maze", "steps": [], "useAWS": true}', Project).use_a_w_s is True
+
+
+# ---- another number of players
+
+
+def test_a_registration_keeps_what_was_registered_last_for_each_other_number_of_players() -> None:
+    two = study(players=2, trial={"game": "two"}, task_definition="two:1", server_port=443)
+    three = study(players=3, trial={"game": "three"}, warm_servers=2).following(two)
+    again = study(players=3, trial={"game": "three, mended"}).following(three)
+    four = study(players=4, trial={"game": "four"}, game_pages={"instructions": 2}).following(again)
+    assert [each.players for each in four.other_numbers] == [2, 3]
+    assert [four.for_session(players) for players in (0, 4, 5)] == [four, four, None]
+    for players, game, task, port in ((2, "two", "two:1", 443), (3, "three, mended", None, 5000)):
+        found = four.for_session(players)
+        assert found is not None
+        assert (found.players, found.trial, found.task_definition, found.server_port) == (players, {"game": game}, task, port)  # fmt: skip
+        assert found.steps == four.steps
+    assert four.following(four).other_numbers == four.other_numbers
+    assert [each.players for each in study(players=2).following(four).other_numbers] == [3, 4]
+    assert from_json(to_json(four), Project) == four
+
+
+def test_a_session_of_another_number_gets_no_warm_server() -> None:
+    found = study(players=3, warm_servers=2).following(study(players=2, warm_servers=1)).for_session(2)
+    assert found is not None
+    assert found.warm_servers == 0
+
+
+def test_a_first_registration_and_one_after_a_study_for_one_participant_keep_nothing() -> None:
+    assert study(players=2).following(None).other_numbers == ()
+    assert study(players=2).following(study()).other_numbers == ()

@@ -299,3 +299,64 @@ def test_a_study_for_one_has_no_lobby() -> None:
     assert platform.documents.calls == ["list", "get"]
     assert waiting(platform) == NOTHING
     place.use(None)
+
+
+# Another number of players is registered
+
+THREE: dict[str, Any] = {
+    "players": 3,
+    "trial": {"game": "x", "players": {"a": "human", "b": "human", "c": "human"}, "afterAbsent": "policy", "keys": {"x": "up"}},
+}  # fmt: skip
+
+
+def register_three(platform: FakePlatform) -> None:
+    """Register the study again, as `registry.register` enters it; functions see it ten seconds later."""
+    before = study(**STUDY)
+    again = study(**{**STUDY, **THREE}).following(before)
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([again])))
+    platform.wait(seconds=11)
+
+
+def test_the_page_of_a_pair_stays_that_of_a_pair(platform: FakePlatform) -> None:
+    """Also before its server has a record, and after it has one."""
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    register_three(platform)
+    for _ in range(2):
+        page, data = ann.get(), ann.data
+        assert (data["players"], data["state"]["players"], data["state"]["members"]) == (2, 2, 2)
+        assert data["absentEnds"]
+        assert "Two people play this game together." in page
+        assert ann.poll()["players"] == 2
+        serve(platform)
+
+
+def test_the_start_message_that_a_pairs_page_sends_again_says_that_it_is_a_pair(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    register_three(platform)
+    platform.bus.sent.clear()
+    platform.wait(seconds=31)
+    ann.get()
+    [(_, message)] = platform.bus.sent
+    assert message["players"] == 2
+
+
+def test_who_waits_in_the_lobby_is_told_of_the_new_number_by_page_and_poll(platform: FakePlatform) -> None:
+    ann = Player(platform, "ann").to_game()
+    assert ann.data["players"] == 2
+    register_three(platform)
+    assert ann.poll()["players"] == 3
+    assert (ann.data["players"], ann.data["absentEnds"]) == (3, False)
+    assert "3 people play this game together." in ann.get()
+
+
+def test_a_page_that_a_pairs_registration_named_and_that_is_gone_is_left_out(platform: FakePlatform) -> None:
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    before = study(**{**STUDY, "trial": {**STUDY["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"}})
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([study(**{**STUDY, **THREE}).following(before)])))
+    platform.wait(seconds=11)
+    page = ann.get()
+    assert 'id="text-betweenEpisodes"' in page
+    assert 'id="text-instructions"' not in page

@@ -40,7 +40,7 @@ MEMBERS = ("alice", "bob")
 
 
 def pairs(**changes: object) -> Project:
-    return study(players=2, max_runtime=60, **changes)
+    return study(**{"players": 2, "max_runtime": 60, **changes})
 
 
 @pytest.fixture
@@ -612,3 +612,100 @@ def test_a_start_message_that_comes_an_hour_late_starts_no_server_that_stays(
     deliver(platform, servers)
     assert nothing_left(platform)
     assert not any(key.startswith("_lobby/") for key in platform.documents.kept)
+
+
+# Another number of players is registered
+
+
+THREE = {"players": 3, "trial": {"game": "three"}, "version": "v3", "task_definition": "three:1", "server_port": 5000}
+TWO = {"trial": {"game": "two"}, "version": "v2", "task_definition": "two:1", "server_port": 443}
+
+
+def register_as_well(platform: FakePlatform, project: Project) -> None:
+    """Register the study again, as `registry.register` enters it; functions see it ten seconds later."""
+    before = from_json(platform.documents.kept[MASTER_LIST][0], MasterList).find("maze")
+    assert before
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([project.following(before)])))
+    platform.wait(seconds=11)
+
+
+def task(platform: FakePlatform) -> tuple[str, str | None, int]:
+    """What the only task runs: the game of its trial, its definition, and its port."""
+    (request,) = platform.tasks.running.values()
+    return json.loads(request.environment["TRIAL"])["game"], request.definition, request.port
+
+
+@pytest.mark.parametrize("formed", [True, False], ids=["formed", "not formed yet"])
+def test_a_lost_server_is_replaced_for_the_sessions_own_number_of_players(formed: bool) -> None:
+    platform = installed(pairs(**TWO))
+    servers = Servers(platform)
+    if formed:
+        form(platform)
+    servers.start(StartServer("maze", SESSION, players=2))
+    runs(platform, servers)
+    register_as_well(platform, pairs(**THREE))
+    register_as_well(platform, pairs(**{**THREE, "players": 4}))
+    lose(platform, servers)
+    deliver(platform, servers)
+    assert task(platform) == ("two", "two:1", 443)
+    assert (record(platform).attempt, record(platform).players) == (2, 2)
+
+
+def test_a_number_that_is_registered_again_counts_as_it_is_registered_last() -> None:
+    platform = installed(pairs(**TWO))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", SESSION, players=2))
+    register_as_well(platform, pairs(**THREE))
+    register_as_well(platform, pairs(**{**TWO, "trial": {"game": "two, mended"}}))
+    lose(platform, servers)
+    deliver(platform, servers)
+    assert task(platform)[0] == "two, mended"
+
+
+def test_a_first_start_that_comes_late_is_for_the_number_it_was_asked_for() -> None:
+    platform = installed(pairs(**TWO))
+    servers = Servers(platform)
+    register_as_well(platform, pairs(**THREE))
+    servers.start(StartServer("maze", SESSION, players=2))
+    assert task(platform)[0] == "two"
+
+
+def test_a_function_that_has_not_read_the_new_registration_yet_reads_it_for_a_session_of_its_number() -> None:
+    platform = installed(pairs(**TWO))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", OTHER, players=2))
+    platform.tasks.running.clear()
+    project = pairs(**THREE).following(pairs(**TWO))
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))
+    servers.start(StartServer("maze", SESSION, players=3))
+    assert task(platform)[0] == "three"
+
+
+def test_a_session_of_another_number_gets_no_warm_server() -> None:
+    """Warm servers run what is registered now."""
+    platform = installed(pairs(**TWO))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", SESSION, players=2))
+    runs(platform, servers)
+    lose(platform, servers)
+    register_as_well(platform, pairs(**{**THREE, "warm_servers": 1}))
+    platform.bus.sent.clear()
+    servers.start(KeepWarm("maze"))
+    deliver(platform, servers)
+    runs(platform, servers)
+    (warm,) = open_sessions(platform)
+    servers.start(StartServer("maze", SESSION, 2))
+    assert record(platform).warm_server_name is None
+    assert record(platform).port == 443
+    servers.start(StartServer("maze", OTHER, players=3))
+    assert record(platform, OTHER).warm_server_name == warm.name
+
+
+def test_who_plays_alone_gets_what_is_registered_now() -> None:
+    platform = installed(study(trial={"game": "alone"}))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    register_as_well(platform, study(trial={"game": "alone, mended"}))
+    lose(platform, servers)
+    deliver(platform, servers)
+    assert task(platform)[0] == "alone, mended"
