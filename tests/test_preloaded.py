@@ -16,6 +16,7 @@ import pytest
 
 from hippodrome.config import read_project
 from local.check import agent
+from local.check.agent_report import last_line
 from testing import preloaded
 from tests.local.conftest import write_study
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, RUN, environment, run_experiment
@@ -165,7 +166,7 @@ def test_what_make_check_tries_an_agent_in_is_the_same_forked(tmp_path: Path, mo
     for popen in (subprocess.Popen, forked):
         monkeypatch.setattr(process_group, "Popen", popen)
         agent.try_agent(folder, read_project(folder))
-        told.append(json.loads((tmp_path / "place" / "report").read_text())["error"]["text"])
+        told.append(last_line((tmp_path / "place" / "report").read_text())["error"]["text"])
     assert isinstance(begun[0], preloaded.Forked)
     first, second = (json.loads(text.partition(": ")[2]) for text in told)
     assert first == second

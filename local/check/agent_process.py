@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import io
 import json
 import math
 import os
@@ -15,7 +16,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -43,6 +43,7 @@ from trial.server import assignment
 from trial.settings import trial_section
 
 PLAY_STEPS = 5_000  # in each group
+REPORT_BYTES = 2**20  # after which the report begins anew
 WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
 
 _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
@@ -267,10 +268,15 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], conf
 
 
 class _Progress:
-    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method."""
+    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method.
+
+    A line holds all that is known. There are two for each step, and to make a new file for each would take longer than
+    many an environment's step.
+    """
 
     def __init__(self, report: Path, folder: Path, outside: Outside) -> None:
         self._report, self._folder, self._outside = report, folder, outside
+        self._file: io.FileIO | None = None
         self.episodes = self.steps = 0
         self.matched: int | None = None
         """How many sessions `match` made of made-up people, if it was asked."""
@@ -327,13 +333,24 @@ class _Progress:
 
     def _write(self, **what: Any) -> None:
         far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
-        far["pace"], far["matched"] = asdict(self.pace), self.matched
+        far["pace"], far["matched"] = vars(self.pace), self.matched
         if self.callbacks is not None:
             far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
         if self.undrawn:
             far["undrawn"] = self.undrawn
+        self._append(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}).encode() + b"\n")
+
+    def _append(self, line: bytes) -> None:
+        with contextlib.suppress(OSError):  # the agent has closed the file
+            if self._file is not None and self._file.tell() < REPORT_BYTES:
+                self._file.write(line)
+                return
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
         part = self._report.with_suffix(".part")
-        part.write_text(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}))
+        self._file = part.open("wb", buffering=0)
+        self._file.write(line)
         part.replace(self._report)
 
 

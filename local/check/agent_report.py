@@ -28,6 +28,13 @@ _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
+def last_line(report: str) -> dict[str, Any]:
+    """What the agent's process knew last. It may have been killed while it wrote a further line. Raises ValueError."""
+    whole, _, _ = report.rpartition("\n")
+    found: dict[str, Any] = json.loads(whole.rpartition("\n")[2])
+    return found
+
+
 class AgentReport:
     """Says what the agent's process has reported."""
 
@@ -37,7 +44,7 @@ class AgentReport:
         self._code = layout.agent_folder(folder).resolve()
         self._label = label_of(folder)
         try:
-            self._report: dict[str, Any] = json.loads((place / "report").read_text())
+            self._report = last_line((place / "report").read_text())
         except (OSError, ValueError):
             self._report = {}
 

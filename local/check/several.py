@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -109,7 +109,7 @@ class Game:
                 if not progress.call("render", self._adapter.pictures):
                     return False
                 progress.pace.took(time.monotonic() - began)
-                progress.known["policies"] = {name: asdict(pace) for name, pace in self._paces.items()}
+                progress.known["policies"] = {name: vars(pace) for name, pace in self._paces.items()}
                 progress.known["takeTurns"] = self._take_turns()
                 progress.returned(now.infos.values(), now.extra)
                 callbacks.stepped(actions, now.rewards, now.observations, now.infos)

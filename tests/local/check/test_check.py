@@ -14,7 +14,9 @@ import pytest
 from hippodrome.config import read_project
 from local.backend.platform import LocalPlatform
 from local.check import agent as agent_check
-from local.check.agent_report import slowness
+from local.check import agent_process
+from local.check.agent_report import last_line, slowness
+from local.check.outside import Outside
 from local.check.pace import Pace
 from local.check.pages import check_pages
 from local.check.project import check_project
@@ -917,3 +919,33 @@ def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path)
     (line,) = looked(folder)
     assert line.startswith("config.yml:7: remark: project.events.startServerStep: every opened link starts a server")
     assert run(folder)[0] == 0
+
+
+def test_how_far_an_agent_came_is_read_from_the_last_whole_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agent_process, "REPORT_BYTES", 1_000)
+    report = tmp_path / "report"
+    progress = agent_process._Progress(report, tmp_path, Outside(None))
+    sizes = []
+    for step in range(50):
+        progress.steps = step
+        assert progress.call("step", lambda: None)
+        told = last_line(report.read_text())
+        assert (told["call"], told["steps"]) == ("step", step)
+        sizes.append(report.stat().st_size)
+    assert 1_000 < max(sizes) < 2_000, "it begins anew"
+    with report.open("a") as file:
+        file.write('{"call": "rend')
+    assert last_line(report.read_text())["steps"] == 49
+
+
+def test_an_agent_that_closes_all_files_is_reported_all_the_same(folder: Path) -> None:
+    agent(folder, "class Agent:", "import os\nclass Agent:")
+    agent(
+        folder,
+        "    def step(self, action",
+        "    def step(self, action_: int):\n        os.closerange(3, 999)\n        raise ValueError('in vain')\n    def other(self, action",
+    )
+    (said,) = tried(folder)
+    assert "in vain" in said
