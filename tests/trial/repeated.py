@@ -26,7 +26,7 @@ from trial.core.trial import Trial
 from trial.core.unfinished import RecordedTrial
 from trial.policies.places import load_policies
 from trial.recordings.recorder import rules
-from trial.recordings.recording import read_observation
+from trial.recordings.recording import read_observation, text_of_line
 from trial.recordings.resume import add_lines
 from trial.settings import Settings
 
@@ -155,7 +155,7 @@ class Game:
                 self.head = json.loads(json.dumps(rules(self.settings.trial, effect.players)))
                 effects += self.trial.recording_opened(self.now)
             elif isinstance(effect, WriteLine):
-                self.lines.append(json.loads(effect.line))
+                self.lines.append(json.loads(text_of_line(effect.line)))
             elif isinstance(effect, RecordLine):
                 self.lines.append({"kind": effect.kind, **effect.fields})
             elif isinstance(effect, AskPolicy | ResetPolicy):

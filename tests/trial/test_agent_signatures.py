@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import textwrap
+from collections import UserDict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from trial.core.actions import Action
 from trial.core.effects import StepCall
 from trial.core.players import PLAYER
 from trial.recordings import recording
+from trial.recordings.recording import text_of_line
 
 AGENT = """
 import numpy
@@ -244,7 +246,7 @@ def line_of(folder: Path, returned: str, more: str = "") -> dict[str, Any]:
     step = StepCall(
         limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={"episode": 1, "step": 1}
     )
-    return json.loads(calls.run(step).line)
+    return json.loads(text_of_line(calls.run(step).line))
 
 
 def test_the_dict_of_a_step_is_recorded_whole(tmp_path: Path) -> None:
@@ -273,7 +275,7 @@ def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [json.loads(calls.run(step).line) for _ in range(3)]
+        lines = [json.loads(text_of_line(calls.run(step).line)) for _ in range(3)]
     assert [line["extra"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": 2}] * 3
     assert [record.getMessage() for record in caplog.records] == [
         "what step() returns as 'large' is too large for the recording (2000002 bytes); its size is recorded instead"
@@ -288,7 +290,7 @@ def test_an_info_that_is_too_large_is_said_once_and_the_rest_of_it_is_recorded(
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [json.loads(calls.run(call).line) for call in (step, step)]
+        lines = [json.loads(text_of_line(calls.run(call).line)) for call in (step, step)]
     assert [line["info"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": [2]}] * 2
     assert [record.getMessage() for record in caplog.records] == [
         "'large' in info is too large for the recording (2000002 bytes); its size is recorded instead"
@@ -303,7 +305,7 @@ def test_an_info_of_many_values_leaves_no_more_than_a_mark_of_what_is_too_much(
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [calls.run(call).line for call in (step, step)]
+        lines = [text_of_line(calls.run(call).line) for call in (step, step)]
     assert max(map(len, lines)) < 1.2 * recording.MAX_EXTRA_BYTES
     kept = json.loads(lines[1])["info"]
     assert json.loads(lines[0])["info"] == kept
@@ -318,7 +320,7 @@ def test_an_info_of_fifty_megabytes_is_written_as_fast_as_another(tmp_path: Path
     player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
-    first, *others = [json.loads(calls.run(step).line)["info"] for _ in range(30)]
+    first, *others = [json.loads(text_of_line(calls.run(step).line))["info"] for _ in range(30)]
     assert first["text"] == {"tooLarge": 50_000_002}
     assert first["array"].keys() == {"tooLarge"}
     assert first["last"] == 1
@@ -337,7 +339,7 @@ for _ in range(25): deep = [deep]
     )
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     calls = AgentCalls(player, dict, record_observations=False)
-    _, after, later = [json.loads(calls.run(step).line)["info"] for _ in range(3)]
+    _, after, later = [json.loads(text_of_line(calls.run(step).line))["info"] for _ in range(3)]
     assert after == later
     assert later["on"] == {"true": [1]}
 
@@ -347,9 +349,46 @@ def test_an_info_stays_as_it_is_beside_something_large(tmp_path: Path) -> None:
     player = started(tmp_path, "return 0, 1.0, False, {}", f"return {observation}, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=True)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
-    line = json.loads(calls.run(step).line)
+    line = json.loads(text_of_line(calls.run(step).line))
     assert line["info"] == {"many": list(range(200))}
     assert len(line["observation"]) == 6_000_000
+
+
+@pytest.mark.parametrize("value", ["game.steps", "[game.steps]", "{'x': (game.steps,)}", "numpy.int64(game.steps)"])
+def test_an_info_that_the_game_changes_afterwards_stays_as_it_was(tmp_path: Path, value: str) -> None:
+    changes = f"game.steps += 1; game.info['lives'] = {value}; return 0, 1.0, False, False, game.info"
+    player = started(tmp_path, "return 0, 1.0, False, {}", changes, AGENT + "\nclass game: steps, info = 0, {}\n")
+    calls = AgentCalls(player, dict, record_observations=False)
+    step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
+    lines = [calls.run(step).line for _ in range(3)]
+    expected: dict[str, Any] = {"game.steps": [1, 2, 3], "[game.steps]": [[1], [2], [3]]}
+    expected |= {"{'x': (game.steps,)}": [{"x": [1]}, {"x": [2]}, {"x": [3]}], "numpy.int64(game.steps)": [1, 2, 3]}
+    assert [json.loads(text_of_line(line))["info"]["lives"] for line in lines] == expected[value]
+
+
+SETTLED: list[Any] = [
+    {},
+    {"lives": 3, "level": 0.5, "over": False, "who": None, "name": "x" * 1_000},
+    {2**63: -(2**63)},
+]
+UNSETTLED: list[Any] = [
+    {"a": []},
+    {"a": {}},
+    {"a": np.float32(1)},
+    {"a": "x" * 1_001},
+    {"x" * 1_001: 1},
+    {"a": 2**63 + 1},
+    {(1, 2): 1},
+    dict.fromkeys(range(101)),
+    UserDict(a=1),
+]
+
+
+def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written() -> None:
+    assert [recording.is_settled(info) for info in (*SETTLED, *UNSETTLED)] == [True] * 3 + [False] * len(UNSETTLED)
+    for info in SETTLED:
+        fields = {"step": 1, "info": info, "reward": float("nan")}
+        assert recording.LaterLine("step", fields).text() == recording.line("step", **fields)
 
 
 def test_a_circle_in_the_dict_ends_somewhere(tmp_path: Path) -> None:

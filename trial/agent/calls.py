@@ -91,14 +91,24 @@ class Calls:
     def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {"extra": self._bounded("what step() returns as %r", values)}
 
-    def _line(self, kind: str, /, **fields: Any) -> bytes:
+    def _line(self, kind: str, /, **fields: Any) -> recording.Line:
         """A line of the recording. What is too large in an `info` is replaced by its size."""
+        if self._is_settled(fields):
+            return recording.LaterLine(kind, fields | {"info": dict(fields["info"])})
         line = None if self._cut else recording.line(kind, **fields)
         if line is not None and len(line) <= recording.MAX_EXTRA_BYTES:
             return line
         cut = self._cut_infos(fields)
         self._cut = bool(cut)  # then the next line's is cut at once: to write 50 MB takes seconds
         return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
+
+    def _is_settled(self, fields: Mapping[str, Any]) -> bool:
+        """Whether all values of a line are small, and no later step can change them: those of most games are."""
+        if self._record_observations or "extra" in fields:
+            return False
+        parts = fields["players"].values() if "players" in fields else ()
+        infos = (fields["info"], *(part["info"] for part in parts if "info" in part))
+        return all(map(recording.is_settled, infos))
 
     def _cut_infos(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Those fields of a line whose infos are too large, with what is kept of them."""

@@ -1,6 +1,7 @@
 """What the core of a trial (`trial/core/trial.py`) asks its shell to do. Pure records.
 
-A connection is whatever the shell uses to name one; the core only compares it. Texts are messages of docs/wire.md.
+A connection is whatever the shell uses to name one; the core only compares it. A line is whatever it writes of a step
+or a reset; the core passes it on. Texts are messages of docs/wire.md.
 Records that are made at each step are named tuples, since frozen dataclasses take several times as long to make.
 """
 
@@ -145,7 +146,7 @@ class Begun:
     `view` is None if all players act and may do everything.
     """
 
-    line: bytes
+    line: Any
     pictures: Pictures
     view: View | None = None
 
@@ -160,7 +161,7 @@ class StepTaken(NamedTuple):
     terminated: bool
     truncated: bool
     pictures: Pictures
-    line: bytes
+    line: Any
     view: View | None = None
 
 
@@ -206,7 +207,7 @@ class OpenRecording:
 class WriteLine(NamedTuple):
     """Add a finished line to the recording."""
 
-    line: bytes
+    line: Any
 
 
 @dataclass(frozen=True, slots=True)

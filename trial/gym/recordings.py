@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from protocol.keys import recordings_folder
-from protocol.times import time_text
 from trial.gym.errors import EnvironmentFailed
 from trial.recordings import recording
 from trial.recordings.recording import Recording
@@ -132,7 +131,7 @@ class Recorded:
 
     def write(self, kind: str, **fields: Any) -> None:
         """Write a line. Raises EnvironmentFailed."""
-        now = time_text(datetime.now(UTC))
+        now = datetime.now(UTC)
         self._file.add(recording.line(kind, **self._stamp, time=now, ns=time.monotonic_ns(), **fields))
         if time.monotonic() >= self._flushed + FLUSH_SECONDS or kind == "header":
             self._flushed = time.monotonic()

