@@ -134,3 +134,9 @@ class WaitingRoom:
 
     def wait(self, seconds: float) -> None:
         self.platform.clock += timedelta(seconds=seconds)
+
+
+def waits(told: LobbyState | NoServerYet | Membership) -> LobbyState:
+    """What a participant is told who still waits."""
+    assert isinstance(told, LobbyState), told
+    return told
