@@ -143,7 +143,7 @@ def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(world: Installe
 
 
 def test_data_are_made_of_what_is_left(world: Installed, tmp_path: Path, capsys: Any) -> None:
-    from tests.export.test_run import rows
+    from tests.export.place import rows
 
     pair(world.put, tmp_path, observe=True)
     out = tmp_path / "out"

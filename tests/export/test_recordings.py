@@ -26,7 +26,7 @@ from export.scrub import Scrub, nothing
 from testing.exploration import examples
 from tests.export import data_world as made_of
 from tests.export.data_world import PROJECT, arrive, crowd, into_folder, key, record, recording_key, server
-from tests.export.test_run import rows
+from tests.export.place import rows
 from trial.recordings import recording
 
 WHO = {"participant": "p1", "studyStep": "3", "attempt": 1}

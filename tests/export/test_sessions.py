@@ -15,6 +15,7 @@ from deploy.__main__ import main
 from export.source import Folder
 from protocol.keys import membership_key, session_key, sessions_folder
 from tests.export.data_world import PROJECT, crowd, into_folder, key, register
+from tests.export.place import Place, rows
 from tests.export.session_world import (
     ANN,
     BOB,
@@ -31,7 +32,6 @@ from tests.export.session_world import (
     study,
 )
 from tests.export.test_recordings import load
-from tests.export.test_run import Place, rows
 
 
 @pytest.fixture

@@ -1,0 +1,49 @@
+"""A folder that `data` fills from the data of one machine, for tests."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from console.problem import Exit
+from deploy.__main__ import main
+from tests.deploy.installation import Ran
+from tests.export.data_world import into_folder
+
+
+class Place:
+    """A data folder as `make run` leaves it, and the folder that `data` fills from it."""
+
+    def __init__(self, tmp: Path, capsys: Any) -> None:
+        self.tmp, self._capsys = tmp, capsys
+        self.data, self.out = tmp / "data", tmp / "out"
+        self.put = into_folder(self.data)
+
+    def run(self, *more: str, out: Path | None = None) -> Ran:
+        self._capsys.readouterr()
+        code = main(["data", str(out or self.out), "--project", "maze", "--from", str(self.data), *more])
+        printed = self._capsys.readouterr()
+        assert "This should not have happened" not in printed.err, printed.err
+        return Ran(code, printed.out, printed.err)
+
+    def rows(self, name: str = "answers") -> list[dict[str, str]]:
+        return rows(self.out / f"{name}.csv")
+
+    def listed(self) -> dict[str, str]:
+        """The manifest's files, and their hashes."""
+        return {line["path"]: line["sha256"] for line in json.loads((self.out / "manifest.json").read_text())["files"]}
+
+    def done(self, *more: str) -> dict[str, Any]:
+        """What a run that succeeds says it did."""
+        ran = self.run("--json", *more)
+        assert ran.code == Exit.DONE, ran.err
+        assert self.run("--check").code == Exit.DONE
+        found: dict[str, Any] = ran.json
+        return found
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        return list(csv.DictReader(file))
