@@ -127,6 +127,9 @@ def remarks(config: Config) -> Iterator[Remark]:
     if trial.absent == 0 and trial.after_absent == "end":
         said = "0: a connection that is lost for a moment ends the game for all; write absent: 30"
         yield Remark(("trial", "absent"), said)
+    if trial.gather == 0 and trial.after_absent == "end":
+        said = "0: the game ends for the first participant who comes, since nobody waits for the others"
+        yield Remark(("trial", "gather"), f"{said}; write gather: 120, or afterAbsent: policy with a substitute")
 
 
 def _without_keys(trial: Trial) -> Iterator[Remark]:

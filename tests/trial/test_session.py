@@ -480,20 +480,64 @@ def test_policies_do_not_play_while_the_only_member_is_still_measured():
     assert driver.told(1)["people"] == {"left": "policy", "right": "here"}
 
 
-@pytest.mark.parametrize("seconds", [1, 10])
-def test_a_member_who_is_still_measured_when_their_time_is_over_gets_their_place_back(seconds):
-    """Before the game has begun without them, or in the game."""
-    driver = SessionDriver(maxPing=100, pingSamples=2, **POLICY).come(0).trip(0, 0.02).trip(0, 0.02).wait(59.9)
-    driver.come(1).trip(1, 0.02).wait(seconds)
+@pytest.mark.parametrize("gather", [0, 0.05])
+def test_with_little_time_to_gather_each_member_is_measured_and_plays_from_then_on(gather):
+    """A policy plays in the place of the second until they come, and never in that of the first."""
+    driver = SessionDriver(maxPing=100, pingSamples=3, gather=gather, **POLICY).come(0).wait(0.1)
+    assert driver.told(0)["people"] == {"left": "awaited", "right": "policy"}
+    driver.come(1)
+    for number in (0, 1) * 3:
+        driver.wait(0.2).trip(number, 0.05)
+    assert driver.wait(3.2).taken
+    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert ("left", "replaced") not in driver.presence()
+
+
+@pytest.mark.parametrize("max_ping", [0, 100])
+def test_with_no_time_to_gather_the_game_is_over_for_the_first_who_comes_and_that_is_not_their_fault(max_ping):
+    """Who is not connected is not waited for at all; `make check` says so."""
+    driver = SessionDriver(gather=0, maxPing=max_ping).come(0)
+    assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
+    assert driver.errors(0) == [PARTNER_MISSING]
+
+
+def test_the_time_of_a_member_does_not_run_while_their_round_trip_is_measured():
+    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).trip(0, 0.02).trip(0, 0.02).wait(59.9)
+    driver.come(1).trip(1, 0.02).wait(10)
+    assert "heldFor" not in driver.told(0)
+    assert driver.told(0)["people"]["right"] == "awaited"
+    assert driver.trip(1, 0.02).wait(3.2).taken
+
+
+def test_it_runs_on_if_they_go_meanwhile():
+    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).trip(0, 0.02).trip(0, 0.02).wait(30)
+    driver.come(1).trip(1, 0.02).wait(100).go(1)
+    assert driver.told(0)["heldFor"] == 30
+    assert driver.wait(30).outcomes == {"P0": "partnerLeft", "P1": "left"}
+
+
+@pytest.mark.parametrize("section", [{}, {"absent": 0}, {"gather": 3}], ids=str)
+def test_who_reconnects_and_is_never_measured_does_not_hold_the_others_for_ever(section):
+    driver = SessionDriver(maxPing=100, pingSamples=2, **section).come(0).trip(0, 0.02).trip(0, 0.02)
+    for _ in range(30):
+        driver.come(1).wait(9).go(1)
+    assert driver.trial.progress.over
+
+
+@pytest.mark.parametrize(("samples", "until"), [(1, 1), (2, 2), (3, 2), (5, 3), (100, 51)])
+def test_who_never_answers_is_refused_as_soon_as_that_is_certain(samples, until):
+    driver = SessionDriver(maxPing=100, pingSamples=samples, **POLICY).come(0, 1)
+    for number in range(samples):
+        driver.trip(0, 0.02)
+        if number < until:
+            assert driver.told(1)["people"]["right"] == "awaited"
+            driver.trip(1, 10.0)
     assert driver.told(0)["people"]["right"] == "policy"
-    driver.trip(1, 0.02).wait(4).say(1, action="up", held=True).wait(0.2)
-    assert driver.told(0)["people"]["right"] == "here"
-    assert driver.taken[-1].actions["right"].by == "human"
-    assert driver.presence()[-2:] == [("right", "replaced"), ("right", "returned")]
+    assert driver.errors(1) == [PING]
 
 
 def test_a_round_trip_that_comes_after_the_end_changes_no_outcome():
-    driver = SessionDriver(maxPing=100, pingSamples=1).come(0).trip(0, 0.02).wait(59.9).come(1)
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0).trip(0, 0.02).wait(59.9)
     driver.say(0, command="good").now += 1
     driver.event("advance", driver.now)  # the agent hears the last feedback
     driver.event("round_trip", "P1", 9.0, driver.now)

@@ -2,7 +2,7 @@
 
 The game goes on while every member is here, or a policy plays in their place. Otherwise it is held. A member may be
 missing for `gather` seconds before the game, and then for `absent` seconds. This time runs while another member waits,
-and stops while all are gone. A member who plays gets used time back little by little, so a member who comes and goes
+and stops while all are gone, or while the member is here and their round trip is measured. A member who plays gets used time back little by little, so a member who comes and goes
 cannot hold the others for ever. Before the game begins, and after each hold, there is a countdown. All times are
 seconds of one monotonic clock, which is passed in.
 """
@@ -19,7 +19,8 @@ Where = Literal["here", "reads", "awaited", "away", "policy"]
 """What the others are told of a player. reads: here, but still at the page before the game or between two episodes;
 awaited: has not come yet; away: was here."""
 LEAST_ABSENCE = 3.0
-"""An absence uses so many seconds at least, or a third of `absent`: the countdown begins anew after it."""
+"""An absence uses so many seconds at least, or a third of `absent`, before the game of `gather`: the countdown begins
+anew after it."""
 GIVEN_BACK = 0.25
 """So many seconds of their time a member has again for each second of play."""
 Over = Literal["absent", "ping"]
@@ -53,6 +54,11 @@ class _Member:
     @property
     def missing(self) -> bool:
         return self.over is None and not self.here
+
+    @property
+    def gone(self) -> bool:
+        """The clock runs; it does not while they are measured, which takes ten seconds for each sample at most."""
+        return self.over is None and not self.takes_part
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,16 +159,19 @@ class Presence:
         self.paused = True
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The member's browser has answered a ping. Before the game, the first samples decide whether they may play."""
-        member = self._members[player]
+        """The member's browser has answered a ping. Before the game, the first samples decide whether they may play.
+
+        Whoever has more than half of them too long is refused at once.
+        """
+        member, rules = self._members[player], self.rules
         member.samples.append(seconds)
-        if not member.measured and len(member.samples) == self.rules.ping_samples:
+        if member.measured:
+            return
+        too_long = sum(each * 1000 > rules.max_ping for each in member.samples) > rules.ping_samples // 2
+        if too_long or len(member.samples) == rules.ping_samples:
             member.measured = True
-            if _median(member.samples) * 1000 > self.rules.max_ping:
+            if too_long or _median(member.samples) * 1000 > rules.max_ping:
                 member.over = "ping"
-            self._changed(now)
-        if member.over == "absent" and member.here:  # their time was over while they were measured
-            member.over = None
             self._changed(now)
 
     def page(self) -> None:
@@ -295,16 +304,16 @@ class Presence:
         self._tell()
         waits = self.waits
         for member in self._members.values():
-            if member.missing and waits:
+            if member.gone and waits:
                 if member.until is None:
                     member.until = now + self.time_left(member.player)
             elif member.until is not None:
-                least = 0.0 if member.missing else self._least
+                least = 0.0 if member.gone else self._least
                 member.left, member.until = max(0.0, min(member.until - now, member.left - least)), None
 
     @property
     def _least(self) -> float:
-        return min(LEAST_ABSENCE, self.rules.absent / 3)
+        return min(LEAST_ABSENCE, (self.rules.absent if self.begun else self.rules.gather) / 3)
 
     def _give_time_back(self, now: float) -> None:
         """Members who have played since the last call get some of their time back. Call it before a change."""

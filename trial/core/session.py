@@ -164,13 +164,11 @@ class Session:
         self._progress.choices.said_at(player, int(now * 1e9))
         return True
 
-    def _takes_back(self, player: str) -> bool:
-        """If a policy plays for a member who is waited for again, they play from now on; whether that is so."""
-        if player not in self._replaced or self.presence.over(player) is not None:
-            return False
-        self._replaced.discard(player)
-        self._progress.choices.policies.give_back(player)
-        return True
+    def _takes_back(self, player: str) -> None:
+        """If a policy plays for a member who is waited for again, they play from now on."""
+        if player in self._replaced and self.presence.over(player) is None:
+            self._replaced.discard(player)
+            self._progress.choices.policies.give_back(player)
 
     def _turned_away(self, player: str) -> None:
         self._progress.choices.let_go(player)
@@ -202,8 +200,6 @@ class Session:
         if self._progress.over:
             return  # too late: the outcomes stand
         self.presence.round_trip(player, seconds, now)
-        if self._takes_back(player):
-            self._record(player, "returned")
         if self.presence.begun:
             self._line("ping", {"roundTrip": {player: round(seconds * 1000)}})
 

@@ -169,6 +169,11 @@ def test_nothing_is_said_of_two_people_who_wait_play_and_leave(folder: Path) -> 
             "", "absent: 0\n",
             "trial.absent: 0: a connection that is lost for a moment ends the game for all; write absent: 30",
         ),
+        (
+            "", "gather: 0\n",
+            "trial.gather: 0: the game ends for the first participant who comes, since nobody waits for the others; "
+            "write gather: 120, or afterAbsent: policy with a substitute",
+        ),
     ],
 )  # fmt: skip
 def test_what_works_but_may_not_be_meant(folder: Path, project: str, trial: str, said: str) -> None:
