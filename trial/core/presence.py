@@ -2,9 +2,9 @@
 
 The game goes on while every member is here, or a policy plays in their place. Otherwise it is held. A member may be
 missing for `gather` seconds before the game, and then for `absent` seconds. This time runs while another member waits,
-and stops while all are gone, or while the member is here and their round trip is measured. A member who plays gets used time back little by little, so a member who comes and goes
-cannot hold the others for ever. Before the game begins, and after each hold, there is a countdown. All times are
-seconds of one monotonic clock, which is passed in.
+and stops while all are gone, or while the member is here and their round trip is measured. A member who plays gets used
+time back little by little, so a member who comes and goes cannot hold the others for ever. Before the game begins, and
+after each hold, there is a countdown. All times are seconds of one monotonic clock, which is passed in.
 """
 
 from __future__ import annotations
