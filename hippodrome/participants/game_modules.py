@@ -36,9 +36,6 @@ MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
 TOGETHER = ("people.js", "lobby.js")
 """The modules of a game that several participants play together. `lobby.js` is last: what stands behind it waits."""
 
-OF_SOME = (*MODULES, *TOGETHER)
-"""All modules that are not part of every project's page."""
-
 
 def of(project: Project) -> tuple[str, ...]:
     """The names of the modules that a project needs besides those of every project."""

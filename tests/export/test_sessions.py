@@ -8,7 +8,6 @@ from typing import Any
 
 import pyarrow.dataset
 import pyarrow.parquet as pq
-import pytest
 
 from console.problem import Exit
 from deploy.__main__ import main
@@ -32,11 +31,6 @@ from tests.export.session_world import (
     study,
 )
 from tests.export.test_recordings import load
-
-
-@pytest.fixture
-def place(tmp_path: Path, capsys: Any) -> Place:
-    return Place(tmp_path, capsys)
 
 
 def table(out: Path, *columns: str) -> list[dict[str, Any]]:
