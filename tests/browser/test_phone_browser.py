@@ -42,7 +42,7 @@ def play(world: World, phone: Any, size: tuple[int, int], trial: dict[str, Any],
     world.trial = {**trial, "scene": scene, "ui": dict.fromkeys(ui, True)}
     world.controls = {
         "UI": ui, "scene": scene, "assets": [], "maxEpisodes": 3, "actionSpace": ["noop", "up", "left", "right", "down", "wait"],
-        **{key: trial[key] for key in ("pace", "keys") if key in trial},
+        **{key: trial[key] for key in ("pace", "keys", "labels") if key in trial},
     }  # fmt: skip
 
     world.step = 2
@@ -99,6 +99,25 @@ def test_words_above_the_picture_go_on_in_a_second_line(world: World, phone: Any
     phone.wait_for_selector("#total:text('Total 123,456')")
     shot(phone, "568-turns")
     assert all(box(phone, f"#{each}")["x"] + box(phone, f"#{each}")["width"] <= 568 for each in ("turn", "scene-hud"))
+    assert overflow(phone) == [0, 0]
+
+
+@pytest.mark.parametrize("size", [(360, 640), (568, 320)], ids=str)
+@pytest.mark.parametrize("keys", [{}, {"keys": {"ArrowLeft": "left", "ArrowUp": "up", "ArrowRight": "right"}}])
+def test_an_arrow_has_the_projects_text_below_it(
+    world: World, phone: Any, size: tuple[int, int], keys: dict[str, Any]
+) -> None:
+    labels = {"left": "Nach links", "up": "Rudern!"}
+    play(world, phone, size, {**keys, "labels": labels}, ["up", "left", "right", "start"])
+    shot(phone, f"{size[0]}-labels-{len(keys)}")
+    assert [phone.inner_text(f".pad .{name} small") for name in labels] == list(labels.values())
+    assert phone.locator(".pad .right small").count() == 0
+    for name in labels:
+        button, text = box(phone, f".pad .{name}"), box(phone, f".pad .{name} small")
+        assert button["x"] <= text["x"]
+        assert text["x"] + text["width"] <= button["x"] + button["width"]
+        assert text["y"] + text["height"] <= button["y"] + button["height"]
+        assert phone.evaluate("(each => each.scrollHeight <= each.clientHeight + 1)(document.querySelector('.pad small'))")
     assert overflow(phone) == [0, 0]
 
 

@@ -50,8 +50,14 @@ def shows(page: Any, selector: str, text: str) -> None:
 
 
 def fits(page: Any) -> None:
-    """What covers the picture is there to be seen whole."""
-    assert page.evaluate("(each => each.scrollHeight <= each.clientHeight)(document.getElementById('overlay'))")
+    """What covers the picture, or the window, is no higher than that, and its words are seen whole."""
+    assert page.evaluate(
+        """() => {
+            const each = document.getElementById("overlay"), covers = getComputedStyle(each).position === "fixed";
+            const most = covers ? innerHeight : each.parentElement.getBoundingClientRect().height;
+            return each.scrollHeight <= each.clientHeight && each.getBoundingClientRect().height <= most + .5;
+        }"""
+    )
 
 
 def waited_for(world: World, polls: int) -> None:
@@ -440,6 +446,33 @@ def test_whoever_is_still_measured_is_not_told_that_they_were_away(together: Wor
     together.connections[0].send(json.dumps(together.stands))
     tab.wait_for_selector("#overlay-title:text-is('One moment, please')")
     assert tab.inner_text("#overlay-hint") == "The game begins as soon as everybody is here."
+
+
+@pytest.mark.parametrize(("width", "height"), [*SIZES, (640, 360)])
+def test_what_stands_on_a_low_picture_is_seen_whole(together: World, tab: Any, width: int, height: int) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    low = {"width": 600, "height": 60}
+    together.trial, together.spoken = {"scene": low}, "hippodrome.3"
+    together.controls |= {"scene": low, "assets": []}
+    running(together, tab)
+    drawn = json.dumps({"new": True, "set": {}, "hud": "nothing yet"})
+    together.connections[0].send(struct.pack("!BI", 4, 3) + drawn.encode())
+    tab.wait_for_function("document.getElementById('screen').getBoundingClientRect().height < 80")
+    tell(together, state="paused", heldFor=8, **people(red="away"))
+    shows(tab, "#overlay-hint", "If they are not here in")
+    assert tab.evaluate(SEEN_WHOLE, "overlay")
+    shot(tab, f"{width}-low-picture")
+    tell(together, state="playing", **people(red="here"))
+    shows(tab, "#trouble", "The other participant is back.")
+    assert tab.evaluate(SEEN_WHOLE, "trouble")
+
+
+SEEN_WHOLE = """id => {
+    const found = document.getElementById(id), box = found.getBoundingClientRect(), x = (box.left + box.right) / 2;
+    found.style.pointerEvents = "auto";
+    const seen = (y) => found.contains(document.elementFromPoint(x, y));
+    return found.scrollHeight <= found.clientHeight && seen(box.top + 2) && seen(box.bottom - 2);
+}"""
 
 
 def test_players_have_the_names_that_the_researcher_gives_them(together: World, tab: Any) -> None:
