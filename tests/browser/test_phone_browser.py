@@ -117,7 +117,9 @@ def test_an_arrow_has_the_projects_text_below_it(
         assert button["x"] <= text["x"]
         assert text["x"] + text["width"] <= button["x"] + button["width"]
         assert text["y"] + text["height"] <= button["y"] + button["height"]
-        assert phone.evaluate("(each => each.scrollHeight <= each.clientHeight + 1)(document.querySelector('.pad small'))")
+        assert phone.evaluate(
+            "(each => each.scrollHeight <= each.clientHeight + 1)(document.querySelector('.pad small'))"
+        )
     assert overflow(phone) == [0, 0]
 
 
