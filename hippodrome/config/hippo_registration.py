@@ -18,7 +18,7 @@ _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back
     "signedLinks", "maxParticipants", "maxServers", "maxServerHours", "warmServers", "allowedHosts", "cluster",
     "subdomain", "plainClients", "frontEnd", "taskDefinition", "serverPort",
-    "players", "matching", "patience", "afterPatience",
+    "players", "matching", "seats", "patience", "afterPatience",
 )  # fmt: skip
 _SHOWN = frozenset(_KEPT) - {"taskDefinition", "serverPort"}  # what a config.yml may say
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"

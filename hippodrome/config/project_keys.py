@@ -17,7 +17,7 @@ from hippodrome.config import fargate
 from hippodrome.config.diagnostics import Keys
 from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
-from hippodrome.model.matching import MATCHED_BY, MATCHINGS
+from hippodrome.model.matching import MATCHED_BY, MATCHINGS, SEATS
 from hippodrome.model.step_order import FINAL
 from protocol import values
 from protocol.session import MOST_PLAYERS
@@ -290,6 +290,8 @@ class Project(Model):
     """Participants who play together in one environment. 1: each plays alone, on a server of their own."""
     matching: Annotated[str | dict[str, str], Rule(who_with_whom, _MATCHING)] = "arrival"
     """Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py."""
+    seats: Annotated[str, one_of(*SEATS)] = "lot"
+    """Who plays which player: by lot, in the order of the groups, or in the order in which match named them."""
     patience: Annotated[float, Rule(values.number(10, 3600), {"type": "number", "minimum": 10, "maximum": 3600})] = 300
     """Seconds after which a participant no longer waits in the lobby for others."""
     after_patience: Annotated[str, one_of("unmatched", "policies")] = "unmatched"

@@ -16,10 +16,12 @@ from protocol.values import printable
 
 PLAYERS: Keys = ("project", "players")
 MATCHING: Keys = ("project", "matching")
+SEATS: Keys = ("project", "seats")
 WHO_PLAYS: Keys = ("trial", "players")
 
 OF_SESSIONS: tuple[Keys, ...] = (
     MATCHING,
+    SEATS,
     ("project", "patience"),
     ("project", "afterPatience"),
     *(("trial", key) for key in SESSION_KEYS),
@@ -41,16 +43,19 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
     yield from _humans(checked)
     yield from _one_game_for_all(checked)
     yield from _empty_places(checked)
+    yield from _seats(checked)
     yield from _names(checked)
 
 
 def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
     """What does not go together with the number of groups, which the versions of pages make; 0 if there are none."""
     project = checked.root.project
-    if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or project.matching not in ("group", "mixed"):
+    if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return
-    if not groups:
-        pages = "write two versions of a page, such as rules-0.html and rules-1.html"
+    pages = "write two versions of a page, such as rules-0.html and rules-1.html"
+    if project.seats == "group" and project.matching == "match" and checked.valid(SEATS):
+        yield Mistake(SEATS, f"group, and there are no groups; {pages}, or seats: match")
+    if project.matching in ("group", "mixed"):
         yield Mistake(MATCHING, f"{project.matching}, and there are no groups; {pages}, or matching: arrival")
 
 
@@ -91,6 +96,23 @@ def _empty_places(checked: Checked) -> Iterator[Mistake]:
     if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
         what = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
         yield Mistake(path, f"missing; {what}")
+
+
+def _seats(checked: Checked) -> Iterator[Mistake]:
+    """Seats that are not drawn by lot follow from how people are matched, and all of them are taken."""
+    project = checked.root.project
+    if project.seats == "lot" or not checked.valid(SEATS, MATCHING):
+        return
+    if project.seats == "match" and project.matching != "match":
+        yield Mistake(SEATS, "match, and no function says who plays with whom; write matching: match, or seats: lot")
+    elif project.seats == "group" and project.matching not in ("mixed", "match"):
+        said = (
+            "group, and a game is not of different groups; write matching: mixed or match under project, or seats: lot"
+        )
+        yield Mistake(SEATS, said)
+    elif project.after_patience == "policies" and checked.valid(("project", "afterPatience")):
+        said = "and with afterPatience: policies a game may lack people, whose places are always the last ones"
+        yield Mistake(SEATS, f"{project.seats}, {said}; write seats: lot, or afterPatience: unmatched")
 
 
 def _names(checked: Checked) -> Iterator[Mistake]:

@@ -49,7 +49,8 @@ def _wished(free: Sequence[Waiting], project: Project, wished: Sequence[Sequence
     sessions: list[Sequence[Waiting]] = []
     for labels in wished:
         if len(set(labels)) == project.players and all(label in waiting for label in labels):
-            sessions.append(sorted((waiting.pop(label) for label in set(labels)), key=lambda one: one.order))
+            members = [waiting.pop(label) for label in dict.fromkeys(labels)]
+            sessions.append(members if project.seats == "match" else sorted(members, key=lambda one: one.order))
     return sessions
 
 

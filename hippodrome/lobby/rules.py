@@ -6,6 +6,7 @@ Each rule makes the next version of the document of decisions (`decisions.py`) o
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from datetime import datetime, timedelta
@@ -143,23 +144,37 @@ def _with_proposals(
 # Decisions for good
 
 
-def form(document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime) -> Decisions:
+def form(
+    document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime, seats: str = "lot"
+) -> Decisions:
     """Form the proposed session with these members, unless it stands no longer as it was proposed to them.
 
-    Seats are drawn by lot, from the session's random id: else who comes first, and is perhaps more eager, would always
-    play the same player.
+    `seats` says who plays which player (`project.seats`).
     """
     found = next((each for each in document.proposed if each.id == proposal_id), None)
     if found is None or found.labels != tuple(member.label for member in members):
         return document
-    lot = found.session_id
-    drawn = sorted(members, key=lambda member: hashlib.sha256(f"{lot}\0{member.label}".encode()).digest())
-    formed = Formed(lot, tuple(drawn), now, found.ahead is not None, found.ahead, found.players)
+    seated = _seated(members, found.session_id, seats)
+    formed = Formed(found.session_id, seated, now, found.ahead is not None, found.ahead, found.players)
     return msgspec.structs.replace(
         document,
         proposed=tuple(each for each in document.proposed if each is not found),
         formed=(*document.formed, formed),
     )
+
+
+def _seated(members: Sequence[Matched], lot: str, seats: str) -> tuple[Matched, ...]:
+    """The members in the order of their seats.
+
+    By lot, from the session's random id: else who comes first, and is perhaps more eager, would always play the same
+    player. It also decides between members of one group.
+    """
+    if seats == "match":
+        return tuple(members)
+    drawn = sorted(members, key=lambda member: hashlib.sha256(f"{lot}\0{member.label}".encode()).digest())
+    if seats == "group":
+        drawn.sort(key=lambda member: math.inf if member.group is None else member.group)
+    return tuple(drawn)
 
 
 def give_up(document: Decisions, one: Unmatched) -> Decisions:

@@ -62,7 +62,7 @@ class Run:
         document = rules.without_done(document, self.entries.done)
         document = rules.without_proposals(document, self.broken)
         for proposal_id, found in self.members.items():
-            document = rules.form(document, proposal_id, found, self.now)
+            document = rules.form(document, proposal_id, found, self.now, self.project.seats)
         document = rules.decide(
             document,
             self.entries,

@@ -10,6 +10,10 @@ MATCHINGS = ("arrival", "group", "mixed", MATCH)
 MATCHED_BY = ("same", "different")
 """By what they answered in a field of an earlier page."""
 
+SEATS = ("lot", "group", "match")
+"""Who of a session plays which player: by lot, by the number of the group, or in the order in which `match` names
+the members."""
+
 
 def field_of(matching: str | Mapping[str, str]) -> str | None:
     """The field of an earlier page whose answers decide; None if none does."""

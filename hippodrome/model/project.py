@@ -101,6 +101,7 @@ class Project(Record, frozen=True):
     signed_links: bool = False
     players: int = 1  # participants of one session; 1: each participant has a server of their own
     matching: str | dict[str, str] = "arrival"  # who plays with whom: see `matching.py`
+    seats: str = "lot"  # who plays which player: see `matching.py`
     patience: float = 300  # seconds in the lobby
     after_patience: str = "unmatched"  # or `policies`
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)

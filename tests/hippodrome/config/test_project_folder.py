@@ -113,6 +113,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "players": 1,
         "matching": "arrival",
         "patience": 300,
+        "seats": "lot",
         "afterPatience": "unmatched",
         "gamePages": {},
         "trial": {

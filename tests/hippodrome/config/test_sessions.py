@@ -88,6 +88,24 @@ def test_two_people_in_one_game(folder: Path) -> None:
             "players: 1",
         ),
         (
+            "seats: group\n", TWO,
+            "project.seats: group, and a game is not of different groups; write matching: mixed or match under project, "
+            "or seats: lot",
+        ),
+        (
+            "matching: mixed\nseats: match # by group\n", TWO,
+            "project.seats: match, and no function says who plays with whom; write matching: match, or seats: lot",
+        ),
+        (
+            "matching: mixed\nseats: group\nafterPatience: policies\n", TWO + "substitute: random\n",
+            "project.seats: group, and with afterPatience: policies a game may lack people, whose places are always the "
+            "last ones; write seats: lot, or afterPatience: unmatched",
+        ),
+        (
+            "seats: first\n", TWO,
+            'project.seats: must be lot or group or match, not "first"',
+        ),
+        (
             "subdomain: userId\n", TWO,
             "project.subdomain: a server is several participants', so it cannot be called after one: use subdomain: hash",
         ),
@@ -106,6 +124,20 @@ def test_what_does_not_go_together(folder: Path, project: str, trial: str, said:
 def test_each_of_three_groups_has_its_players(folder: Path) -> None:
     trial = "players: {0: {a: human, b: human}, 1: {a: human, b: human, c: random}, 2: {b: human, a: human}}\n"
     assert read(folder, pair("matching: group\n", trial, GROUPS)).project.matching == "group"
+
+
+@pytest.mark.parametrize(("matching", "seats"), [("mixed", "group"), ("match", "group"), ("match", "match")])
+def test_seats_may_follow_from_groups_or_from_a_function(folder: Path, matching: str, seats: str) -> None:
+    project = read(folder, pair(f"matching: {matching}\nseats: {seats}\n", TWO, GROUPS)).project
+    assert (project.matching, project.seats) == (matching, seats)
+
+
+def test_seats_by_group_need_groups(folder: Path) -> None:
+    said = one(folder, pair("matching: match\nseats: group\n"))
+    assert said == (
+        "project.seats: group, and there are no groups; write two versions of a page, such as rules-0.html and "
+        "rules-1.html, or seats: match"
+    )
 
 
 @pytest.mark.parametrize("matching", ["group", "mixed"])

@@ -60,6 +60,16 @@ def test_seats_are_drawn_by_lot_so_that_who_came_first_is_not_always_the_same_pl
     assert 12 < sum(one.seat for one in memberships if one) < 48  # one of some 10 million such rooms is beyond
 
 
+def test_with_seats_by_group_each_is_the_player_of_their_group() -> None:
+    users = [f"u{n}" for n in range(20)]
+    groups = {user: n % 3 % 2 for n, user in enumerate(users)}
+    room = WaitingRoom(pairs(matching="mixed", seats="group"), groups=groups)
+    room.poll(*users, seconds=6)
+    seats = {user: membership.seat for user in users if (membership := room.membership(user)) is not None}
+    assert len(seats) >= 10
+    assert seats == {user: groups[user] for user in seats}
+
+
 def test_a_membership_says_how_long_the_participant_had_waited(room: WaitingRoom) -> None:
     room.visit("zoe")
     room.wait(1)

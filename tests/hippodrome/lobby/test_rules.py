@@ -366,6 +366,29 @@ def test_seats_are_drawn_by_lot_by_every_run_alike() -> None:
     assert min(first[label] for label in "abc") > 150
 
 
+def test_seats_by_group_are_drawn_by_lot_within_a_group_only() -> None:
+    members = (Matched("a", "A", 1), Matched("b", "B"), Matched("c", "C", 0), Matched("d", "D", 0))
+    orders = set()
+    for n in range(60):
+        document = Decisions(proposed=(proposal("abcd", name=f"p{n}"),))
+        [found] = rules.form(document, f"p{n}", members, NOW, "group").formed
+        orders.add("".join(found.labels))
+    assert orders == {"cdab", "dcab"}
+
+
+def test_seats_are_those_in_which_the_members_were_wished() -> None:
+    project = pairs(players=3, matching="match", seats="match")
+    document = decide(lobby(*in_turn("abcd")), project=project, wished=[["d", "a", "c"]])
+    [found] = document.proposed
+    assert found.labels == ("d", "a", "c")
+    members = tuple(Matched(label, label.upper()) for label in found.labels)
+    assert rules.form(document, found.id, members, NOW, "match").formed[0].labels == ("d", "a", "c")
+    [by_lot] = decide(
+        lobby(*in_turn("abcd")), project=pairs(players=3, matching="match"), wished=[["d", "a", "c"]]
+    ).proposed
+    assert by_lot.labels == ("a", "c", "d")
+
+
 def test_a_formed_session_has_the_id_of_the_server_that_was_started_ahead() -> None:
     document = Decisions(proposed=(proposal("ab", ahead=Ahead("o", ago(60))),))
     done = rules.form(document, "p", (Matched("a", "A"), Matched("b", "B")), NOW)

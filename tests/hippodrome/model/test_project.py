@@ -103,6 +103,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "other_numbers": (),
         "matching": "arrival",
         "patience": 300,
+        "seats": "lot",
         "after_patience": "unmatched",
         "trial": {},
         "task_definition": None,
