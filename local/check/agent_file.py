@@ -11,7 +11,7 @@ from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.config.layout import AGENT
 from hippodrome.model.matching import MATCH
 from local.check.wording import short
-from trial.agent.callbacks import NAMES
+from trial.agent.callback_names import NAMES
 
 
 def label_of(folder: Path) -> str | None:

@@ -12,7 +12,8 @@ import pytest
 
 from protocol import exits
 from trial.agent.agent import AgentAdapter
-from trial.agent.callbacks import MOST_VALUES, NAMES, About, Callbacks, Session, listening
+from trial.agent.callback_names import NAMES
+from trial.agent.callbacks import MOST_VALUES, About, Callbacks, Session, listening
 from trial.recordings import recording
 
 ABOUT = About("trial-1", "3", 1)

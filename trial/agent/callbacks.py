@@ -15,34 +15,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from trial.agent.callback_names import (
+    EPISODE_END,
+    EPISODE_START,
+    FEEDBACK,
+    NAMES,
+    SESSION_END,
+    SESSION_START,
+    TICK,
+)
 from trial.core.players import PLAYER
 from trial.recordings import recording
 from trial.recordings.recorded_values import text_of
 
 log = logging.getLogger("trial")
-
-SESSION_START = "on_session_start"
-SESSION_END = "on_session_end"
-EPISODE_START = "on_episode_start"
-EPISODE_END = "on_episode_end"
-TICK = "on_tick"
-FEEDBACK = "on_feedback"
-JOIN = "on_join"
-LEAVE = "on_leave"
-RETURN = "on_return"
-LOBBY_TIMEOUT = "on_lobby_timeout"
-NAMES = (
-    SESSION_START,
-    SESSION_END,
-    EPISODE_START,
-    EPISODE_END,
-    TICK,
-    FEEDBACK,
-    JOIN,
-    LEAVE,
-    RETURN,
-    LOBBY_TIMEOUT,
-)
 
 MOST_VALUES = 1_000
 """Values that one call of a callback may record."""

@@ -1,0 +1,26 @@
+"""The names of callbacks, the methods of the researcher's agent that are told what happens (`callbacks.py`)."""
+
+from __future__ import annotations
+
+SESSION_START = "on_session_start"
+SESSION_END = "on_session_end"
+EPISODE_START = "on_episode_start"
+EPISODE_END = "on_episode_end"
+TICK = "on_tick"
+FEEDBACK = "on_feedback"
+JOIN = "on_join"
+LEAVE = "on_leave"
+RETURN = "on_return"
+LOBBY_TIMEOUT = "on_lobby_timeout"
+NAMES = (
+    SESSION_START,
+    SESSION_END,
+    EPISODE_START,
+    EPISODE_END,
+    TICK,
+    FEEDBACK,
+    JOIN,
+    LEAVE,
+    RETURN,
+    LOBBY_TIMEOUT,
+)
