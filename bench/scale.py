@@ -27,10 +27,11 @@ from testing.simulation import faults
 from testing.simulation.assumptions import assumptions, changed
 from testing.simulation.aws_bound import aws_alone
 from testing.simulation.cloud import CONCURRENCY, QUOTAS
+from testing.simulation.conditions import Conditions
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import Hippo
 from testing.simulation.people import Person, Visit
-from testing.simulation.ports import ADDRESSES, Conditions
+from testing.simulation.tasks import ADDRESSES
 from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, World
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026

@@ -27,8 +27,8 @@ from testing.clock import EPOCH
 from testing.quiet_log import quiet
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.aws_bound import aws_alone_together
+from testing.simulation.conditions import Conditions
 from testing.simulation.members import Habits, Member
-from testing.simulation.ports import Conditions
 from testing.simulation.world import PROJECT, World
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026

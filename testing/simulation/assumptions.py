@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from testing.simulation import functions, ports
+from testing.simulation import functions
 from testing.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
+from testing.simulation.conditions import SLOW_FOR, Conditions
 from testing.simulation.people import POLLS
-from testing.simulation.ports import DEPROVISIONED, MAX_CHANGES, Conditions
+from testing.simulation.ports import MAX_CHANGES, PAGE
+from testing.simulation.tasks import ADDRESSES, DEPROVISIONED
 from testing.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
 
 OURS = "our assumption"
@@ -22,13 +24,13 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
     return {
         "start of a task": f"log-normal, median {median:g} s, sigma {sigma:g}, at most {longest:g} s ({OURS})",
         "DNS change until INSYNC": f"{_span(conditions.propagation)} (Route 53's FAQ: usually within 60 seconds)",
-        "Route 53 is slow": f"{conditions.slow_zone:.0%} of the time, for {ports.SLOW_FOR:g} s: "
+        "Route 53 is slow": f"{conditions.slow_zone:.0%} of the time, for {SLOW_FOR:g} s: "
         f"{_span(conditions.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
         "zone busy after a change": f"{_span(conditions.busy_zone)} ({OURS})",
         "changes of the zone in a call": f"{MAX_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
-        "S3": f"a read or listing shows every write answered before it; a listing is a call for {ports.PAGE:,} keys (S3 User "
+        "S3": f"a read or listing shows every write answered before it; a listing is a call for {PAGE:,} keys (S3 User "
         "Guide, data consistency model); LastModified has whole seconds (minio/minio-go pull request 1638)",
         "Spot": _spot(conditions),
         "events": f"{conditions.late:.0%} come 1 to 20 s late, {conditions.repeated:.0%} come twice ({OURS})",
@@ -51,7 +53,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         f"{POLLS['naming']:g} s while the server is being named (web/game/waiting.js)",
         "network interface goes": f"{_span(DEPROVISIONED)} after the container has ended ({OURS})",
         "sweep": f"every {SWEEP_EVERY:g} s (infra/template.yml)",
-        "addresses": f"{ports.ADDRESSES:,}: what the subnets of infra/template.yml hold",
+        "addresses": f"{ADDRESSES:,}: what the subnets of infra/template.yml hold",
     }
 
 

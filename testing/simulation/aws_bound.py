@@ -13,7 +13,8 @@ import random
 from collections.abc import Iterator, Sequence
 
 from testing.simulation.cloud import QUOTAS
-from testing.simulation.ports import MAX_CHANGES, Conditions, address_lag, draws, propagation, start_time
+from testing.simulation.conditions import Conditions, address_lag, draws, propagation, start_time
+from testing.simulation.ports import MAX_CHANGES
 
 
 def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:

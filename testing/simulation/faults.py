@@ -15,9 +15,9 @@ import msgspec
 from protocol.keys import answer_key
 from testing.port_faults import Fault, FaultAt
 from testing.simulation import session_checks
+from testing.simulation.conditions import Conditions
 from testing.simulation.members import Habits, Member
 from testing.simulation.people import Person, Visit
-from testing.simulation.ports import Conditions
 from testing.simulation.world import PROJECT, World
 
 FAULTS = (Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY)

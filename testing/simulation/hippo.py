@@ -21,7 +21,7 @@ from typing import Any
 
 from hippodrome.ports import DnsRecord, NoCapacity, TaskRequest
 from testing.simulation.cloud import Throttled
-from testing.simulation.ports import TimedTask
+from testing.simulation.tasks import TimedTask
 from testing.simulation.world import World
 from testing.tasks import Life
 

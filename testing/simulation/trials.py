@@ -17,7 +17,8 @@ from hippodrome.ports import Conflict
 from protocol import session as sessions
 from protocol.keys import answer_key, session_key
 from protocol.session import Session, member_token
-from testing.simulation.ports import SimPlatform, TimedTask
+from testing.simulation.ports import SimPlatform
+from testing.simulation.tasks import TimedTask
 from testing.tasks import Life
 
 TICK = 1.0  # seconds between two looks of a trial at who is there

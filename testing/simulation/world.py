@@ -27,9 +27,11 @@ from testing.port_faults import Crash
 from testing.simulation import functions, lobby
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import CONCURRENCY, Cloud, NoRoom
+from testing.simulation.conditions import Conditions
 from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
 from testing.simulation.matching import SimMatching
-from testing.simulation.ports import Conditions, SimBus, SimPlatform, SimTimers, TimedTask
+from testing.simulation.ports import SimBus, SimPlatform, SimTimers
+from testing.simulation.tasks import TimedTask
 from testing.simulation.trials import SimTrials
 from testing.tasks import Life
 

@@ -43,8 +43,9 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
 from testing.quiet_log import quiet
-from testing.simulation import aws_bound, hippo, ports, world
-from testing.simulation.ports import Conditions
+from testing.simulation import aws_bound, hippo, world
+from testing.simulation import tasks as ecs
+from testing.simulation.conditions import Conditions
 from testing.tasks import Life
 from trial.pictures.encoder import Encoder
 
@@ -319,8 +320,8 @@ def test_what_is_assumed_is_told_from_the_constants_and_of_worse_conditions_what
 
 
 def test_ten_thousand_servers_fit_the_network_of_the_template(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert ports.ADDRESSES > 2 * scale.MANY
-    monkeypatch.setattr(ports, "ADDRESSES", 60)
+    assert ecs.ADDRESSES > 2 * scale.MANY
+    monkeypatch.setattr(ecs, "ADDRESSES", 60)
     with quiet():
         full = scale.crowd(7, 80, 10.0)
     assert full.world.platform.tasks.most_interfaces > 60

@@ -36,7 +36,7 @@ from protocol.session import Member, Session
 from testing.aws_events import ACCOUNT
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
-from testing.simulation import ports
+from testing.simulation import conditions, tasks
 from testing.studies import study
 from tests.deploy.installation import ROOT, Ran
 from tests.deploy.living import Living, held
@@ -392,12 +392,12 @@ def test_what_was_once_bad_is_not_proven() -> None:
 
 def test_the_stages_are_those_of_the_simulation() -> None:
     """`deploy` imports nothing of `bench`: its table must follow."""
-    median, sigma, longest = ports.STARTS
+    median, sigma, longest = conditions.STARTS
     usual = tuple(float(round(median * math.exp(sign * 2 * sigma))) for sign in (-1, 1))
     assert (STAGES["start"].usual, STAGES["start"].most) == (usual, longest)
-    assert STAGES["name"].usual == ports.PROPAGATION
-    assert STAGES["name"].most == ports.SLOW_PROPAGATION[1]
-    assert STAGES["gone"].usual == ports.DEPROVISIONED
+    assert STAGES["name"].usual == conditions.PROPAGATION
+    assert STAGES["name"].most == conditions.SLOW_PROPAGATION[1]
+    assert STAGES["gone"].usual == tasks.DEPROVISIONED
     assert STAGES["told"].most == 20 + 1, "Conditions.late: events come 1 to 20 s late"
 
 

@@ -15,9 +15,10 @@ from testing.simulation.assumptions import assumptions
 from testing.simulation.aws_bound import aws_alone, aws_alone_together
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
+from testing.simulation.conditions import SLOW_FOR, Conditions, propagation
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
 from testing.simulation.people import Person
-from testing.simulation.ports import PAGE, SLOW_FOR, Conditions, propagation
+from testing.simulation.ports import PAGE
 from testing.simulation.world import LOOPS, World
 from testing.tasks import Life
 

@@ -20,8 +20,8 @@ from protocol.keys import answer_key, membership_key, session_key
 from protocol.session import Member as Seated
 from protocol.session import Session
 from testing.simulation import faults, lobby, session_checks
+from testing.simulation.conditions import Conditions
 from testing.simulation.members import POLL, PROPOSED_POLL, Habits, Member
-from testing.simulation.ports import Conditions
 from testing.simulation.trials import SimTrial
 from testing.simulation.world import PROJECT, WIRES, World
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm

@@ -11,7 +11,7 @@ from hippodrome.ports import TaskRequest
 from protocol.keys import answer_key, session_key
 from protocol.session import Member, Session, member_token
 from testing.clock import EPOCH
-from testing.simulation.ports import Conditions
+from testing.simulation.conditions import Conditions
 from testing.simulation.trials import ABSENT, COUNTDOWN
 from testing.simulation.world import PROJECT, World
 from testing.tasks import Life

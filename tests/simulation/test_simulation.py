@@ -14,8 +14,8 @@ from testing.port_faults import Fault, FaultAt
 from testing.simulation import faults
 from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
+from testing.simulation.conditions import Conditions
 from testing.simulation.people import POLLS, Person, retry_delay
-from testing.simulation.ports import Conditions
 from testing.simulation.world import TIMEOUTS, WIRES, World
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
 
