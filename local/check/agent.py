@@ -88,7 +88,10 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
 
 
 def _question(folder: Path, config: Config) -> dict[str, Any]:
-    """Made-up people for the function `match`, who have answered the pages before the game."""
+    """Made-up people for the function `match`, who have answered the pages before the game.
+
+    They choose at random; the last of them answer what the first have answered.
+    """
     try:
         pages = EarlierAnswers.before_the_game(open_folder(folder).path, config)
     except StepFileError:
@@ -97,7 +100,7 @@ def _question(folder: Path, config: Config) -> dict[str, Any]:
     waiting = []
     for number in range(3 * players):
         group = number % groups if groups else None
-        found = pages.answers(group)[number // players % 2] if pages else {}
+        found = pages.answers(group, number % (2 * players))[number // players % 2] if pages else {}
         answers = {name: value for answered in found.values() for name, value in answered.items()}
         waiting.append(
             {"id": f"made-up-{number}", "waited": 5 * (3 * players - number), "group": group, "answers": answers}

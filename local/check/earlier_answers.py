@@ -67,8 +67,8 @@ class EarlierAnswers:
             found |= answers
         return len(found) if found else None
 
-    def answers(self, group: int | None) -> list[dict[str, dict[str, Any]]]:
-        """By step: the most that may have been answered there, and the least."""
+    def answers(self, group: int | None, person: int = 1) -> list[dict[str, dict[str, Any]]]:
+        """By step: the most that may have been answered there, and the least. Another `person` chooses otherwise."""
         most: dict[str, dict[str, Any]] = {}
         least: dict[str, dict[str, Any]] = {}
         for step in self._steps:
@@ -79,7 +79,7 @@ class EarlierAnswers:
                 most[step.key] = least[step.key] = {}
                 continue
             file = step.files[(group or 0) if step.variants else 0]
-            most[step.key], least[step.key] = _answered(source_of(self._folder / file.name))
+            most[step.key], least[step.key] = _answered(source_of(self._folder / file.name), person)
         return [most, least]
 
     def _texts(self) -> list[str]:
@@ -96,13 +96,13 @@ def _forms(text: str) -> list[forms.Form]:
     return forms.read(f"<form>{fragments.prepare(page).text}</form>")
 
 
-def _answered(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any]]:
     """Answers to a page: to all its questions, and to those only that must be answered."""
     found = _forms(text)
     if not found:
         return {}, {}
     controls = found[0].controls
-    filled = form_filling.gathered(form_filling.fill(found[0], Random(1)))  # noqa: S311 - nothing secret
+    filled = form_filling.gathered(form_filling.fill(found[0], Random(person)))  # noqa: S311 - nothing secret
     most = {control.name: "1" for control in controls if control.name} | filled
     boxes = {control.name for control in controls if control.kind in ("checkbox", "radio")}
     needed = {control.name for control in controls if control.required}

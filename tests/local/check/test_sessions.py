@@ -208,6 +208,17 @@ def test_a_function_that_matches_stands_beside_the_class(folder: Path) -> None:
     assert line.endswith("matching: match; write it beside the class Agent, not in it, and without self")
 
 
+@pytest.mark.parametrize("fits", ["==", "!="])
+def test_made_up_people_choose_differently_and_some_choose_alike(folder: Path, fits: str) -> None:
+    roles = "".join(f"<input type=radio name=role value={role} required>" for role in ("guide", "seeker"))
+    (folder / "steps/hello.html").write_text(f"{ASKS}{roles}")
+    (folder / "agent.py").write_text(
+        f"{AGENT}\n\ndef match(waiting):\n    first = waiting[0]\n"
+        f"    return [[first, other] for other in waiting[1:] if other['answers']['role'] {fits} first['answers']['role']][:1]\n"
+    )
+    assert tried(configured(folder, "  matching: match\n")) == []
+
+
 def test_a_function_that_matches_is_asked_for_in_config_yml(folder: Path) -> None:
     (folder / "agent.py").write_text(f"{AGENT}\n\ndef match(waiting):\n    return []\n")
     (line,) = looked(folder)
