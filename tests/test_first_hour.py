@@ -59,7 +59,7 @@ ELSEWHERE = {
     "Nothing is ordered until …": "certificate/test_command.py",
     "The image could not be built": "deploy/test_codebuild.py",
     "Interrupted. CloudFormation goes on with the stack …": "deploy/test_stack.py",
-    "Interrupted. The same command goes on from here.": "deploy/test_register.py",
+    "Interrupted. The same command goes on from here.": "deploy/test_register_refused.py",
     "Something of that name is in another region: say …": "deploy/test_destroy_waits.py",
     "This has to wait until …; then the rest is deleted.": "deploy/test_destroy_waits.py",
     "After … ACM still says that the site's certificate is in use by …": "deploy/test_destroy_waits.py",

@@ -287,3 +287,17 @@ def town(machine: None) -> Iterator[Town]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return write_study(tmp_path / "study")
+
+
+def configure(folder: Path, *changes: tuple[str, str]) -> None:
+    """Write the study's config.yml with these texts changed, (old, new)."""
+    text = CONFIG
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "config.yml").write_text(text)
+
+
+def bodies(town: Town) -> dict[str, bytes]:
+    """What the bucket holds of the study `maze`, by key."""
+    return {key: town.get(key) for key in town.keys("maze/")}
