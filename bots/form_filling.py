@@ -17,7 +17,7 @@ from bots.forms import PRESSED, Control, Form
 Pairs = list[tuple[str, str]]
 
 ANSWERED = 0.8
-"""Of the fields that may be left out, so many get an answer."""
+"""The share of the optional fields that get an answer."""
 
 _WORDS = (
     "It was fine, thank you.",

@@ -75,7 +75,7 @@ def _unpacked(source: Path, problems: list[str]) -> Iterator[bytes]:
 
 
 def parsed(text: bytes) -> dict[str, Any] | None:
-    """The JSON object in a line; None if it is none."""
+    """The JSON object in a line; None if the line holds no JSON object."""
     line: Any
     try:
         line = msgspec.json.decode(text)

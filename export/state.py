@@ -92,7 +92,7 @@ class State:
     """One connection; use it in one thread. Nothing is lost that was committed."""
 
     def __init__(self, path: Path | None) -> None:
-        """Open or make it; None is an empty one in memory. Raises sqlite3.DatabaseError for a file that is none."""
+        """Open or make it; None is an empty one in memory. Raises sqlite3.DatabaseError for another file."""
         self._db = sqlite3.connect(path or ":memory:", isolation_level=None)
         self._db.execute("PRAGMA synchronous=NORMAL")
         self._db.executescript(_TABLES)

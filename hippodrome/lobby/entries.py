@@ -27,9 +27,9 @@ from protocol.session import is_session_id
 
 FOLDER = "_lobby/"
 PRESENT = timedelta(seconds=10)
-"""Who has asked since then is there. The page asks every two seconds."""
+"""A participant who has asked since then is there. The page asks every two seconds."""
 REMEMBERED = timedelta(seconds=30)
-"""Who has asked since then keeps the time at which they came; later they begin anew."""
+"""A participant who has asked since then keeps the time at which they came; later they begin anew."""
 DELETED = timedelta(seconds=60)
 """Older entries are deleted: well after `REMEMBERED`, so that no request on its way still writes to one."""
 NO_TRAIT = "-"
@@ -55,7 +55,7 @@ class Waiting:
 
     @property
     def order(self) -> tuple[int, str]:
-        """Who came first is matched first."""
+        """By this, the first who came is matched first."""
         return self.joined, self.label
 
     def is_present(self, now: datetime) -> bool:
@@ -73,7 +73,7 @@ class Departure:
 
 @dataclass(frozen=True)
 class Entries:
-    """A listing of the folder. Who has left and not come back is in `left`, and not in `waiting`."""
+    """A listing of the folder. A participant who has left and not come back is in `left`, not in `waiting`."""
 
     waiting: Mapping[str, Waiting] = field(default_factory=dict)  # by label
     confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # labels, by the proposal's id

@@ -1,4 +1,4 @@
-"""Who of those who wait play together: by arrival, traits, or as the function `match` of agent.py says. Pure.
+"""Which of the participants who wait play together: by arrival, traits, or as the function `match` says. Pure.
 
 A session is here a sequence of its members, in the order of their arrival.
 """

@@ -3,8 +3,8 @@
 The researcher's code runs on servers alone. So who waits is written into a document, `_match/{projectId}/waiting.json`,
 which servers without members look at. Each question has an id, and its answer a document of its own,
 `{projectId}/lobby/groups/{id}.json`, which the first of them creates. A question stays as it is until it is answered,
-or for `ANSWERED_WITHIN`; who comes meanwhile is written down beside it, for the next one. So an answer is to what the
-document still says, however many people come.
+or for `ANSWERED_WITHIN`. A participant who comes meanwhile stands beside it, for the next question. So an answer fits
+what the document still says, however many people come.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ANSWERED_WITHIN = timedelta(seconds=10)
 MOST_WAITING = 200
 """Participants in one question: those who came first."""
 MOST_CAME = 200
-"""Further participants in the document. Who comes then is written down when there is room: their page asks again."""
+"""Further participants in the document. One who comes then is written down when there is room: the page asks again."""
 MOST_ANSWERS = 16 * 1024
 """Bytes of one participant's answers. Larger ones are left out."""
 
@@ -118,8 +118,8 @@ def next_question(
 ) -> Question:
     """What is asked now: `question` as it is, or a new one of those who are `free`.
 
-    `waiting` are the labels of all who wait; who is not among them is forgotten. `matched` are those whom the answer to
-    `question` matches, and who are asked about again only if they stay free.
+    `waiting`: the labels of all who wait; a participant who is not among them is forgotten. `matched`: those whom the
+    answer to `question` matches; they are asked about again only if they stay free.
     """
     people = {label: each for label, each in question.people().items() if label in waiting}
     asked = sorted((one for one in free if one.label in people and one.label not in matched), key=lambda one: one.order)

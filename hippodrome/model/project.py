@@ -318,7 +318,7 @@ def write_list(listed: MasterList) -> bytes:
 
 
 def _as_object(raw: bytes) -> Mapping[str, Any]:
-    """An entry as a JSON object; empty if it is none."""
+    """An entry as a JSON object; empty if it is another value."""
     try:
         entry = msgspec.json.decode(raw)
     except (ValueError, RecursionError):

@@ -108,7 +108,7 @@ def _to_json(task: Task) -> dict[str, Any]:
 
 
 def _from_json(stored: Any) -> Task:
-    """The stored record. Raises TypeError if it is none."""
+    """The stored record. Raises TypeError if this is no record."""
     fields = dict(**stored)
     handover = fields.pop("warm_server", "")
     return Task(**fields, handover_key=handover)

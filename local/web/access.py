@@ -67,7 +67,7 @@ def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: 
 
 
 def origin_of(address: str) -> str | None:
-    """The origin that an address names, as browsers write it; None if it is none."""
+    """The origin that an address names, as browsers write it; None if the text names no origin."""
     try:
         parts = urlsplit(address)
         port = f":{parts.port}" if parts.port else ""

@@ -88,7 +88,7 @@ def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
 
 
 def final(config: RemoteConfig) -> str:
-    """The last page, which leads on if the experiment says where. Who found no other to play with has one of theirs."""
+    """The last page, which leads on if the experiment says where. An unmatched participant gets another text."""
     page = _page(config.final_page_header_text or "Thank you!", config.final_page_text, plain="<p>This is the end.</p>")
     page += _led(config, config.experiment_end_redirect_url or config.end_game_redirect_url)
     if len(humans_of(config)) == 1:
