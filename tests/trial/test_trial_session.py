@@ -258,6 +258,50 @@ def test_a_participant_whose_data_were_erased_is_no_member_any_more(launch, open
     asyncio.run(run())
 
 
+def test_without_a_substitute_the_game_is_over_for_the_others_of_one_whose_data_were_erased(launch):
+    """As if that participant had left: nobody is kept at a game that cannot begin."""
+    server = launch_session(launch)
+    form(server.store, document(("anna", "")))
+
+    async def run():
+        async with member(server, "anna") as anna:
+            assert await anna.closed() == 1000
+            assert anna.done["outcome"] == "partnerLeft"
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert answer(server.store, "anna")["answers"]["episodes"] == 0
+
+
+def test_what_was_played_with_one_whose_data_were_erased_counts_for_the_others(launch):
+    first = launch_session(launch)
+    form(first.store)
+
+    async def play():
+        async with member(first, "anna") as anna, member(first, "bert") as bert:
+            await anna.say(action="up", held=True)
+            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 20) for each in (anna, bert)))
+            first.terminate()
+            await asyncio.gather(anna.closed(), bert.closed())
+
+    asyncio.run(play())
+    assert first.wait() == 0
+    [lines] = recordings(first.store).values()
+    put(first.store, f"study/sessions/{SID}/session.json", document(("anna", "")).to_json())
+    second = launch_session(launch, SERVER="pair-2")
+
+    async def go_on():
+        async with member(second, "anna") as anna:
+            assert await anna.closed() == 1000
+
+    asyncio.run(go_on())
+    assert second.wait() == 0
+    found = answer(second.store, "anna")["answers"]
+    steps = [line for line in lines if line["kind"] == "step"]
+    assert found["score"] == sum(line["players"]["left"]["reward"] for line in steps) > 0
+    assert (found["outcome"], found["episodes"]) == ("partnerLeft", 1)
+
+
 @for_all(user_id=st.one_of(st.none(), st.text(), st.sampled_from(MEMBERS)), token=st.one_of(st.none(), st.text()))
 def test_whatever_a_client_says_only_a_member_with_their_own_token_gets_in(user_id, token):
     settings = assignment.formed(Settings.from_env(ENV), document())

@@ -58,13 +58,15 @@ class Session:
         places: Mapping[str, str],
         *,
         vacant: Sequence[str],
+        gone: Sequence[str],
         recorded: RecordedTrial | None,
         trial_id: str,
         say_each: Callable[[Callable[[str], str | None]], None],
         recording: Recording,
         emit: Callable[[Effect], None],
     ) -> None:
-        """In the places of `vacant` a policy plays from the start. `recorded` is what earlier servers have recorded.
+        """In the places of `vacant` a policy plays from the start. Those of `gone` are of members who never come back:
+        the game is over for all once what was played of it stands. `recorded` is what earlier servers have recorded.
 
         `say_each` tells each client what a function has for its player.
         """
@@ -80,7 +82,7 @@ class Session:
         resumed = recorded is not None and (bool(recorded.ended) or recorded.unfinished is not None)
         self.presence = Presence(
             Rules(config.absent, config.gather, config.countdown, config.max_ping, config.ping_samples),
-            tuple(places.values()),
+            (*places.values(), *gone),
             reads=bool(config.instructions) and not resumed,
             begun=resumed,
         )
@@ -95,6 +97,8 @@ class Session:
         self._broke = False  # a break was on when `attend` was called last
         self._met = resumed  # the game has begun, so that a member who is missing has left
         self._settled: int | None = None  # the `version` of the members with which the game was last found to be on
+        self._replays = recorded is not None and recorded.unfinished is not None
+        """An episode of an earlier server is still to be repeated: until then nothing is over."""
         self._waiting: list[RecordLine] = []
         progress.choices.timed_keys = True
         for player, outcome in (recorded.outcomes if recorded is not None else {}).items():
@@ -104,6 +108,8 @@ class Session:
                 self.presence.has_left(player)
             elif player in self._humans and outcome == "stopped":
                 self._stopped.add(player)
+        for player in gone:
+            self.presence.has_left(player)
 
     @property
     def _plays_on(self) -> bool:
@@ -255,6 +261,9 @@ class Session:
 
     def _end_or_replace(self, now: float) -> frozenset[str]:
         presence, progress = self.presence, self._progress
+        self._replays = self._replays and progress.needs_reset
+        if self._replays:
+            return NOBODY
         gone = [player for player in presence.players if presence.over(player) and player not in self._replaced]
         refused = frozenset(player for player in gone if presence.over(player) == "ping")
         for player in gone:

@@ -181,11 +181,12 @@ class Trial:
         *,
         places: Mapping[str, str] | None = None,
         vacant: Sequence[str] = (),
+        gone: Sequence[str] = (),
     ) -> list[Effect]:
         """The agent has started: these are the environment's players, and what earlier servers recorded of the step.
 
         In a session, `places` says which player each member plays, by their id, and `vacant` are the places of humans
-        that no member has: policies are in them.
+        that no member has: policies are in them. In those of `gone` nobody plays any more.
         """
         if self.phase is not Phase.STARTING:
             return []
@@ -197,6 +198,7 @@ class Trial:
                 self.progress,
                 places,
                 vacant=vacant,
+                gone=gone,
                 recorded=recorded,
                 trial_id=self.id,
                 say_each=self._clients.say_each,

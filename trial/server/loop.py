@@ -202,7 +202,8 @@ class TrialLoop:
         self._places.fill(table.players, table.policies, table.stand_ins, table.seats)
         self._find_callbacks(started, table.players)
         now = self._loop.time()
-        self._apply(self.core.start(table.players, recorded, now, places=table.places, vacant=table.vacant))
+        places, vacant, gone = table.places, table.vacant, table.gone
+        self._apply(self.core.start(table.players, recorded, now, places=places, vacant=vacant, gone=gone))
 
     async def _table(self, started: Started) -> Table | None:
         """Who plays whom; None if the policies cannot be loaded, which the log says."""

@@ -29,6 +29,8 @@ class Table:
     """In a session: the places of humans that no member has. A policy plays there."""
     stand_ins: Mapping[str, Policy] = field(default_factory=dict)
     """In a session: the policies that may play for members who are away, by player."""
+    gone: tuple[str, ...] = ()
+    """In a session: the places of members whose data were erased, if no policy plays there. They do not come back."""
 
 
 @dataclass(slots=True)
@@ -77,10 +79,13 @@ class Started:
         places = {user_id: seats[seat] for user_id, seat in settings.seats.items()}
         vacant = tuple(name for name in seats if name not in places.values())
         plays = config.substitute
-        if vacant and plays is None:
-            raise PlayersError(f"trial.substitute must say what plays in the place of {vacant[0]}, who has not come")
         if plays is None:
-            return replace(table, places=places, seats=tuple(seats))
+            erased = {seats[member.seat] for member in settings.members if not member.user_id}
+            if missing := [name for name in vacant if name not in erased]:
+                raise PlayersError(
+                    f"trial.substitute must say what plays in the place of {missing[0]}, who has not come"
+                )
+            return replace(table, places=places, seats=tuple(seats), gone=vacant)
         away = seats if config.after_absent == "policy" else vacant
         stand_ins = self._policies([replace(each, plays=plays) for each in table.players if each.name in away])
         return Table(
