@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import os
+import sys
 import threading
 from typing import Any
+
+import pytest
 
 from trial.agent.worker import Worker
 from trial.core.effects import AgentTimeout
@@ -55,3 +60,73 @@ def test_a_limit_that_is_left_over_from_before_ends_nothing() -> None:
         return heard
 
     assert asyncio.run(work()) == [(False, None)] * 3
+
+
+def test_a_failure_in_what_hears_of_one_result_loses_no_other() -> None:
+    async def work() -> tuple[Heard, list[Any]]:
+        worker, heard, free, wrong = Worker(), Heard(), threading.Event(), []
+        asyncio.get_running_loop().set_exception_handler(lambda _, said: wrong.append(said["exception"]))
+
+        def done(result: Any, error: Exception | None) -> None:
+            heard.append((result, error))
+            if result == 0:
+                raise ValueError("heard")
+
+        for number in range(3):
+            worker.submit(lambda number=number: free.wait() and number, 10.0, done)
+        free.set()
+        worker.close()
+        worker._thread.join()  # all three results are there before the loop hears of the first
+        async with asyncio.timeout(10):
+            while worker.busy:
+                await asyncio.sleep(0.001)
+        return heard, wrong
+
+    heard, wrong = asyncio.run(work())
+    assert heard == [(0, None), (1, None), (2, None)]
+    assert [str(error) for error in wrong] == ["heard"]
+
+
+def test_a_worker_serves_one_event_loop_after_the_other() -> None:
+    worker, free = Worker(), threading.Event()
+
+    async def work(number: int) -> int:
+        found = await worker.call(lambda: number, limit=10.0)
+        worker.submit(free.wait, 10.0, lambda *_: None)  # is still going on when the loop ends
+        return found
+
+    assert asyncio.run(work(1)) == 1
+    free.set()
+    assert asyncio.run(work(2)) == 2
+    worker.close()
+
+
+def test_a_function_that_returns_when_its_loop_has_ended_harms_nobody() -> None:
+    worker, free = Worker(), threading.Event()
+
+    async def work() -> None:
+        worker.submit(free.wait, 10.0, lambda *_: None)
+
+    asyncio.run(work())
+    free.set()
+    worker.close()
+    worker._thread.join(10)
+    assert not worker._thread.is_alive()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's descriptors")
+def test_a_worker_leaves_no_descriptor_open() -> None:
+    def used() -> None:
+        worker = Worker()
+        asyncio.run(worker.call(lambda: None, limit=10.0))
+        worker.close()
+        worker._thread.join()
+
+    def opened() -> set[str]:
+        gc.collect()
+        return set(os.listdir("/proc/self/fd"))
+
+    before = opened()
+    for _ in range(5):
+        used()
+    assert len(opened()) <= len(before)
