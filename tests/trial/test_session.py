@@ -624,6 +624,20 @@ def test_on_the_next_server_all_are_waited_for_again_and_nobody_reads_again():
     assert second.wait(3.1).taken[0].fields["step"] == first.steps + 1
 
 
+def test_a_game_that_had_not_begun_begins_on_the_next_server_as_on_the_first():
+    """Members gather, read and are measured there. A server that waits for them has begun an episode, without a step."""
+    section = {"instructions": "rules.html", "maxPing": 100, "pingSamples": 1, "absent": 5, "gather": 60}
+    first = SessionDriver(**section).come(0).trip(0, 0.02).wait(50)
+    second = SessionDriver(**section, recorded=recorded_of(first, ended=False)).come(0).trip(0, 0.02)
+    assert second.told(0)["heldFor"] == 60
+    assert second.told(0)["people"] == {"left": "reads", "right": "awaited"}
+    second.wait(30).come(1)
+    assert second.told(1)["people"] == {"left": "reads", "right": "awaited"}, "who is measured"
+    second.trip(1, 0.2)
+    assert second.outcomes == {"P0": "partnerLeft", "P1": "ping"}
+    assert second.errors(0) == [PARTNER_MISSING]
+
+
 def test_a_game_that_has_ended_for_all_is_over_on_the_next_server_too():
     first = SessionDriver().begin().wait(1).go(1).wait(30)
     second = SessionDriver(recorded=recorded_of(first))

@@ -79,7 +79,7 @@ class Session:
         self._progress = progress
         self._emit = emit
         self._humans = {player: human for human, player in places.items()}
-        resumed = recorded is not None and (bool(recorded.ended) or recorded.unfinished is not None)
+        resumed = recorded is not None and recorded.begun
         self.presence = Presence(
             Rules(config.absent, config.gather, config.countdown, config.max_ping, config.ping_samples),
             (*places.values(), *gone),

@@ -104,3 +104,8 @@ class RecordedTrial:
     seconds: float = 0.0
     outcomes: dict[str, str] = field(default_factory=dict)
     """In a session, by player: how the trial has ended for each member, as far as it has."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything was played. A server begins an episode before its participants come."""
+        return bool(self.ended) or (self.unfinished is not None and bool(self.unfinished.steps))
