@@ -11,7 +11,7 @@ from jinja2 import meta
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.diagnostics import printable
 from hippodrome.config.step_files import StepFileError, open_folder
-from hippodrome.participants import fragments
+from hippodrome.participants import fragments, sandbox
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, source_of
 from local.check.structure import check_structure
@@ -74,7 +74,7 @@ def _no_code(label: str) -> Diagnostic:
 def _leads_back(source: str) -> bool:
     """Whether a last page shows the participant's code, or has a link to another place: docs/recruiting.md."""
     try:
-        if "completion_code" in meta.find_undeclared_variables(fragments._environment().parse(source)):
+        if "completion_code" in meta.find_undeclared_variables(sandbox.environment().parse(source)):
             return True
     except Exception:  # noqa: BLE001 - the page's own check says what Jinja cannot read
         return True

@@ -18,7 +18,7 @@ _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
 _IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
 _BUTTONS = ("button", "reset", "submit", "image")  # inputs that do well without a name
-_LOADED = {**fragments._ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
+_LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
 class Tags(HTMLParser):

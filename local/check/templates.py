@@ -9,8 +9,8 @@ from jinja2 import meta, nodes
 from jinja2.exceptions import SecurityError, TemplateRuntimeError, TemplateSyntaxError, UndefinedError
 
 from hippodrome.config import Config, Diagnostic
-from hippodrome.participants import fragments
-from hippodrome.participants.fragments import FragmentError
+from hippodrome.participants import fragments, sandbox
+from hippodrome.participants.sandbox import FragmentError
 from local.check.earlier_answers import EarlierAnswers
 from local.check.wording import nearest, short
 from protocol.answer import UNMATCHED
@@ -23,9 +23,9 @@ def check_template(
 ) -> Iterator[Diagnostic]:
     """Whether the page can be read, and can be shown to a participant who has answered the pages before it."""
     page = fragments.prepare(source)
-    if not fragments._uses_jinja(page.text):
+    if not sandbox.uses_jinja(page.text):
         return
-    environment = fragments._environment()
+    environment = sandbox.environment()
     try:
         parsed = environment.parse(page.text)
     except TemplateSyntaxError as error:
@@ -52,7 +52,7 @@ def check_template(
             try:
                 page.render({**known, "answers": answers})
             except FragmentError as error:
-                yield _failing(label, error, may_depend=bool(fragments.records_mentioned(page.text)))
+                yield _failing(label, error, may_depend=bool(sandbox.records_mentioned(page.text)))
                 return
 
 

@@ -31,6 +31,10 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_fragments",
         "hippodrome/participants/test_pages",
     ),
+    "hippodrome/participants/sandbox.py": (
+        "hippodrome/participants/test_fragments",
+        "hippodrome/participants/test_pages",
+    ),
     "hippodrome/servers/warm/handover.py": (
         "hippodrome/servers/warm/test_warm_servers",
         "hippodrome/servers/warm/test_races",

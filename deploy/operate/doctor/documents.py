@@ -26,9 +26,9 @@ from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import Project, Step, UnreadableEntry
 from hippodrome.model.warm_pool import Pool
-from hippodrome.participants import fragments, pages
-from hippodrome.participants.fragments import FragmentError
+from hippodrome.participants import pages
 from hippodrome.participants.pages import StepView
+from hippodrome.participants.sandbox import FragmentError, records_mentioned
 from hippodrome.ports import Documents, Entry
 from hippodrome.storage import secret
 from protocol.keys import sessions_folder
@@ -196,7 +196,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
         pages.fragment(view)
     except FragmentError as error:
         line = f" (line {error.line})" if error.line else ""
-        if fragments.records_mentioned(source):
+        if records_mentioned(source):
             text = f"Step {step.key}: {file}.html{line} fails for a participant without answers: {error.message}"
             yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
         else:

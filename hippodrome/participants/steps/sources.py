@@ -11,8 +11,8 @@ from hippodrome.log import logger
 from hippodrome.model import ids
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Step
-from hippodrome.participants import fragments
 from hippodrome.participants.page_error import CONTENT_NOT_FOUND, PageError
+from hippodrome.participants.sandbox import FragmentError, records_mentioned
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.visit import Visit
 
@@ -43,7 +43,7 @@ def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
     """Turn a `FragmentError` of these pages into the `PageError` that says so."""
     try:
         yield
-    except fragments.FragmentError as error:
+    except FragmentError as error:
         files = ", ".join(source.file for source in sources)
         logger.error("step page broken", extra={"project": visit.project.id, "file": files, "line": error.line})
         raise PageError(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
@@ -52,7 +52,7 @@ def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
 def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapping[str, Any]:
     """The values that a page may use. Records are read only if the page mentions them."""
     project, user_id, repository = visit.project, visit.user_id, services.repository
-    mentioned = fragments.records_mentioned(text)
+    mentioned = records_mentioned(text)
     values: dict[str, Any] = {
         "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
         "participant": {"userId": user_id},

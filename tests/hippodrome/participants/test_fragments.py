@@ -10,7 +10,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hippodrome.participants.fragments import FragmentError, prepare, records_mentioned
+from hippodrome.participants.fragments import prepare
+from hippodrome.participants.sandbox import FragmentError, records_mentioned
 
 BASE = "/steps/demo/"
 

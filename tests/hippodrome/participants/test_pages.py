@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
 from hippodrome.participants import frame, pages, scripts
-from hippodrome.participants.fragments import FragmentError, records_mentioned
 from hippodrome.participants.frame import Page
 from hippodrome.participants.pages import GameView, StepView
+from hippodrome.participants.sandbox import FragmentError, records_mentioned
 from hippodrome.participants.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -1,0 +1,129 @@
+"""Jinja's sandbox: it fills values into researchers' pages (`fragments.py`). Jinja is imported once it is needed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+    from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+LIMIT = 2_000_000  # characters of a rendered page
+VALUES_READ = frozenset({"participant", "answers"})  # each costs a read of the participant's records
+
+
+class FragmentError(Exception):
+    """A step page that Jinja cannot render. `line` counts in the researcher's file; None if it is not known."""
+
+    def __init__(self, message: str, line: int | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.line = line
+
+
+def uses_jinja(text: str) -> bool:
+    """Whether Jinja has to render it. `{#` alone is more likely a style sheet's `@media print{#menu{…}}`."""
+    return "{{" in text or "{%" in text or ("{#" in text and "#}" in text)
+
+
+@lru_cache(maxsize=64)
+def records_mentioned(source: str) -> frozenset[str]:
+    """Which of the participant's records a step page uses: `participant`, `answers`, or single steps as `answers.3`.
+
+    Empty for a page that does not parse.
+    """
+    if not uses_jinja(source):
+        return frozenset()
+    from jinja2 import meta  # noqa: PLC0415 - most pages need no Jinja, and its import costs cold starts
+
+    try:
+        parsed = environment().parse(source)
+        mentioned = meta.find_undeclared_variables(parsed) & VALUES_READ
+    except Exception:  # noqa: BLE001 - the parser fails in many ways; rendering will tell which
+        return frozenset()
+    if "answers" not in mentioned:
+        return frozenset(mentioned)
+    return frozenset(mentioned - {"answers"} | _answers(parsed))
+
+
+def _answers(parsed: Any) -> set[str]:
+    """`answers.{step}` for each step named as such; `answers` if the page uses them in any other way."""
+    from jinja2 import nodes  # noqa: PLC0415 - as above
+
+    steps = set()
+    for node in parsed.find_all((nodes.Getitem, nodes.Getattr)):
+        if isinstance(node.node, nodes.Name) and node.node.name == "answers":
+            key = node.attr if isinstance(node, nodes.Getattr) else getattr(node.arg, "value", None)
+            if isinstance(key, str):
+                steps.add((id(node.node), key))
+    whole = {id(node) for node in parsed.find_all(nodes.Name) if node.name == "answers"} - {one for one, _ in steps}
+    return {"answers"} if whole else {f"answers.{key}" for _, key in steps}
+
+
+def render(text: str, values: Mapping[str, Any]) -> str:
+    """Fill the values into a page. Raises FragmentError."""
+    parts: list[str] = []
+    size = 0
+    try:
+        for part in _compile(text).generate(values):
+            parts.append(part)
+            size += len(part)
+            if size > LIMIT:
+                raise FragmentError("the page grows beyond 2 MB")
+    except FragmentError:
+        raise
+    except Exception as error:  # a template can fail in any way
+        raise FragmentError(f"{type(error).__name__}: {error}", _line(error)) from error
+    return "".join(parts)
+
+
+@lru_cache(maxsize=64)
+def _compile(text: str) -> Template:
+    return environment().from_string(text)
+
+
+def _line(error: Exception) -> int | None:
+    """The line of the template where it failed: Jinja knows it of syntax errors, the traceback of others."""
+    line: int | None = getattr(error, "lineno", None)
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == "<template>":
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line
+
+
+@cache
+def environment() -> ImmutableSandboxedEnvironment:
+    """The sandbox of all pages, made once."""
+    from jinja2 import ChainableUndefined  # noqa: PLC0415 - as above
+    from jinja2.exceptions import SecurityError  # noqa: PLC0415
+    from jinja2.sandbox import ImmutableSandboxedEnvironment  # noqa: PLC0415
+
+    class Environment(ImmutableSandboxedEnvironment):
+        """The sandbox, which also refuses to multiply a small text into a huge one."""
+
+        intercepted_binops = frozenset({"*", "**", "%"})
+
+        def call_binop(self, context: Any, operator: str, left: Any, right: Any) -> Any:
+            call: Callable[[Any, Any], Any] = self.binop_table[operator]
+            sizes = [len(side) for side in (left, right) if isinstance(side, str | list | tuple)]
+            counts = [abs(side) for side in (left, right) if isinstance(side, int)]
+            too_long = operator == "*" and any(size * count > LIMIT for size in sizes for count in counts)
+            too_large = operator == "**" and any(count > 64 for count in counts[-1:])
+            wide = operator == "%" and isinstance(left, str) and re.search(r"%[^a-z%]*([0-9]{4}|\*)", left)
+            if too_long or too_large or wide:
+                raise SecurityError(f"the result of {operator} would be too large")
+            return call(left, right)
+
+    def empty(value: object) -> None:
+        """A missing value is null in JSON, as it is empty in a text."""
+        if not isinstance(value, ChainableUndefined):
+            raise TypeError(f"{type(value).__name__} is not JSON serializable")
+
+    made = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
+    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": empty}
+    return made
