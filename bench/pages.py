@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from bench.control import ANSWERS, ROOT, Browser, Study, on_moto, warm
+from bench.study_on_moto import ANSWERS, ROOT, Browser, Study, on_moto, warm
 from bench.table import Row, each, row
 from hippodrome.model import ids
 from testing.aws_events import FORM

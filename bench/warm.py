@@ -21,9 +21,9 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from bench.bill import server_seconds
-from bench.control import ROOT
 from bench.pages import Line, serving
 from bench.scale import SEED, quantile, seconds_of
+from bench.study_on_moto import ROOT
 from bench.table import Row, each, row
 from deploy.cost import estimate
 from deploy.cost.prices import Prices

@@ -32,6 +32,7 @@ from bench import (
     scenes,
     seen,
     sessions,
+    study_on_moto,
     table,
     together,
     trial,
@@ -101,9 +102,9 @@ def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
     pages.project_without_game(tmp_path)
     with pages.serving([sys.executable, "-m", "local", ".", "--port", "0"], tmp_path) as address:
         crowd = asyncio.run(pages.send_crowd(address, 3, pages.through_the_study))
-    assert len(crowd.waits) == 3 * (2 * len(control.ANSWERS) + 1)
+    assert len(crowd.waits) == 3 * (2 * len(study_on_moto.ANSWERS) + 1)
     answers = list(tmp_path.glob("data/crowd/users/*/answers/*.json"))
-    assert len(answers) == 3 * len(control.ANSWERS)
+    assert len(answers) == 3 * len(study_on_moto.ANSWERS)
 
 
 def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
@@ -221,7 +222,7 @@ def test_memory_is_that_of_the_command_and_not_of_who_starts_it(tmp_path: Path) 
     def held() -> float:
         with (tmp_path / "out").open("wb") as out:
             status, most = memory.run(
-                "this", [], env={"PYTHONPATH": f"{tmp_path}:{control.ROOT}"}, cwd=tmp_path, out=out, err=out
+                "this", [], env={"PYTHONPATH": f"{tmp_path}:{study_on_moto.ROOT}"}, cwd=tmp_path, out=out, err=out
             )
         assert status == 0
         return most
@@ -355,7 +356,7 @@ def goals(file: Path) -> Iterator[tuple[str, set[str]]]:
 
 
 def test_each_row_with_a_goal_has_a_yardstick_or_says_whose_bound_it_is() -> None:
-    found = [one for file in (control.ROOT / "bench").rglob("*.py") for one in goals(file)]
+    found = [one for file in (study_on_moto.ROOT / "bench").rglob("*.py") for one in goals(file)]
     assert len(found) > 25
     judged = {where: with_ for where, with_ in found if with_ & {"at_most", "at_least"}}
     assert [where for where, with_ in judged.items() if not with_ & {"yardstick", "bound"}] == []
@@ -415,7 +416,7 @@ def test_a_server_of_environments_that_is_dear_misses_its_goals() -> None:
 
 def test_bench_installs_all_that_it_measures_with() -> None:
     """On a fresh clone, too."""
-    makefile = (control.ROOT / "Makefile").read_text(encoding="utf-8")
+    makefile = (study_on_moto.ROOT / "Makefile").read_text(encoding="utf-8")
     (line,) = [line for line in makefile.splitlines() if line.startswith("bench:")]
     assert {"$(VENV)/dev", "$(MINISTACK)/ready"} <= set(line.split())
 
@@ -501,15 +502,15 @@ def test_memory_that_grows_with_the_study_misses_its_goal(monkeypatch: pytest.Mo
 
 
 def test_a_participant_whose_server_costs_more_calls_misses_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = control.Study.invoke
+    usual = study_on_moto.Study.invoke
 
-    def chatty(study: control.Study, function: types.ModuleType, event: Any) -> dict[str, Any]:
+    def chatty(study: study_on_moto.Study, function: types.ModuleType, event: Any) -> dict[str, Any]:
         answer = usual(study, function, event)
         of = study.calls[function.__name__.rpartition(".")[2]]
         of.extend(of[-1:])
         return answer
 
-    monkeypatch.setattr(control.Study, "invoke", chatty)
+    monkeypatch.setattr(study_on_moto.Study, "invoke", chatty)
     assert next(control.calls_of_a_participant())["met"] is False
 
 
