@@ -225,3 +225,29 @@ def test_two_tabs_and_a_reload_in_the_lobby_are_one_participant(come: Any) -> No
         eva.page.wait_for_timeout(500)
         until -= 1
         assert until, "one of the two tabs has the game, and the other says so"
+
+
+def test_a_link_that_two_people_open_is_one_participant_whose_last_page_plays(come: Any, chromium: Any) -> None:
+    """The other page says so, and takes the game back by a click alone. The partner plays on after each change."""
+    gwen, hans = come("gwen"), come("hans")
+    for person in (gwen, hans):
+        person.plays()
+    other = chromium.new_context()
+    try:
+        second = other.new_page()
+        second.set_default_timeout(45_000)
+        second.goto(gwen.link)
+        gwen.sees("The game is open in another tab or on another device")
+        second.wait_for_selector("#mode[data-state=playing]", state="attached")
+        hans.plays()
+        gwen.page.wait_for_timeout(3_000)  # a page that takes the game back by itself would do so by now
+        assert second.locator("#overlay-title:text('another tab'):visible").count() == 0
+        gwen.page.locator("#overlay-button").click()
+        gwen.plays()
+        second.wait_for_selector("#overlay-title:text('The game is open in another tab or on another device'):visible")
+        hans.plays()
+    finally:
+        other.close()
+    for person in (gwen, hans):
+        person.plays()
+    assert_one_is_red_and_one_blue(gwen, hans)

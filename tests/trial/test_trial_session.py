@@ -998,3 +998,34 @@ def wait_for(true, seconds=15):
     while not true():
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+# ---- acknowledgements that are forged
+
+
+@pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
+def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
+    """Acknowledgements pace a member's own pictures alone."""
+    server = launch_session(launch, trial={"startingFrameRate": 20})
+    form(server.store)
+
+    async def forge(bert):
+        while forged != "none":
+            newest = bert.frames[-1][1] if bert.frames else 0
+            await bert.say(ack=newest + (1000 if forged == "of what was not sent" else 0))
+            await asyncio.sleep(0.02)
+
+    async def run():
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            bert.acks = False
+            tasks = [asyncio.create_task(forge(bert)), asyncio.create_task(bert.watch(60))]
+            await anna.until(lambda: len(anna.frames) > 10)
+            first = len(anna.frames)
+            while len(anna.frames) < first + 80:  # four seconds, after which a page that sleeps is away
+                await anna.take()
+                assert anna.state["people"] == {"left": "here", "right": "here"}
+            for task in tasks:
+                task.cancel()
+
+    asyncio.run(run())
+    assert "Traceback" not in server.said()
