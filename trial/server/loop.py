@@ -58,7 +58,7 @@ from trial.wire.connection import Connection
 
 log = logging.getLogger("trial")
 
-_MOVES = 4  # participants who came and went, of whom callbacks have not been told; more are put together
+_MOVES = 4  # moves that wait until callbacks are told; of more, a leave and the return after it cancel out
 
 
 class TrialLoop:

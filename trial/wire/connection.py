@@ -66,7 +66,7 @@ class Connection:
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.woke: Callable[[int], None] | None = None
-        """Is called with the frame that a client acknowledges which had stopped acknowledging."""
+        """Called with the frame's id when a client acknowledges again that had stopped."""
         self.rate = 30
         """Frames per second of the game now."""
         self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
