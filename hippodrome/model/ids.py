@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import hmac
 import re
@@ -47,6 +48,7 @@ def new_session_id() -> str:
     return f"s.{secrets.token_hex(10)}"
 
 
+@functools.lru_cache(maxsize=1024)  # a request asks several times, and base32 is encoded in Python
 def server_label(project_id: str, user_id: str) -> str:
     """The label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
 
