@@ -7,6 +7,7 @@ import gzip
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,25 +20,64 @@ from testing.held_study import HeldStudy
 from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
+HERE = Path(__file__).parent
 SHOTS = ROOT / "shots"
 PATIENCE = 45_000  # ms
 
 
-@pytest.fixture(scope="module")  # not longer: while Playwright is there, its thread cannot run any other event loop
-def chromium() -> Iterator[Any]:
-    """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required."""
+class Kept:
+    """Chromium, from the first test of this folder that wants it to the last: to start it takes as long as some tests."""
+
+    def __init__(self) -> None:
+        self._open = contextlib.ExitStack()
+        self._browser: Any = None
+
+    def browser(self) -> Any:
+        """The browser, started if it does not run. Raises NoChromium."""
+        if self._browser is None or not self._browser.is_connected():
+            path = chromium_path()
+            from playwright.sync_api import sync_playwright
+
+            self.close()
+            playwright = self._open.enter_context(sync_playwright())
+            self._browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+            self._open.callback(self._browser.close)
+        return self._browser
+
+    def close(self) -> None:
+        """End it, if it runs."""
+        self._browser = None
+        self._open.close()
+
+
+KEPT = Kept()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """After this folder's last test the browser ends: while Playwright is there, its thread cannot run any other event loop."""
     try:
-        path = chromium_path()
+        return (yield)
+    finally:
+        if nextitem is None or not nextitem.path.is_relative_to(HERE):
+            KEPT.close()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required.
+
+    What a file leaves open is closed after it.
+    """
+    try:
+        browser = KEPT.browser()
     except NoChromium:
         if os.environ.get("BROWSER_TESTS") == "required":
             pytest.fail(NO_CHROMIUM)
         pytest.skip(NO_CHROMIUM)
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
-        yield browser
-        browser.close()
+    yield browser
+    for context in browser.contexts:
+        context.close()
 
 
 @contextlib.contextmanager

@@ -676,7 +676,7 @@ def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, t
     world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
     tab.wait_for_selector("#overlay-button:text('Go on')")
     pixel = "[...document.getElementById('screen').getContext('2d').getImageData(0, 0, 1, 1).data].join()"
-    tab.wait_for_function(f"{pixel} === '255,0,0,255'")
+    tab.wait_for_function(f"() => {pixel} === '255,0,0,255'")
 
 
 def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None:

@@ -457,7 +457,7 @@ def test_what_stands_on_a_low_picture_is_seen_whole(together: World, tab: Any, w
     running(together, tab)
     drawn = json.dumps({"new": True, "set": {}, "hud": "nothing yet"})
     together.connections[0].send(struct.pack("!BI", 4, 3) + drawn.encode())
-    tab.wait_for_function("document.getElementById('screen').getBoundingClientRect().height < 80")
+    tab.wait_for_function("() => document.getElementById('screen').getBoundingClientRect().height < 80")
     tell(together, state="paused", heldFor=8, **people(red="away"))
     shows(tab, "#overlay-hint", "If they are not here in")
     assert tab.evaluate(SEEN_WHOLE, "overlay")
