@@ -30,7 +30,7 @@ Faults, one module for each height at which they are injected
 How much and how fast
     `quiet_log`       the log stands still meanwhile
     `exploration`     how many examples and cases `make test` and `make hunt` take
-    `preloaded`       processes of `python -m …` that begin with their imports done
+    `preloaded`       processes of `python -m …` that begin with their imports done; `held_study` and `held_rehearsal` use it
     `memoized_aws`    botocore and moto compute once per process what they would compute for each client and call
     `template`        the resources of `infra/template.yml`
 """

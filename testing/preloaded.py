@@ -42,6 +42,9 @@ OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
 }
 """Modules and scripts that are forked from a process of their own: what that has loaded, and the variables with which it started."""
 
+_ASKS = "ASKS_FOR_PROCESSES"  # names the file at which a process that `starts` others asks for them
+_asks_at = os.environ.pop(_ASKS, "")
+
 
 class Forked:
     """A process, as `subprocess.Popen` tells of it."""
@@ -109,8 +112,11 @@ def start(
     stderr: IO[Any] | int,
     start_new_session: bool = False,
     safe_path: bool = False,
+    starts: bool = False,
 ) -> Forked | subprocess.Popen[str]:
     """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's, and `safe_path` is Python's -P.
+
+    A process that `starts` others by this function has them forked by the process that forked it.
 
     A `module` that ends with `.py` is a script in `cwd`: `python SCRIPT ARGUMENTS`.
     `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
@@ -155,6 +161,7 @@ def start(
             "env": dict(env),
             "session": start_new_session,
             "safe_path": safe_path,
+            "starts": starts,
         }
         socket.send_fds(_forker(kind), [json.dumps(request).encode()], [theirs.fileno(), *fds])
     return Forked(ours, reading)
@@ -186,7 +193,9 @@ def _environment(kind: str) -> dict[str, str]:
 
 @functools.cache
 def _forker(kind: str) -> socket.socket:
-    """The process that forks these (one of `OTHERS`, or empty); it ends with this one."""
+    """The process that forks these (one of `OTHERS`, or empty); it ends with the tests."""
+    if _asks_at and not kind:
+        return socket.socket(fileno=int(_asks_at))
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     with theirs:
@@ -206,8 +215,9 @@ def _forker(kind: str) -> socket.socket:
 def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[str, Any] | None:
     """Fork for each request, and tell the exit code of each process. Returns a request in its new process, None at the end."""
     running: dict[int, tuple[socket.socket, int]] = {}  # by the file that tells of the end
+    asking = {requests.fileno(): requests}  # the tests, and processes that start others
     while True:
-        ready, _, _ = select.select([requests.fileno(), *running], [], [])
+        ready, _, _ = select.select([*asking, *running], [], [])
         for each in ready:
             if each in running:
                 told, pid = running.pop(each)
@@ -216,31 +226,41 @@ def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[
                 with told, contextlib.suppress(OSError):  # who started it may be gone
                     told.send(str(code).encode())
                 continue
-            body, fds, _, _ = socket.recv_fds(requests, 1 << 20, 3)
-            if not body:
+            body, fds, _, _ = socket.recv_fds(asking[each], 1 << 20, 3)
+            if not body and each == requests.fileno():
                 return None
+            if not body:
+                asking.pop(each).close()
+                continue
+            wanted: dict[str, Any] = json.loads(body)
+            asks, asked = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) if wanted["starts"] else (None, None)
             told, pid = socket.socket(fileno=fds[0]), os.fork()
             if pid == 0:
-                for open_socket in (requests, told, *(one for one, _ in running.values())):
+                for open_socket in filter(None, (told, asked, *asking.values(), *(one for one, _ in running.values()))):
                     open_socket.detach()  # `_become` closes their files
-                wanted: dict[str, Any] = json.loads(body)
                 wanted["env"].update(told_by_imports)
-                _become(wanted, *fds[1:])
+                _become(wanted, fds[1], fds[2], asks.detach() if asks else None)
                 return wanted
             for file in fds[1:]:
                 os.close(file)
+            if asks and asked:
+                asks.close()
+                asking[asked.fileno()] = asked
             told.send(str(pid).encode())
             running[os.pidfd_open(pid)] = told, pid
 
 
-def _become(request: dict[str, Any], stdout: int, stderr: int) -> None:
+def _become(request: dict[str, Any], stdout: int, stderr: int, asks: int | None) -> None:
     """Have what a new process has: files, folder, variables, arguments."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if request["session"]:
         os.setsid()
     os.dup2(stdout, 1)
     os.dup2(stderr, 2)
-    os.closerange(3, 1 + max(map(int, os.listdir("/proc/self/fd"))))
+    if asks is not None:
+        os.dup2(asks, 3, inheritable=False)
+        request["env"][_ASKS] = "3"
+    os.closerange(3 if asks is None else 4, 1 + max(map(int, os.listdir("/proc/self/fd"))))
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])

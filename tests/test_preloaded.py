@@ -131,6 +131,35 @@ def test_all_that_it_says_is_read_and_its_end_awaited(begin: Any) -> None:
         silent.communicate(timeout=0.5)
 
 
+STARTS = """
+import json, os, subprocess
+from testing import preloaded
+code = "import os; print(os.getppid(), sorted(os.environ.keys() - ['LC_CTYPE'])); raise SystemExit(5)"
+with open("second.py", "w") as file:
+    file.write(code)
+before = sorted(os.environ)
+second = preloaded.start("second", cwd=os.getcwd(), env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+assert isinstance(second, preloaded.Forked)
+said, _ = second.communicate(timeout=20)
+print(json.dumps([said, f"{os.getppid()} {before}\\n", second.returncode]))
+"""
+
+
+def test_one_that_starts_another_has_it_forked_by_the_same(tmp_path: Path) -> None:
+    """And in the environment of neither is anything of it."""
+    (tmp_path / "starts.py").write_text(STARTS)
+    env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT)}
+    options: Any = {"cwd": tmp_path, "env": env, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    process = preloaded.start("starts", starts=True, **options)
+    said, _ = process.communicate(timeout=20)
+    assert process.returncode == 0, said
+    second, own, code = json.loads(said)
+    assert (second, code) == (own, 5)
+    assert preloaded._ASKS not in own
+    again = preloaded.start("starts", starts=True, **options)
+    assert json.loads(again.communicate(timeout=20)[0])[1] == own, "who asked has gone, and the next one asks too"
+
+
 AGENT_TELLS = """
 import json, os, sys
 class Agent:

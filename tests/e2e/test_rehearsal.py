@@ -32,15 +32,16 @@ TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the syst
 Process = preloaded.Forked | subprocess.Popen[str]
 
 
-def rehearsal(*arguments: str | Path, **env: str) -> Process:
+def rehearsal(*arguments: str | Path, module: str = "testing.held_rehearsal", **env: str) -> Process:
     return preloaded.start(
-        "local.rehearsal",
+        module,
         [*map(str, arguments)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "150", **env},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
+        starts=True,
     )
 
 
@@ -52,7 +53,7 @@ def said(process: Process, seconds: float = 120) -> str:
 
 
 def test_the_example_project(tmp_path: Path) -> None:
-    process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data")
+    process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="local.rehearsal")
     text = said(process)
     assert process.returncode == 0, text
     for line in ("ui.stop", "2 of 2", "6 of 6", "of 30 set", "none"):
