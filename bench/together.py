@@ -1,8 +1,8 @@
 """Games of several participants on real servers, and in a real Chromium: `python -m bench together`.
 
 The game costs next to nothing, so that the server is measured: players on a board, drawn by objects, 30 ticks a second.
-Clients are sockets that acknowledge each picture and press keys. What participants see is timed in their pages, by
-their own clocks.
+Clients are sockets that acknowledge pictures as our page does and press keys. What participants see is timed in their
+pages, by their own clocks.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def server(players: int) -> Iterator[tuple[str, int]]:
 
 async def play(user: str, url: str, count: load.Count) -> None:
     """Play as this member until it is cancelled."""
-    keys = random.Random(user)
+    keys, acknowledging, loop = random.Random(user), load.Acknowledging(), asyncio.get_running_loop()
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.3")], max_size=None, compression=None, open_timeout=60
     ) as client:
@@ -146,7 +146,8 @@ async def play(user: str, url: str, count: load.Count) -> None:
             if isinstance(data, str):
                 continue
             count.pictures += 1
-            await client.send(json.dumps({"ack": load.frame_id(data)}))
+            if acknowledging.due(loop.time()):
+                await client.send(json.dumps({"ack": load.frame_id(data)}))
             if count.pictures % 20 == 0:
                 await client.send(json.dumps({"action": keys.choice(ACTIONS[1:]), "held": keys.random() < 0.5}))
 

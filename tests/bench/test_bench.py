@@ -10,6 +10,7 @@ import io
 import json
 import os
 import platform
+import re
 import sys
 import types
 from collections.abc import Iterator
@@ -601,3 +602,12 @@ def test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goa
         assert next(sessions.judged("in pairs", found))["met"] is False
     assert sessions.judged_faults(0)["met"] is True
     assert sessions.judged_faults(1)["met"] is False
+
+
+def test_clients_of_the_bench_acknowledge_as_the_page_does() -> None:
+    times = [5.0, 5.03, 5.06, 5.09, 5.12, 5.3, 5.33, 5.36]
+    acknowledging = load.Acknowledging()
+    assert [acknowledging.due(now) for now in times] == [True, False, True, False, True, True, False, True]
+    told = re.search(r"const ACK_WAIT = (\d+);", (pictures.ROOT / "web/game/connection.js").read_text(encoding="utf-8"))
+    assert told is not None
+    assert int(told[1]) == 1000 * load.TOGETHER

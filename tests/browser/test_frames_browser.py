@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -166,6 +167,31 @@ def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: W
     assert len(new_world.connections) == 1
 
 
+def test_every_second_frame_is_acknowledged_where_they_come_quickly(new_world: World, tab: Any) -> None:
+    tab.add_init_script(
+        """window.clock = 1000;
+        performance.now = () => window.clock;
+        const wait = window.setTimeout, draw = CanvasRenderingContext2D.prototype.putImageData;
+        window.setTimeout = (done, ms, ...more) => (ms === 50 ? 0 : wait(done, ms, ...more));
+        window.drawn = 0;
+        CanvasRenderingContext2D.prototype.putImageData = function (...parts) { window.drawn += 1; draw.apply(this, parts); };"""
+    )
+    play(new_world, tab)  # the server sends frames 1 and 2
+    for number in range(3, 12):
+        until(tab, lambda number=number: tab.evaluate("window.drawn") == number - 1)
+        tab.evaluate("window.clock += 20")
+        new_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
+    new_world.wait_for({"ack": 11})
+    assert new_world.commands("ack") == [1, 3, 5, 7, 9, 11]
+
+
+def test_a_frame_that_no_other_follows_is_acknowledged(new_world: World, tab: Any) -> None:
+    play(new_world, tab)
+    for number in range(3, 8):
+        new_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
+        new_world.wait_for({"ack": number})
+
+
 def jpeg_of(width: int, height: int) -> bytes:
     out = io.BytesIO()
     Image.new("RGB", (width, height)).save(out, "JPEG")
@@ -173,6 +199,7 @@ def jpeg_of(width: int, height: int) -> bytes:
 
 
 SMALL = np.zeros((2, 2, 3), np.uint8)
+PACKED = zlib.compress(SMALL.tobytes(), wbits=-15)
 BOMBS = {
     "another size": header(JPEG, SMALL, 3) + jpeg_of(3, 2),
     "a huge one in a small frame": header(JPEG, SMALL, 3) + jpeg_of(5000, 5000),

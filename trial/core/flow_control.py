@@ -14,12 +14,14 @@ _WIDEST = 15  # frames under way, however long the round trip
 class Window:
     """The frames that were sent and not acknowledged: at most two more than fit into the round trip.
 
-    A client that has never acknowledged a frame is not held back here, but by its write buffer.
+    To a client that acknowledges two frames at once it is one more, since the first of them waits for the other. A
+    client that has never acknowledged a frame is not held back here, but by its write buffer.
     """
 
     def __init__(self) -> None:
         self._under_way: deque[tuple[int, float, bool]] = deque()  # id, when, whether the first message with this id
         self._round_trip = math.inf
+        self._together = False  # the last acknowledgement was that of several frames
         self._sent_at = -math.inf
         self.newest = -1
         """Id of the newest frame sent."""
@@ -39,17 +41,21 @@ class Window:
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         """The client has shown this frame, and so all before it."""
+        frames = 0
         while self._under_way and self._under_way[0][0] <= frame_id:
             seen, at, first = self._under_way.popleft()
+            frames += first
             if seen == frame_id and first:  # of rows, the acknowledgement may be that of an earlier message
                 self._round_trip = min(self._round_trip, now - at)
+        if frames:
+            self._together = frames > 1
 
     def wait(self, now: float, rate: int) -> float:
         """Seconds until another frame may be sent; 0 for at once. An acknowledgement may come before that."""
         under_way = len(self._under_way)
         if under_way < 2 or not self.acknowledging:  # the first is the usual case
             return 0.0
-        if under_way < min(2 + math.ceil(self._round_trip * rate), _WIDEST):
+        if under_way < min(2 + self._together + math.ceil(self._round_trip * rate), _WIDEST):
             return 0.0
         return max(0.0, self._sent_at + 1.0 - now)  # even then one frame a second: an acknowledgement may be lost
 

@@ -9,6 +9,7 @@ const SILENCE = 2_500; // ms without a message; then the page asks whether the s
 const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
 const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
+const ACK_WAIT = 50; // ms that an acknowledgement waits for one more picture, if they come as quickly
 const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
 
 let link = null; // the present connection; what an earlier one still sends does not count
@@ -18,7 +19,7 @@ let link = null; // the present connection; what an earlier one still sends does
 export function play(server, hear) {
   return new Promise((resolve) => {
     const socket = new WebSocket(server.url, canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : []);
-    const own = { socket, heard: performance.now(), asked: 0, acked: 0, welcome: false };
+    const own = { socket, heard: performance.now(), asked: 0, acked: 0, drawn: -Infinity, owed: 0, welcome: false };
     own.end = (why, result) => {
       if (link !== own) return;
       link = null;
@@ -62,17 +63,20 @@ function receive(own, message, hear) {
   hear(said);
 }
 
+// Every second picture is acknowledged, with the one before it, and each that comes ACK_WAIT or more after the last one.
 function acknowledge(own, id) {
   if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
+  const now = performance.now();
+  const quick = now - own.drawn < ACK_WAIT;
+  Object.assign(own, { newest: id, drawn: now, owed: own.owed + 1 });
+  const wait = quick && own.owed < 2 ? ACK_WAIT : own.acked + ACK_EVERY - now;
+  clearTimeout(own.timer);
   const tell = () => {
-    own.timer = null;
-    own.acked = performance.now();
+    Object.assign(own, { acked: performance.now(), owed: 0 });
     if (link === own) send({ ack: own.newest });
   };
-  own.newest = id;
-  const wait = own.acked + ACK_EVERY - performance.now();
   if (wait <= 0) tell();
-  else own.timer ??= setTimeout(tell, wait);
+  else own.timer = setTimeout(tell, wait);
 }
 
 // On bad Wi-Fi a connection can be dead for minutes before the browser notices.
