@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from testing import preloaded
+from tests.local.conftest import write_study
 from trial.server import process_group
 
 
@@ -12,3 +15,9 @@ from trial.server import process_group
 def forked(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is tried in this process is tried in a forked one, whose imports are done; `make check` starts it as its users do."""
     monkeypatch.setattr(process_group, "Popen", preloaded.popen)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A small study, in which all is well."""
+    return write_study(tmp_path / "study", start=2)

@@ -9,7 +9,7 @@ import pytest
 
 from hippodrome.config import agent_imports, read_project
 from protocol.players import ONNXRUNTIME
-from tests.local.check.test_check import config, run
+from tests.local.check.checking import config, run
 from tests.local.conftest import ROOT, write_study
 
 

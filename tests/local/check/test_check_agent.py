@@ -1,0 +1,446 @@
+"""`python -m local.check` on agent.py: each failure with its line."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import read_project
+from local.check import agent as agent_check
+from local.check.agent_report import slowness
+from local.check.pace import Pace
+from testing.exploration import sample
+from tests.local.check.checking import agent, config, looked, page, run, tried
+
+pytestmark = pytest.mark.usefixtures("forked")
+
+
+# --- agent.py ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("class Agent:", "class Other:", "agent.py: there is no class Agent"),
+        ("class Agent:", "class Agnet:", "agent.py: there is no class Agent; is Agnet meant to be Agent?"),
+        ("class Agent:", "class agent:", "agent.py: there is no class Agent; is agent meant to be Agent?"),
+        ("def render(self):\n        return self.env", "def rendr(self):\n        return self.env", "agent.py:15: Agent has no render"),
+        ("def step(self, action):", "def step(self, a, b, c):", "agent.py:21: step(a, b, c) cannot be called; write step(action) or step(env, action)"),
+        ("import numpy", "import no_such_thing; import numpy", "agent.py:1: start(\"none\") fails: ModuleNotFoundError: No module named 'no_such_thing'; install its package: .venv/bin/pip install no_such_thing"),
+        ("self.n += 1", "self.n += 'x'", "agent.py:8: step(0) fails: TypeError: unsupported operand"),
+        ("return self.env.step(action)", "return 5", "agent.py:21: step() must return "),
+        ("np.zeros((16, 16, 3), np.uint8)", "None", "agent.py:23: render() returned nothing; "),
+        ("def reset(self, seed=None):", "def reset():", "agent.py:"),
+        ("render()\n    def close(self):\n        pass", "render()\n    def close(self):\n        1 / 0", "agent.py:26: remark: close() fails: ZeroDivisionError"),
+        ("self.env = Env()", "raise SystemExit(3)", 'agent.py:17: start("none") fails: SystemExit: 3'),
+        ("self.env = Env()", "print('Oh!'); import os; os._exit(4)", 'agent.py:16: start("none") ended Python itself (exit status 4)'),
+        ("self.env = Env()", "import signal; signal.raise_signal(11)", 'agent.py:16: start("none") ended Python itself (signal SIGSEGV)'),
+    ],
+)  # fmt: skip
+def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
+    agent(folder, old, new)
+    (line,) = tried(folder)
+    assert line.startswith(said)
+
+
+def test_callbacks_that_fail_are_mistakes_and_the_game_is_played_all_the_same(folder: Path) -> None:
+    source = folder / "agent.py"
+    start = len(source.read_text().splitlines())
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        return session.observatons\n"
+        "    def on_episode_end(self):\n        pass\n"
+    )
+    raising, uncallable = tried(folder)
+    assert raising.startswith(f"agent.py:{start + 2}: on_tick() fails: AttributeError: 'Session' object has no")
+    assert uncallable == (
+        f"agent.py:{start + 3}: on_episode_end() fails: TypeError: Agent.on_episode_end() takes 1 positional argument "
+        "but 2 were given"
+    )
+
+
+def test_a_callback_that_hangs_is_remarked(folder: Path) -> None:
+    source = folder / "agent.py"
+    start = len(source.read_text().splitlines())
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        import time\n        time.sleep(999)\n"
+    )
+    assert tried(folder) == [
+        f"agent.py:{start + 1}: remark: on_tick() takes longer than callbackSeconds (0.5 s); callbacks are skipped "
+        "until it has returned"
+    ]
+
+
+def test_callbacks_that_are_fine_are_not_remarked(folder: Path) -> None:
+    source = folder / "agent.py"
+    source.write_text(
+        source.read_text() + "    def on_tick(self, session):\n        session.record('t', session.ticks)\n"
+    )
+    assert tried(folder) == []
+
+
+def test_an_agent_that_fails_late_is_seen(folder: Path) -> None:
+    agent(folder, "self.n += 1", "self.n += 1; assert self.n != 25, 'late'")
+    (line,) = tried(folder)
+    assert line.startswith("agent.py:8: step(")
+    assert "fails (episode 1, after 24 steps in all): AssertionError: late" in line
+
+
+def test_an_agent_that_fails_in_one_group_only_is_seen(folder: Path) -> None:
+    (folder / "steps" / "hello.html").unlink()
+    page(folder, "<p>0", "hello-0")
+    page(folder, "<p>1", "hello-1")
+    agent(folder, "self.n += 1", "import os; self.n += 1; assert os.environ['GROUP'] != '1', 'never'")
+    (line,) = tried(folder)
+    assert "group 1): AssertionError: never" in line
+    status, lines = run(folder)
+    assert status == 1
+    assert "  played in group 0: 1 of 1 episodes to the end, 30 steps" in lines
+
+
+def test_a_game_without_an_end_is_played_for_a_while_and_that_is_said(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(folder, "self.n >= 30", "False")
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 0.5)
+    said: list[str] = []
+    assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
+    assert re.fullmatch(r"played: 0 of 1 episodes to the end, \d+ steps \(its time was over\)", said[0])
+
+
+def test_a_method_that_is_nearly_a_callback_is_remarked_on(folder: Path) -> None:
+    agent(folder, "    def close", "    def on_episode_over(self, session):\n        pass\n\n    def close")
+    (line,) = looked(folder)
+    assert re.fullmatch(
+        r"agent\.py:\d+: remark: on_episode_over is no callback, so it is never called; did you mean on_episode_end\?",
+        line,
+    )
+    agent(
+        folder,
+        "    def close",
+        "    def on_episode_end(self, session):\n        self.on_episode_over(session)\n\n    def close",
+    )
+    assert looked(folder) == []
+
+
+@pytest.mark.parametrize("limit", ["maxSteps: 12", "episodeSeconds: 0.2"])
+def test_an_episode_ends_at_its_limit(folder: Path, limit: str) -> None:
+    agent(folder, "self.n >= 30", "False")
+    config(folder, "  maxEpisodes: 1\n", f"  maxEpisodes: 2\n  {limit}\n")
+    said: list[str] = []
+    assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
+    assert said == ["played: 2 of 2 episodes to the end, 24 steps"]
+
+
+@pytest.mark.parametrize(("names", "remark"), [("[noop, left, right]", False), ("[noop]", True)])
+def test_more_names_than_actions_is_a_mistake(folder: Path, names: str, remark: bool) -> None:
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: {names}")
+    config(folder, ", left: true", "")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    (line,) = tried(folder)
+    assert f"has {names.count(',') + 1} names, but the environment has 2 actions" in line
+    assert (": remark: " in line) is remark
+    assert line.startswith("config.yml:")
+
+
+@pytest.mark.parametrize(
+    ("actions", "dead"),
+    [
+        ("[noop, left, wright]", True),
+        ("[noop, left, RIGHT]", False),
+        ("[noop, left, upright]", False),
+        ("[noop, left, jump, jumpright]", False),
+    ],
+)
+def test_an_arrow_that_no_action_is_called_after_is_remarked(folder: Path, actions: str, dead: bool) -> None:
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: {actions}")
+    config(folder, "left: true", "left: true, right: true, down: false")
+    remark = "config.yml:14: remark: trial.ui.right: the arrow does nothing: no action is called right"
+    assert looked(folder) == ([remark] if dead else [])
+
+
+@pytest.mark.parametrize(
+    ("ui", "count", "remark"),
+    [
+        ("left: true, right: true", 2, "the arrows left and right are not shown: the environment has 2 actions without "
+         "names; name them all, in their order: actionSpace: [left, right]"),
+        ("up: true", 3, "the arrow up is not shown: the environment has 3 actions without names; name them all, in "
+         "their order: actionSpace: [up, …]"),
+        ("left: false", 2, None),
+    ],
+)  # fmt: skip
+def test_arrows_of_actions_without_names_are_remarked(folder: Path, ui: str, count: int, remark: str | None) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "left: true", ui)
+    agent(folder, "class Env:", f"class Space:\n    n = {count}\n\nclass Env:\n    action_space = Space()")
+    assert tried(folder) == ([] if remark is None else [f"config.yml:13: remark: trial.ui: {remark}"])
+
+
+@pytest.mark.parametrize("action_space", ["", "  actionSpace: []\n"])
+def test_an_arrow_without_an_action_of_the_environment_is_remarked(folder: Path, action_space: str) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", action_space)
+    config(folder, "left: true", "left: true, right: true")
+    agent(folder, "class Env:", "class Env:\n    def get_action_meanings(self):\n        return ['NOOP', 'LEFT']")
+    (line,) = tried(folder)
+    assert line.endswith("remark: trial.ui.right: the arrow does nothing: no action is called right")
+
+
+def test_arrows_of_actions_without_names_are_not_remarked_where_ui_is_not(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    assert tried(folder) == []
+
+
+def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) -> None:
+    config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
+    assert looked(folder) == []
+
+
+def test_a_key_without_an_action_of_the_environment_is_remarked(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "  keys:\n    ArrowLeft: left\n    Space: jump\n")
+    agent(folder, "class Env:", "class Env:\n    def get_action_meanings(self):\n        return ['NOOP', 'LEFT']")
+    (line,) = tried(folder)
+    assert line.endswith("the key does nothing: no action is called jump; there are noop, left")
+
+
+def test_with_keys_the_arrows_of_ui_are_not_remarked(folder: Path) -> None:
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  keys: {a: left}")
+    config(folder, "left: true", "left: true, right: true")
+    assert looked(folder) == []
+
+
+def test_players_whom_no_participant_plays_are_remarked(folder: Path) -> None:
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  players: {a: human, b: human, c: idle}")
+    (line,) = looked(folder)
+    assert line.endswith(
+        "remark: trial.players: 2 players are human (a, b), and a game has one participant, who plays the first; "
+        "write players: 2 under project, or let the others be played by a policy"
+    )
+    groups = "players: {0: {a: human, b: random}, 1: {a: human, b: human}}"
+    config(folder, "players: {a: human, b: human, c: idle}", groups)
+    (line,) = looked(folder)
+    assert "trial.players.1: 2 players are human" in line
+
+
+def test_keys_that_act_before_their_combination_are_remarked(folder: Path) -> None:
+    keys = "keys: {a: left, b+a: noop, c+d: noop}"
+    config(folder, "actionSpace: [noop, left]", f"actionSpace: [noop, left]\n  {keys}")
+    assert looked(folder) == []
+    config(folder, keys, f"{keys}\n  input: single")
+    (line,) = looked(folder)
+    assert line.endswith('trial.keys.b+a: with input: single, a does "left" before the other key is down')
+
+
+def test_fields_of_a_page_that_the_game_page_shows_are_remarked(folder: Path) -> None:
+    (folder / "steps" / "rules.html").write_text("<h1>Rules</h1><label>Age <input name='age'></label>")
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  instructions: rules")
+    (line,) = looked(folder)
+    assert line == (
+        "steps/rules.html: remark: its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
+    )
+    (folder / "steps" / "rules.html").write_text("<h1>Rules</h1><p>{{ nobody.knows }}</p>")
+    assert any("nobody" in line for line in looked(folder))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "slow"),
+    [
+        ([0.5] * 6, "2 steps a second"),
+        ([0.3] * 10, "3.3 steps a second"),
+        ([0.13] * 40, None),  # 7.7 of 15
+        ([0.5] * 4, None),  # too short to say
+        ([9.0, *[0.05] * 50], None),  # one step that has to load something
+        ([], None),
+    ],
+)
+def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
+    pace = Pace()
+    for each in seconds:
+        pace.took(each)
+    said = slowness(pace, 15)
+    assert said == (None if slow is None else f"it plays {slow} here; startingFrameRate is 15")
+
+
+def test_an_agent_far_slower_than_the_frame_rate_is_remarked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent(folder, "self.n += 1", "import time; time.sleep(0.3); self.n += 1")
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 3.0)
+    (line,) = tried(folder)
+    said = r"config\.yml:11: remark: trial\.startingFrameRate: it plays [\d.]+ steps a second here; .* is 60"
+    assert re.fullmatch(said, line)
+
+
+def with_a_third_name(folder: Path, step: str) -> None:
+    """A study with three names, of which the environment has two; it complains of any other."""
+    config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left, right]")
+    agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
+    agent(folder, "self.n += 1", "self.n += 1; assert action in (0, 1), 'no such action'")
+    agent(folder, "return self.env.step(action)", step)
+
+
+def test_an_agent_may_turn_names_into_actions_of_the_environment(folder: Path) -> None:
+    with_a_third_name(folder, "return self.env.step([0, 0, 1][action])")
+    assert tried(folder) == []
+
+
+def test_an_error_is_not_blamed_on_the_names_where_the_agent_turns_them_into_actions(folder: Path) -> None:
+    with_a_third_name(folder, "assert action != 2, 'mine'; return self.env.step(0)")
+    (line,) = tried(folder)
+    assert "step(2) fails" in line
+    assert line.endswith("AssertionError: mine")
+
+
+def test_an_action_that_the_environment_complains_of_is_a_mistake_of_the_names(folder: Path) -> None:
+    with_a_third_name(folder, "return self.env.step(action)")
+    (line,) = tried(folder)
+    assert line.startswith("config.yml:13: trial.actionSpace: has 3 names, but the environment has 2 actions; ")
+
+
+def test_an_agent_that_hangs(folder: Path) -> None:
+    agent(folder, "self.n += 1", "import time; time.sleep(1000)")
+    began = time.monotonic()
+    assert tried(folder, 2) == ["agent.py:8: step(0) has not come back within 2 s"]
+    assert time.monotonic() - began < 10
+
+
+def test_nothing_that_the_agent_starts_is_left(folder: Path, tmp_path: Path) -> None:
+    note = tmp_path / "pid"
+    agent(
+        folder,
+        "self.env = Env()",
+        f"import subprocess; open({str(note)!r}, 'w').write(str(subprocess.Popen(['sleep', '99']).pid)); self.env = Env()",
+    )
+    assert tried(folder) == []
+    until = time.monotonic() + 5
+    while Path(f"/proc/{note.read_text()}/cmdline").exists() and Path(f"/proc/{note.read_text()}/cmdline").read_bytes():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_a_custom_agent_without_action_space(folder: Path) -> None:
+    config(folder, "  actionSpace: [noop, left]\n", "")
+    assert tried(folder) == [
+        "config.yml:8: trial.actionSpace: missing; list the game's actions, since the environment does not name them"
+    ]
+
+
+def test_a_game_that_does_not_exist(folder: Path) -> None:
+    (folder / "agent.py").unlink()
+    config(folder, "game: none", "game: CartPoll-v1")
+    (line,) = tried(folder)
+    assert line.startswith('config.yml:9: trial.game: start("CartPoll-v1") fails: gymnasium.error.NameNotFound: ')
+
+
+def test_a_game_without_an_agent(folder: Path) -> None:
+    (folder / "agent.py").unlink()
+    config(folder, "game: none", "game: ALE/Pong-v5")
+    said = "config.yml:13: remark: trial.actionSpace: has 2 names, but the environment has 6 actions"
+    assert tried(folder) == [said]
+
+
+def test_an_agent_sees_what_a_server_would_see(folder: Path) -> None:
+    config(folder, "  maxEpisodes: 1", "  maxEpisodes: 1\n  options: {level: 7}")
+    (folder / "beside.py").write_text("LEVEL = 7")
+    lines = """import beside, json, os, threading
+        assert json.loads(os.environ["TRIAL"])["options"]["level"] == beside.LEVEL
+        assert os.environ["GROUP"] == "" and os.path.exists("config.yml")
+        assert threading.current_thread() is not threading.main_thread()
+        self.env = Env()"""
+    agent(folder, "self.env = Env()", lines)
+    assert tried(folder) == []
+
+
+# --- agents that are started before their participant is known
+
+
+def warm(folder: Path, *, groups: bool = True) -> None:
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  warmServers: 2")
+    if groups:
+        page(folder, "<h1>Hello</h1>", "hello-0")
+        (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-1.html")
+
+
+EARLY = "is not known here: with warmServers the agent starts before its participant comes; read it in reset()"
+
+
+READS = ("os.environ.get('GROUP')", "os.getenv('GROUP')", "'GROUP' in os.environ", "environ.get('GROUP', '0')")
+
+
+@pytest.mark.explores
+@pytest.mark.parametrize(("reads", "at"), sample([(reads, at) for reads in READS for at in (1, 18)], 3))
+def test_a_group_that_is_read_too_early(folder: Path, reads: str, at: int) -> None:
+    warm(folder)
+    if at == 1:
+        agent(folder, "import numpy as np", f"import os; from os import environ; import numpy as np; x = {reads}")
+    else:
+        agent(folder, "self.env = Env()", f"import os; from os import environ\n        x = {reads}; self.env = Env()")
+    assert tried(folder) == [f"agent.py:{at}: remark: GROUP {EARLY}"]
+
+
+def test_a_group_that_is_demanded_too_early_is_a_mistake_with_its_reason(folder: Path) -> None:
+    warm(folder, groups=False)  # an ordinary server has an empty one
+    agent(folder, "self.env = Env()", "import os; self.group = os.environ['GROUP']")
+    remark, mistake = tried(folder)
+    assert remark == f"agent.py:17: remark: GROUP {EARLY}"
+    assert mistake == "agent.py:17: start(\"none\") fails: KeyError: 'GROUP'"
+
+
+def test_a_participant_who_is_asked_for_too_early(folder: Path) -> None:
+    warm(folder, groups=False)
+    (folder / "beside.py").write_text("import os\nPERSON = os.environ.get('USER_ID')\nGROUP = os.environ.get('GROUP')")
+    agent(folder, "import numpy", "import beside; import numpy")
+    assert tried(folder) == [f"beside.py:2: remark: USER_ID {EARLY}"]
+
+
+def test_a_group_that_is_read_at_the_reset_is_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GROUP", "of this shell")
+    monkeypatch.setenv("USER_ID", "of this shell")
+    warm(folder)
+    agent(folder, "self.env = Env()", "import os; dict(os.environ); os.environ.copy(); self.env = Env()")
+    agent(
+        folder,
+        "return self.env.reset(seed=seed)",
+        "import os; assert (os.environ['GROUP'] in '01', os.environ['USER_ID']) == (True, 'check'); return self.env.reset()",
+    )
+    assert tried(folder) == []
+
+
+def test_what_libraries_look_up_is_not_the_projects(folder: Path) -> None:
+    warm(folder)
+    library = folder / ".venv" / "lib" / "site-packages"
+    library.mkdir(parents=True)
+    (library / "somebodys.py").write_text("import os\nx = os.environ.get('GROUP')")
+    agent(folder, "import numpy", f"import sys; sys.path.append({str(library)!r}); import somebodys; import numpy")
+    assert tried(folder) == []
+
+
+def test_without_warm_servers_a_group_may_be_read_at_any_time(folder: Path) -> None:
+    page(folder, "<h1>Hello</h1>", "hello-0")
+    (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-1.html")
+    agent(folder, "self.env = Env()", "import os; assert os.environ['GROUP'] in '01'; self.env = Env()")
+    assert tried(folder) == []
+
+
+def test_a_mistake_in_a_file_beside_the_agent(folder: Path) -> None:
+    (folder / "beside.py").write_text("\nx = (")
+    agent(folder, "import numpy", "import beside; import numpy")
+    assert tried(folder) == ["beside.py:2: start(\"none\") fails: SyntaxError: '(' was never closed"]
+
+
+def test_without_a_game_the_agent_does_not_matter(folder: Path) -> None:
+    config(folder, "2: game, 3: bye", "2: bye")
+    config(folder, "  events: {startServerStep: 2, stopServerStep: 3}\n", "")
+    (folder / "agent.py").write_text("(")
+    status, lines = run(folder)
+    assert status == 0
+    assert len(lines) == 1
+
+
+@pytest.mark.parametrize("source", [b"x = '\xff'", b"\0", b"(", b"  x", b"return"])
+def test_an_agent_that_python_cannot_read(folder: Path, source: bytes) -> None:
+    (folder / "agent.py").write_bytes(source)
+    (line,) = looked(folder)
+    assert line.startswith("agent.py")
+    assert "Python cannot read this" in line

@@ -1,0 +1,308 @@
+"""`python -m local.check` on pages: Jinja, HTML, questions, and the code that recruiters ask for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hippodrome.config import read_project
+from local.check.pages import check_pages
+from tests.local.check.checking import config, looked, page
+
+pytestmark = pytest.mark.usefixtures("forked")
+
+
+# --- Jinja -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\n{% if group %}", "2: Jinja cannot read this: Unexpected end of template."),
+        ("a\n{% endfi %}", "2: Jinja cannot read this: Encountered unknown tag 'endfi'."),
+        ("\n\n{{ group|shout }}", "3: there is no filter shout in Jinja"),
+        ("{{ group|uper }}", "1: there is no filter uper in Jinja; did you mean upper?"),
+        ("\n{% if answers['1'].a %}\n{{ group|uper }}{% endif %}", "3: there is no filter uper"),
+        ("{% if group is evn %}{% endif %}", "1: there is no test evn in Jinja; did you mean even?"),
+        ("<title>x\n</title>\n{{ nobody() }}", "3: the page cannot be shown: UndefinedError: 'nobody' is undefined"),
+        ("\n{% include 'other.html' %}", "2: include, import and extends do not work: a page is one file"),
+        (
+            "<style>@media print{#menu{display:none}}</style>{{ group }}",
+            "1: Jinja cannot read this: Missing end of comment tag; {# begins",
+        ),
+        ("{{ 1 // 0 }}", "1: the page cannot be shown: ZeroDivisionError"),
+        ("{{ 'x' * 100000000 }}", "1: the page cannot be shown: SecurityError"),
+    ],
+)
+def test_jinja(folder: Path, text: str, said: str) -> None:
+    page(folder, text)
+    assert any(line.startswith(f"steps/hello.html:{said}") for line in looked(folder)), looked(folder)
+    assert any(not problem.remark for problem in check_pages(folder, read_project(folder)))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "{{ completion_cod }}",
+            "nothing is shown: there is no value completion_cod; did you mean completion_code?",
+        ),
+        ("{{ answers['1'].n * 2 }}", "a participant without the answer gets an error page here (UndefinedError: "),
+    ],
+)
+def test_jinja_that_may_be_meant(folder: Path, text: str, said: str) -> None:
+    page(folder, text)
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:1: remark: {said}")
+
+
+def test_jinja_that_is_fine(folder: Path) -> None:
+    page(
+        folder,
+        """{{ answers["9"].x.y }} {{ participant.PROLIFIC_PID }} {{ project.name|upper }} {{ completion_code }}
+        {% set n = 3 %}{{ n }} {% for i in range(3) %}<input name="q{{ i }}">{% endfor %} {{ answers["1"].a|tojson }}
+        <style>@media print{ #menu{display:none}}</style> {{ group if group is not none else "nobody" }}""",
+    )
+    assert looked(folder) == []
+
+
+def test_each_group_is_shown_its_page(folder: Path) -> None:
+    (folder / "steps" / "hello.html").unlink()
+    page(folder, "{{ 1 // group }}", "hello-0")
+    page(folder, "{{ 1 // group }}", "hello-1")
+    page(folder, "\n{% if group == 1 %}{{ 1 // 0 }}{% endif %}", "bye")
+    lines = looked(folder)
+    assert [line.partition(": ")[0] for line in lines] == ["steps/hello-0.html:1", "steps/bye.html:2"]
+
+
+# --- HTML --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<img src='cta.png'>", "there is no cta.png in steps/; did you mean cat.png?"),
+        ("<img src='Cat.png'>", "there is no Cat.png in steps/; did you mean cat.png?"),
+        (
+            "<img src='pictures/cat.png'>",
+            "pictures/cat.png is not found: put the file into steps/ itself and write cat.png",
+        ),
+        ("<img src='/steps/quick/dog.png'>", "there is no dog.png in steps/"),
+        ("<img srcset='cat.png 1x, dog.png 2x'>", "there is no dog.png in steps/"),
+        ("<video poster=dog.png></video>", "there is no dog.png in steps/"),
+        ("<img src='cat.bmp'>", "cat.bmp is not shown: of files beside the pages only png, "),
+        ("<iframe src='bye.html'></iframe>", "<iframe> cannot show a file of the project"),
+        ("<p onclick='go()'>", "onclick never runs; use addEventListener in a <script> of the page"),
+        ("<a href='javascript:go()'>x</a>", "javascript: never runs; "),
+        ("<textarea></textarea>", "this <textarea> has no name"),
+        ("<select name=''></select>", "this <select> has no name"),
+        ("<p style='background: url(cat.png)'>", "cat.png is not found from a style; write url(/steps/quick/cat.png)"),
+        ("<style>p { background: url('cat.png') }</style>", "cat.png is not found from a style; "),
+    ],
+)
+def test_html_remarks(folder: Path, text: str, said: str) -> None:
+    (folder / "steps" / "cat.png").touch()
+    page(folder, f"{{# a\ncomment #}}\n{text}")
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:3: remark: {said}")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<input type=File name=x>", "files cannot be sent; take this field out"),
+        (
+            "<img src='https://other.example/cat.png'>",
+            "https://other.example is not in allowedHosts of the config file, so nothing is loaded; "
+            "add https://other.example to allowedHosts",
+        ),
+        ("<script src='//other.example/x.js'></script>", "https://other.example is not in allowedHosts"),
+        (
+            "<img src='http://media.example/cat.png'>",
+            "http://media.example is not in allowedHosts of the config file, so nothing is loaded; write https:// here",
+        ),
+        ("<link rel=stylesheet href=https://media.example/x.css>", "style sheets of other places are not loaded"),
+        ("<embed src=https://media.example/x>", "<embed> is never shown"),
+    ],
+)
+def test_html_mistakes(folder: Path, text: str, said: str) -> None:
+    config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
+    page(folder, f"\n{text}")
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/hello.html:2: {said}")
+
+
+def test_html_that_is_fine(folder: Path) -> None:
+    config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
+    (folder / "steps" / "a cat.png").touch()
+    (folder / "steps" / "x.js").touch()
+    page(
+        folder,
+        """<img src="a%20cat.png?2#x"><img src="./a cat.png"><img src="/steps/quick/a%20cat.png">
+        <img src="https://MEDIA.example/x.png"><img src="https://media.example:443/x"><img src="data:image/png;base64,AA=">
+        <img src="{{ project.id }}.png"><a href="https://anywhere.example">x</a><link rel="preconnect" href="https://x.example">
+        <iframe src="https://media.example/video"></iframe><script src="x.js"></script>
+        <script>if (1 < 2) document.write('<img src="none.png" onclick="x">')</script>
+        <input type="submit"><input type=button><button>Go</button><input name="q{{ group }}" value="{{ answers["1"].n }}">
+        <!-- <img src="none.png"> --> <style>p { background: url(/steps/quick/x.png), url(data:image/png;base64,AA=) }</style>
+        <p one="x" only="y">""",
+    )
+    assert looked(folder) == []
+
+
+# --- questions and tags ------------------------------------------------------------------------------
+
+
+def radio(name: str, *values: str) -> str:
+    return "\n".join(f'<label><input type="radio" name="{name}" value="{value}"> {value}</label>' for value in values)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        (radio("q", "a", "b") + "\n" + radio("q", "a", "b"), 4, "an earlier question has the name q too"),
+        (f"<fieldset>{radio('q', 'a', 'b')}</fieldset>\n<fieldset>{radio('q', 'c', 'd')}</fieldset>", 4, "an earlier question has"),
+        (f"<table><tr><td>{radio('q', '1', '2')}</tr>\n<tr><td>{radio('q', '3', '4')}</tr></table>", 4, "an earlier question has"),
+        ('<input type="radio" name="q" value="a">\n<input type="radio" name="q">', 3, "this choice of q has no value"),
+        ("a\n<textarea name=x>\n<p>more", 3, "<textarea> is never closed, so the rest of the page is not shown"),
+        ("<script>let a = 1", 2, "<script> is never closed"),
+        ("a\n<!-- a comment\n<p>", 3, "this comment is never closed"),
+        ("<script>\nconst a = '{{ answers['1'].a }}'\n</script>", 3, "in a <script>, write {{ answers['1'].a|tojson }}"),
+        ("<script>var id = {{ participant.PROLIFIC_PID }};</script>", 2, "in a <script>, write {{ participant.PROLIFIC_PID|tojson }}"),
+    ],
+)  # fmt: skip
+def test_questions_and_tags_that_lose_something_are_mistakes(folder: Path, text: str, line: int, said: str) -> None:
+    page(folder, f"<h1>Hello</h1>\n{text}")
+    found = looked(folder)
+    assert any(each.startswith(f"steps/hello.html:{line}: {said}") for each in found), found
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("a\n<div>b", 3, "<div> is never closed; add </div>"),
+        ("<b>a\n<i>b</b>", 3, "<i> is never closed"),
+        ("a\n</section>", 3, "</section> closes nothing"),
+    ],
+)
+def test_tags_left_open_are_remarks(folder: Path, text: str, line: int, said: str) -> None:
+    page(folder, f"<h1>Hello</h1>\n{text}")
+    assert [each for each in looked(folder) if each.startswith(f"steps/hello.html:{line}: remark: {said}")]
+
+
+def test_questions_and_tags_that_are_fine(folder: Path) -> None:
+    page(
+        folder,
+        f"""<h1>Hello<br></h1><p>One<p>Two<ul><li>a<li>b</ul>
+        <fieldset>{radio("q", "a", "b")}</fieldset><fieldset>{radio("r", "a", "b")}</fieldset>
+        <table><tr><td>{radio("s", "1")}</td></tr><tr><td>{radio("s", "2")}</td></tr><tr><td>{radio("s", "3")}</table>
+        {{% if group == 1 %}}{radio("t", "a", "b")}{{% else %}}{radio("t", "a", "b")}{{% endif %}}
+        {{% for i in range(2) %}}<div>{radio("u{{ i }}", "a", "b")}</div>{{% endfor %}}
+        <svg><path d="M0 0"/><circle r="1"/></svg> <b><i>x</b></i>
+        <script>const a = {{{{ answers["1"].a|tojson }}}}, g = {{{{ group }}}}, n = {{{{ (group or 0)|int }}}}; if (a < 1) b = "<div>"</script>""",
+    )  # fmt: skip
+    assert looked(folder) == []
+
+
+def test_what_was_answered_before_is_there(folder: Path) -> None:
+    page(
+        folder,
+        '<input type="number" name="age" required><input type="number" name="more"><input type="radio" name="r" value="1">',
+    )
+    page(
+        folder,
+        '{% if answers["1"].age|int > 1 %}{{ answers["1"].age * 2 }}{% endif %}{{ answers["2"].score + 1 }}',
+        "bye",
+    )
+    assert looked(folder) == []
+    page(folder, '\n{{ answers["1"].r + "x" }}{{ answers["1"].r.strip() }}', "bye")
+    (line,) = looked(folder)
+    assert line.startswith("steps/bye.html:2: remark: a participant without the answer gets an error page here")
+    page(folder, '{{ answers["3"].word.strip() }}', "bye")  # its own answer
+    assert "remark: a participant without the answer gets" in looked(folder)[0]
+
+
+def test_a_page_that_no_step_shows(folder: Path) -> None:
+    page(folder, "<p>Hi</p>", "forgotten")
+    assert looked(folder) == [
+        "steps/forgotten.html: remark: no step shows this page; name it under project.steps, or delete it"
+    ]
+
+
+def test_pages_that_no_step_shows_are_one_remark(folder: Path) -> None:
+    for name in ("left", "forgotten"):
+        page(folder, "<p>Hi</p>", name)
+    assert looked(folder) == [
+        "steps/: remark: no step shows these pages; name them under project.steps, or delete them: "
+        "forgotten.html, left.html"
+    ]
+
+
+@pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
+def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
+    page(folder, text)
+    looked(folder)
+
+
+# --- the code that recruiters ask for -----------------------------------------------------------------
+
+NO_CODE = (
+    "remark: this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+)
+
+
+def of_codes(folder: Path, name: str = "end") -> list[str]:
+    return [line.removeprefix(f"steps/{name}.html: ") for line in looked(folder) if "completion_code" in line]
+
+
+@pytest.fixture
+def on_aws(folder: Path) -> Path:
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+    return folder
+
+
+def test_a_last_page_without_a_code_is_remarked(on_aws: Path) -> None:
+    assert of_codes(on_aws) == [NO_CODE]
+    page(on_aws, "{{ completion_code }}", "hello")
+    assert of_codes(on_aws) == [NO_CODE], "those who do not finish see the earlier pages, too"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{# {{ completion_code }} #}",
+        "<p>Your completion_code</p>",
+        "{% raw %}{{ completion_code }}{% endraw %}",
+        "<!-- <a href='https://recruiter.example/complete?cc=C1'>back</a> -->",
+        "<a href='more.html'>more</a>",
+    ],
+)
+def test_what_shows_no_code(on_aws: Path, text: str) -> None:
+    page(on_aws, text, "end")
+    assert of_codes(on_aws) == [NO_CODE]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<p>Your code: {{ completion_code }}</p>",
+        "{% if group %}{{ completion_code|lower }}{% endif %}",
+        "<p><a href='https://recruiter.example/submissions/complete?cc=YOURCODE'>Return</a></p>",
+        '<a href="https://recruiter.example/?id={{ participant.userId }}">Return</a>',
+    ],
+)
+def test_a_code_or_a_link_back_is_enough(on_aws: Path, text: str) -> None:
+    page(on_aws, text, "end")
+    assert of_codes(on_aws) == []
+
+
+def test_each_groups_last_page_needs_one(on_aws: Path) -> None:
+    (on_aws / "steps" / "end.html").unlink()
+    page(on_aws, "{{ completion_code }}", "end-0")
+    page(on_aws, "<h1>Goodbye</h1>", "end-1")
+    assert of_codes(on_aws, "end-1") == [NO_CODE]
+
+
+def test_a_study_on_one_machine_needs_no_code(folder: Path) -> None:
+    assert of_codes(folder) == []
