@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import site
 import sys
 import sysconfig
@@ -179,14 +180,17 @@ def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) ->
     if file.with_suffix("").parts[-len(parts) :] != tuple(parts):
         return None  # `__main__`, or loaded from a file by its path
     came_from = file.parents[len(parts) - 1]
-    installed = (*_INSTALLED, *site.getsitepackages(), site.getusersitepackages())
-    if came_from in (root, _HIPPODROME) or any(
-        came_from.is_relative_to(Path(folder).resolve()) for folder in installed
-    ):
+    if came_from in (root, _HIPPODROME) or any(came_from.is_relative_to(folder) for folder in _installed()):
         return None
     if parts[0] in _TAKEN or parts[0] in metadata.packages_distributions() or not _ours(file, came_from, target):
         return None
     return file.relative_to(came_from).as_posix()
+
+
+@functools.cache
+def _installed() -> tuple[Path, ...]:
+    """The folders of Python's own modules and of packages."""
+    return tuple(_resolved(folder) for folder in (*_INSTALLED, *site.getsitepackages(), site.getusersitepackages()))
 
 
 def _of_hippodrome(file: Path) -> bool:
@@ -195,4 +199,9 @@ def _of_hippodrome(file: Path) -> bool:
 
 def _file(module: Any) -> Path | None:
     name = getattr(module, "__file__", None)
-    return Path(name).resolve() if isinstance(name, str) and name.endswith(".py") else None
+    return _resolved(name) if isinstance(name, str) and name.endswith(".py") else None
+
+
+@functools.cache  # each module is looked at several times
+def _resolved(path: str) -> Path:
+    return Path(path).resolve()
