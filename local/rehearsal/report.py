@@ -101,7 +101,7 @@ def _together(accounts: Sequence[Account]) -> Rows:
             sessions.setdefault(f"{play.step} {play.addresses[0]}", []).append(play)
     sizes = Counter(play.members for members in sessions.values() for play in members[:1])
     made = " and ".join(
-        f"{count} of {size} participant{'' if size == 1 else 's'}"
+        f"{count} with {size} participant{'' if size == 1 else 's'}"
         for size, count in sorted(sizes.items(), reverse=True)
     )
     early = Counter(play.outcome for play in plays if play.outcome in EARLY)

@@ -444,8 +444,11 @@ def test_whoever_is_still_measured_is_not_told_that_they_were_away(together: Wor
     running(together, tab)
     together.stands = {"state": "ready", "heldFor": 8, "you": "blue", "people": {"blue": "awaited", "red": "here"}}
     together.connections[0].send(json.dumps(together.stands))
-    tab.wait_for_selector("#overlay-title:text-is('One moment, please')")
+    tab.wait_for_selector("#overlay-title:text-is('Waiting for the other participant')")
     assert tab.inner_text("#overlay-hint") == "The game begins as soon as everybody is here."
+    assert tab.get_attribute("#people b:first-child", "class") == "awaited"
+    tell(together, state="playing", **people(red="here"))
+    tab.wait_for_selector("#people b.here:first-child")
 
 
 @pytest.mark.parametrize(("width", "height"), [*SIZES, (640, 360)])

@@ -28,7 +28,7 @@ export function buildControls(said) {
   find("controls").replaceChildren(
     ...[
       ...(own?.groups ?? [
-        groupOf("pad", directions.map((name) => actionButton(name, label(name, DIRECTIONS[name].label), `${DIRECTIONS[name].sign}\ufe0e`, said.labels?.[name]))),
+        groupOf("pad", directions.map((name) => actionButton(name, label(name, DIRECTIONS[name].label), `${DIRECTIONS[name].sign}\ufe0e`))),
         groupOf("others", others.map((name) => actionButton(name, label(name)))),
       ]),
       commandsOf(shown, said),

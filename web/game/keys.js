@@ -57,7 +57,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
     arrows: pad.length > 0,
     space: bound.has(called(" ")),
     groups: [
-      groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : nice(ARROWS[key]), labels[single.get(key)]))),
+      groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : nice(ARROWS[key])))),
       groupOf("others", actions.filter(standsAlone).slice(0, MOST_BUTTONS).map((action) => {
         const key = keyOf(action);
         return actionButton(key === undefined ? action : called(key), label(action));
@@ -70,9 +70,9 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
   };
 };
 
-function padButton(key, label, own) {
+function padButton(key, label) {
   const direction = ARROWS[key];
-  const button = actionButton(called(key), label, `${DIRECTIONS[direction].sign}\ufe0e`, own);
+  const button = actionButton(called(key), label, `${DIRECTIONS[direction].sign}\ufe0e`);
   button.className = `hold ${direction}`;
   return button;
 }

@@ -14,8 +14,8 @@ const STATES = { here: "", reads: "reading", awaited: "not here yet", away: "awa
 const COVERS = ["gathering", "held", "begins"];
 
 const pair = data.players === 2;
-const theOther = pair ? "the other participant" : "another participant";
-const theOthers = pair ? "the other participant" : "the other participants";
+const theOther = "the other participant";
+const theOthers = pair ? theOther : theOther + "s";
 const presence = { people: {}, you: "", beginsAt: null, heldUntil: null, shown: "", reason: "" };
 const peopleLine = make("span", { id: "people" });
 const toGoOn = make("p", { id: "reading-wait", role: "status" });
@@ -24,14 +24,13 @@ document.querySelector(".hud").append(peopleLine);
 find("reading-button")?.after(toGoOn);
 
 overlays.gathering = { title: `Waiting for ${theOthers}` };
-overlays.held = {};
-overlays.begins = {};
+Object.assign(overlays, { held: {}, begins: {} });
 overlays.lost.note = nice(theOthers) + " can see that you are away, and the game waits for a short while. Please stay on this page.";
 overlays.unreachable.note = "What you have played is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.";
 // By outcome, what is said of an early end if the server has not said it.
 const ENDINGS = {
   left: "You were away for too long, so the game has ended. What you have played is kept. Please go on.",
-  partnerLeft: `${pair ? "The other participant" : "A participant"} is not there any more, so the game has ended. This is not your fault. Please go on.`,
+  partnerLeft: `${pair ? nice(theOther) : "A participant"} is not there any more, so the game has ended. This is not your fault. Please go on.`,
   ping: "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
 };
 
@@ -75,20 +74,19 @@ function showPeople({ people, you }) {
   const there = names.filter((name) => people[name] === "here").length;
   const shown = names.length > MOST_NAMES ? names.filter((name) => name === presence.you) : names;
   const parts = shown.map((name) => {
-    const own = name === presence.you;
-    const more = own ? "" : STATES[people[name]];
-    const text = own ? `You: ${playerName(name)}` : playerName(name);
-    return make("b", { className: people[name], textContent: more ? `${text} (${more})` : text });
+    const text = playerName(name), more = STATES[people[name]];
+    const textContent = name === presence.you ? `You: ${text}` : more ? `${text} (${more})` : text;
+    return make("b", { className: people[name], textContent });
   });
   if (shown.length < names.length) parts.push(make("b", { className: "here", textContent: `${there} of ${names.length} are here` }));
-  if (peopleLine.textContent !== parts.map((part) => part.textContent).join("")) peopleLine.replaceChildren(...parts);
+  peopleLine.replaceChildren(...parts);
   for (const name of names) if (name !== presence.you && before[name]) tellOf(name, before[name], people[name]);
 }
 
 function tellOf(name, before, now) {
-  const who = pair ? "The other participant" : playerName(name);
-  if (now === "policy" && before !== "policy") showMessage("A computer player has taken the place of " + (pair ? theOther : who) + ".");
-  if (now === "here" && ["away", "policy"].includes(before)) showMessage(`${who} is back.`);
+  const who = pair ? theOther : playerName(name);
+  if (now === "policy" && before !== "policy") showMessage(`A computer player has taken the place of ${who}.`);
+  if (now === "here" && ["away", "policy"].includes(before)) showMessage(`${pair ? nice(who) : who} is back.`);
 }
 
 // Turn by turn: whose turn it is, if it is another's
@@ -102,7 +100,7 @@ function sayWhoseTurn({ state, toAct, turnOf }) {
 function coverPicture() {
   const name = coverName();
   if (game.state === "break" || (find("play").hidden && name !== "begins")) return showWhoReads();
-  const title = titleOfHold();
+  const title = missing().length ? `Waiting for ${pair ? theOther : missing().map(playerName).join(", ")}` : "You were away for a moment";
   if (name === presence.shown && (name !== "held" || title === overlays.held.title)) return countSeconds();
   if (name === "held") releaseAll();
   overlays.begins.title = game.state === "paused" ? "The game goes on" : "The game begins";
@@ -111,17 +109,11 @@ function coverPicture() {
   countSeconds();
 }
 
-// A participant is awaited by the others, and was not away, until the connection has been measured (`maxPing`).
-function titleOfHold() {
-  if (missing().length) return `Waiting for ${pair ? theOther : missing().map(playerName).join(", ")}`;
-  return presence.people[presence.you] === "awaited" ? "One moment, please" : "You were away for a moment";
-}
-
 function coverName() {
   if (game.state === "ended") return game.state;
-  if (presence.heldUntil !== null) return "held";
+  if (presence.heldUntil !== null) return presence.people[presence.you] === "awaited" && !missing().length ? "gathering" : "held"; // awaited: still measured
   if (presence.beginsAt !== null) return "begins";
-  return ["ready", "paused"].includes(game.state) && missing().length ? "gathering" : game.state;
+  return missing().length && ["ready", "paused"].includes(game.state) ? "gathering" : game.state;
 }
 
 // The seconds of the countdown, or until the one who is missing is waited for no longer.

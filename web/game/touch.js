@@ -2,10 +2,8 @@
 import { press, release, tap } from "./actions.js";
 import { make } from "./page.js";
 
-// `own`: the project's text for an action whose button shows a sign. It is shown where the page does not list the keys.
-export function actionButton(action, label, sign, own) {
+export function actionButton(action, label, sign) {
   const button = make("button", { type: "button", textContent: sign ?? label, className: `hold ${action}` });
-  if (sign && own) button.append(make("small", { textContent: own }));
   button.setAttribute("aria-label", label);
   button.dataset.action = action;
   button.addEventListener("click", (event) => event.detail === 0 && tap(action)); // from the keyboard

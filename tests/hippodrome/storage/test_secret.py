@@ -435,9 +435,9 @@ def test_an_entry_that_cannot_be_read_keeps_its_salt_for_its_mending(platform: F
 
 
 def test_nobody_registers_a_salt_or_a_secret_of_their_own(platform: FakePlatform) -> None:
-    for key in ("salt", "secret"):
+    for key, meant in (("salt", "did you mean seats?"), ("secret", "docs/config.md lists all keys")):
         answer = update_project_master_list.handler({"project": registration() | {key: "mine"}}, None)
-        assert answer["problems"] == [f"{key}: unknown key; docs/config.md lists all keys"]
+        assert answer["problems"] == [f"{key}: unknown key; {meant}"]
 
 
 def test_a_study_whose_list_is_of_an_earlier_version_needs_no_secret_at_all() -> None:

@@ -1,0 +1,19 @@
+// The project's texts of arrows: where the page does not list the keys, each stands below its arrow.
+import { hooks } from "./hooks.js";
+
+const captions = new CSSStyleSheet();
+captions.replaceSync(`
+@media (hover: none), (pointer: coarse) {
+  .pad [data-text] { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
+  .pad [data-text]::after { content: attr(data-text); display: block; font-size: .65rem; overflow-wrap: anywhere; }
+}`);
+document.adoptedStyleSheets = [...document.adoptedStyleSheets, captions];
+
+hooks.said.push(({ labels }) => {
+  if (!labels) return;
+  const texts = Object.values(labels);
+  for (const button of document.querySelectorAll(".pad button")) {
+    const text = button.getAttribute("aria-label");
+    if (texts.includes(text)) button.dataset.text = text;
+  }
+});
