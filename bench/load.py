@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from bench import seen
@@ -114,17 +115,34 @@ class Count:
 
 
 class Acknowledging:
-    """Says which pictures a client acknowledges: those that our page does (docs/wire.md, "Acknowledgements")."""
+    """Acknowledges pictures as our page does (docs/wire.md, "Acknowledgements")."""
 
-    def __init__(self) -> None:
+    def __init__(self, send: Callable[[str], Coroutine[Any, Any, None]]) -> None:
+        self._send = send
+        self._loop = asyncio.get_running_loop()
         self._drawn = -math.inf
-        self._owed = False
+        self._later: asyncio.TimerHandle | None = None  # the picture before waits for one more
+        self._telling: asyncio.Task[None] | None = None
 
-    def due(self, now: float) -> bool:
-        """A picture is drawn; whether it is acknowledged at once, with the one before it."""
+    async def drawn(self, picture: int) -> None:
+        """A picture is drawn."""
+        now = self._loop.time()
         quick, self._drawn = now - self._drawn < TOGETHER, now
-        self._owed = quick and not self._owed
-        return not self._owed
+        if quick and self._later is None:
+            self._later = self._loop.call_later(TOGETHER, self._no_other_came, picture)
+            return
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
+        await self._tell(picture)
+
+    def _no_other_came(self, picture: int) -> None:
+        self._later = None
+        self._telling = self._loop.create_task(self._tell(picture))
+
+    async def _tell(self, picture: int) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            await self._send(json.dumps({"ack": picture}))
 
 
 @dataclass
@@ -138,18 +156,18 @@ class Delivered:
 
 async def play(url: str, count: Count) -> None:
     """Play until it is cancelled."""
-    keys, acknowledging, loop = random.Random(7), Acknowledging(), asyncio.get_running_loop()
+    keys = random.Random(7)
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.2")], max_size=None, compression=None, open_timeout=60
     ) as client:
+        acknowledging = Acknowledging(client.send)
         await client.send(json.dumps({"userId": "bench", "token": "bench"}))
         async for data in client:
             count.bytes += len(data)
             if isinstance(data, str):
                 continue
             count.pictures += 1
-            if acknowledging.due(loop.time()):
-                await client.send(json.dumps({"ack": frame_id(data)}))
+            await acknowledging.drawn(frame_id(data))
             if count.pictures == 1:
                 await client.send(json.dumps({"command": "start"}))
             elif count.pictures % 20 == 0:

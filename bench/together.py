@@ -136,18 +136,18 @@ def server(players: int) -> Iterator[tuple[str, int]]:
 
 async def play(user: str, url: str, count: load.Count) -> None:
     """Play as this member until it is cancelled."""
-    keys, acknowledging, loop = random.Random(user), load.Acknowledging(), asyncio.get_running_loop()
+    keys = random.Random(user)
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.3")], max_size=None, compression=None, open_timeout=60
     ) as client:
+        acknowledging = load.Acknowledging(client.send)
         await client.send(json.dumps({"userId": user, "token": member_token(TOKEN, user)}))
         async for data in client:
             count.bytes += len(data)
             if isinstance(data, str):
                 continue
             count.pictures += 1
-            if acknowledging.due(loop.time()):
-                await client.send(json.dumps({"ack": load.frame_id(data)}))
+            await acknowledging.drawn(load.frame_id(data))
             if count.pictures % 20 == 0:
                 await client.send(json.dumps({"action": keys.choice(ACTIONS[1:]), "held": keys.random() < 0.5}))
 

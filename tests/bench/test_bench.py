@@ -604,10 +604,26 @@ def test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goa
     assert sessions.judged_faults(1)["met"] is False
 
 
-def test_clients_of_the_bench_acknowledge_as_the_page_does() -> None:
-    times = [5.0, 5.03, 5.06, 5.09, 5.12, 5.3, 5.33, 5.36]
-    acknowledging = load.Acknowledging()
-    assert [acknowledging.due(now) for now in times] == [True, False, True, False, True, True, False, True]
+def test_clients_of_the_bench_acknowledge_as_the_page_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def acknowledged(times: list[float]) -> list[int]:
+        told: list[str] = []
+
+        async def send(text: str) -> None:
+            told.append(text)
+
+        acknowledging, loop = load.Acknowledging(send), asyncio.get_running_loop()
+        plain = loop.time
+        for picture, now in enumerate(times, 1):
+            monkeypatch.setattr(loop, "time", lambda now=now: now)
+            await acknowledging.drawn(picture)
+        monkeypatch.setattr(loop, "time", plain)
+        async with asyncio.timeout(10):
+            while not told or json.loads(told[-1])["ack"] < len(times):
+                await asyncio.sleep(0.01)
+        return [json.loads(text)["ack"] for text in told]
+
+    assert asyncio.run(acknowledged([5.0, 5.03, 5.06, 5.09, 5.12, 5.3, 5.33, 5.36])) == [1, 3, 5, 6, 8]
+    assert asyncio.run(acknowledged([5.0, 5.03])) == [1, 2], "no other picture came"
     told = re.search(r"const ACK_WAIT = (\d+);", (pictures.ROOT / "web/game/connection.js").read_text(encoding="utf-8"))
     assert told is not None
     assert int(told[1]) == 1000 * load.TOGETHER
