@@ -41,6 +41,13 @@ def test_a_servers_name_is_a_dns_label_that_leads_back_and_shows_no_id(user: str
     assert len(user) < 4 or user.lower() not in name
 
 
+def test_both_timers_of_a_server_lead_to_it() -> None:
+    name = ids.server_name(ids.server_label("maze", "ann"), 2)
+    timers = [name, ids.delayed_timer(name)]
+    assert len(set(timers)) == 2
+    assert [ids.timer_server(timer) for timer in timers] == [name, name]
+
+
 def test_names_of_others_are_not_taken_for_servers() -> None:
     for name in ("www", "s" + "a" * 20, "s" + "a" * 20 + "-0", "S" + "A" * 20 + "-1", "mail-1", "s" + "1" * 20 + "-1"):
         assert ids.parse_server_name(name) is None
