@@ -26,6 +26,7 @@ def _jumps(trial: Mapping[str, Any]) -> bool:
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "labels.js": lambda trial: bool(trial.get("labels")),
+    "rates.js": lambda trial: trial.get("allowFrameRateChange") is True,
     "reading.js": lambda trial: any(isinstance(trial.get(key), str) for key in GAME_PAGES),
     "turns.js": lambda trial: trial.get("pace") == "turns",
     "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),

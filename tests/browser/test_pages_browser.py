@@ -878,6 +878,19 @@ def test_the_words_of_a_hostile_server_stay_words(world: World, tab: Any) -> Non
     reconnected(world, tab)
 
 
+def test_participants_may_change_the_frame_rate_if_the_project_lets_them(world: World, tab: Any) -> None:
+    world.trial = {"allowFrameRateChange": True}
+    world.controls = {"UI": ["start", "fpsSet", "fpsUp", "fpsDown"], "allowFrameRateChange": True}
+    play(world, tab)
+    assert tab.inner_text(".rates output") == "30 per second"
+    tab.click("[data-command=faster]")
+    world.wait_for({"changeFrameRate": "faster"})
+    tab.fill("#rate", "12")
+    world.wait_for({"changeFrameRate": 12})
+    tell(world, state="playing", frameRate=12)
+    tab.wait_for_selector(".rates output:text-is('12 per second')")
+
+
 @pytest.mark.parametrize(
     ("header", "unpacked"),
     [

@@ -1,6 +1,5 @@
 // The buttons and the slider, as the server's message with `UI` and `actionSpace` says.
 import { command } from "./actions.js";
-import { send } from "./connection.js";
 import { hooks } from "./hooks.js";
 import { assignKeys, DIRECTIONS, showLegend } from "./keyboard.js";
 import { find, make } from "./page.js";
@@ -20,7 +19,7 @@ export function buildControls(said) {
   const actions = own ? [] : singleActions(said.actionSpace);
   const space = own?.space ?? actions.includes("fire");
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
-  const label = (name, usual = nice(name)) => said.labels?.[name] ?? usual;
+  const buttonOf = (name) => actionButton(name, said.labels?.[name] ?? nice(name), DIRECTIONS[name]?.sign);
   const others = actions.filter((name) => !(name in DIRECTIONS));
   game.directions = own?.arrows ?? directions.length > 0;
   game.offered = shown;
@@ -28,11 +27,11 @@ export function buildControls(said) {
   find("controls").replaceChildren(
     ...[
       ...(own?.groups ?? [
-        groupOf("pad", directions.map((name) => actionButton(name, label(name, DIRECTIONS[name].label), `${DIRECTIONS[name].sign}\ufe0e`))),
-        groupOf("others", others.map((name) => actionButton(name, label(name)))),
+        groupOf("pad", directions.map(buttonOf)),
+        groupOf("others", others.map(buttonOf)),
       ]),
       commandsOf(shown, said),
-      ratesOf(shown, said),
+      hooks.rates(shown, said),
     ].filter(Boolean),
   );
   showLegend(directions, others, shown, space, own?.lines);
@@ -66,7 +65,7 @@ function commandsOf(shown, { words }) {
 }
 
 // The buttons that the project offers, of `all`: command, label, and the key of `ui` if it is another.
-function commandButtons(shown, all) {
+export function commandButtons(shown, all) {
   const buttons = all.filter(([name, , key = name]) => shown.has(key)).map(([name, label]) => {
     const button = make("button", { type: "button", textContent: label });
     button.dataset.command = name;
@@ -74,27 +73,4 @@ function commandButtons(shown, all) {
     return button;
   });
   return buttons.length ? make("div", { className: "commands" }, ...buttons) : null;
-}
-
-function ratesOf(shown, said) {
-  if (!said.allowFrameRateChange) return null;
-  const buttons = commandButtons(shown, [
-    ["slower", "Slower", "fpsDown"],
-    ["faster", "Faster", "fpsUp"],
-  ]);
-  const box = make("div", { className: "rates" });
-  if (shown.has("fpsSet")) {
-    const slider = make("input", { type: "range", id: "rate", min: said.minFrameRate, max: said.maxFrameRate });
-    slider.addEventListener("change", () => send({ changeFrameRate: Number(slider.value) }));
-    box.append(make("label", { htmlFor: "rate", textContent: "Speed" }), slider, make("output", { htmlFor: "rate" }));
-  }
-  if (buttons) box.append(buttons);
-  return box.childElementCount ? box : null;
-}
-
-export function showRate() {
-  const slider = find("rate");
-  if (!slider) return;
-  slider.value = game.frameRate;
-  slider.nextElementSibling.value = `${game.frameRate} per second`;
 }

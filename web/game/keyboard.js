@@ -4,10 +4,10 @@ import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 
 export const DIRECTIONS = {
-  up: { label: "Up", sign: "↑", codes: ["ArrowUp", "KeyW"] },
-  left: { label: "Left", sign: "←", codes: ["ArrowLeft", "KeyA"] },
-  right: { label: "Right", sign: "→", codes: ["ArrowRight", "KeyD"] },
-  down: { label: "Down", sign: "↓", codes: ["ArrowDown", "KeyS"] },
+  up: { sign: "↑", codes: ["ArrowUp", "KeyW"] },
+  left: { sign: "←", codes: ["ArrowLeft", "KeyA"] },
+  right: { sign: "→", codes: ["ArrowRight", "KeyD"] },
+  down: { sign: "↓", codes: ["ArrowDown", "KeyS"] },
 };
 
 const COMMANDS = { reset: ["R", "begin again"], good: ["G", "good"], bad: ["B", "bad"] }; // key, and words for the legend

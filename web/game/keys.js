@@ -72,7 +72,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
 
 function padButton(key, label) {
   const direction = ARROWS[key];
-  const button = actionButton(called(key), label, `${DIRECTIONS[direction].sign}\ufe0e`);
+  const button = actionButton(called(key), label, DIRECTIONS[direction].sign);
   button.className = `hold ${direction}`;
   return button;
 }

@@ -4,8 +4,8 @@ import { hooks } from "./hooks.js";
 const captions = new CSSStyleSheet();
 captions.replaceSync(`
 @media (hover: none), (pointer: coarse) {
-  .pad [data-text] { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
-  .pad [data-text]::after { content: attr(data-text); display: block; font-size: .65rem; overflow-wrap: anywhere; }
+  .pad .named { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
+  .pad .named::after { content: attr(aria-label); display: block; font-size: .65rem; overflow-wrap: anywhere; }
 }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, captions];
 
@@ -13,7 +13,6 @@ hooks.said.push(({ labels }) => {
   if (!labels) return;
   const texts = Object.values(labels);
   for (const button of document.querySelectorAll(".pad button")) {
-    const text = button.getAttribute("aria-label");
-    if (texts.includes(text)) button.dataset.text = text;
+    button.classList.toggle("named", texts.includes(button.getAttribute("aria-label")));
   }
 });

@@ -85,7 +85,7 @@ function showPeople({ people, you }) {
 
 function tellOf(name, before, now) {
   const who = pair ? theOther : playerName(name);
-  if (now === "policy" && before !== "policy") showMessage(`A computer player has taken the place of ${who}.`);
+  if (now === "policy" && before !== "policy") showMessage("A computer player has taken the place of " + who + ".");
   if (now === "here" && ["away", "policy"].includes(before)) showMessage(`${pair ? nice(who) : who} is back.`);
 }
 

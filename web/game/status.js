@@ -1,6 +1,5 @@
 // What the server says of the game: scores, the number of the game, its state.
 import { showBreak } from "./breaks.js";
-import { showRate } from "./controls.js";
 import { showOverlay } from "./overlay.js";
 import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
@@ -13,7 +12,6 @@ export function showStatus(said) {
   setText(find("total"), `Total ${points(game.score)}`);
   find("total").hidden = !several || game.episodeScore === undefined;
   setText(find("episode"), several ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
-  showRate();
   if (game.state === "break") showBreak(said, before !== "break");
   else if (before !== game.state) showOverlay(game.state);
 }

@@ -3,7 +3,7 @@ import { press, release, tap } from "./actions.js";
 import { make } from "./page.js";
 
 export function actionButton(action, label, sign) {
-  const button = make("button", { type: "button", textContent: sign ?? label, className: `hold ${action}` });
+  const button = make("button", { type: "button", textContent: sign ? `${sign}\ufe0e` : label, className: `hold ${action}` });
   button.setAttribute("aria-label", label);
   button.dataset.action = action;
   button.addEventListener("click", (event) => event.detail === 0 && tap(action)); // from the keyboard

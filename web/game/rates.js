@@ -1,0 +1,31 @@
+// Buttons and a slider for the frame rate, where participants may change it.
+import { commandButtons } from "./controls.js";
+import { send } from "./connection.js";
+import { hooks } from "./hooks.js";
+import { find, make } from "./page.js";
+import { game } from "./state.js";
+
+hooks.rates = (shown, said) => {
+  if (!said.allowFrameRateChange) return null;
+  const buttons = commandButtons(shown, [
+    ["slower", "Slower", "fpsDown"],
+    ["faster", "Faster", "fpsUp"],
+  ]);
+  const box = make("div", { className: "rates" });
+  if (shown.has("fpsSet")) {
+    const slider = make("input", { type: "range", id: "rate", min: said.minFrameRate, max: said.maxFrameRate });
+    slider.addEventListener("change", () => send({ changeFrameRate: Number(slider.value) }));
+    box.append(make("label", { htmlFor: "rate", textContent: "Speed" }), slider, make("output", { htmlFor: "rate" }));
+  }
+  if (buttons) box.append(buttons);
+  return box.childElementCount ? box : null;
+};
+
+hooks.said.push(showRate);
+
+function showRate() {
+  const slider = find("rate");
+  if (!slider) return;
+  slider.value = game.frameRate;
+  slider.nextElementSibling.value = `${game.frameRate} per second`;
+}
