@@ -61,22 +61,24 @@ SHOWN = [
     for name in ("agent.md", "sessions.md")
     for block in re.findall(r"^ {4}def match\((?:.*\n|\n)(?:(?: {4}.*)?\n)+", (DOCS / name).read_text(), re.MULTILINE)
 ]
-WHO = [("0", "no", 0), ("9", "no", 0), ("1", "yes", 1), ("9.5", "yes", 1)]
+WHO = [("0", "no", "seeker", 0), ("9", "no", "seeker", 0), ("1", "yes", "guide", 1), ("9.5", "yes", "guide", 1)]
 PEOPLE = [
-    {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "opinion": opinion}}
-    for name, (skill, opinion, group) in zip("abcd", WHO, strict=True)
+    {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "opinion": opinion, "role": role}}
+    for name, (skill, opinion, role, group) in zip("abcd", WHO, strict=True)
 ]
+CHOSEN = {
+    "opinion": [["a", "c"], ["b", "d"]],
+    "skill": [["a", "c"], ["b", "d"]],
+    "group": [["a", "c"], ["b", "d"]],
+    "role": [["c", "a"], ["d", "b"]],
+}
 
 
-def test_the_docs_show_three_functions() -> None:
-    assert len(SHOWN) == 3
+def test_the_docs_show_four_functions() -> None:
+    assert len(SHOWN) == len(CHOSEN)
 
 
-@pytest.mark.parametrize(
-    ("code", "chosen"),
-    list(zip(SHOWN, ([["a", "c"], ["b", "d"]],) * 3, strict=False)),
-    ids=["opinion", "skill", "group"],
-)
+@pytest.mark.parametrize(("code", "chosen"), list(zip(SHOWN, CHOSEN.values(), strict=False)), ids=list(CHOSEN))
 def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: list[list[str]]) -> None:
     found: dict[str, Any] = {}
     exec(code, found)

@@ -29,35 +29,35 @@ class _Job:
     limit: float
 
 
-class _Bell:
-    """Lets an event loop call `rung` once for each `ring`, which may be called on another thread.
+class _Notifier:
+    """Makes an event loop call `callback` once for each `notify`, which another thread may call.
 
     `call_soon_threadsafe` does that too, with a handle, a write to its own socket and two reads of it: a tick of two
     participants takes 3 % more with it.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, rung: Callable[[], None]) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
         self.loop = loop
-        self._rung = rung
-        self._rings = -1  # an eventfd, where there are such
+        self._callback = callback
+        self._eventfd = -1  # Linux alone has it
         if sys.platform == "linux":
-            self._rings = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_CLOEXEC)
-            loop.add_reader(self._rings, self._hear)
+            self._eventfd = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_CLOEXEC)
+            loop.add_reader(self._eventfd, self._readable)
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         if sys.platform == "linux":
-            os.eventfd_write(self._rings, 1)
+            os.eventfd_write(self._eventfd, 1)
         elif not self.loop.is_closed():
-            self.loop.call_soon_threadsafe(self._rung)
+            self.loop.call_soon_threadsafe(self._callback)
 
-    def _hear(self) -> None:
+    def _readable(self) -> None:
         if sys.platform == "linux":
-            os.eventfd_read(self._rings)  # one of the rings; the loop comes again for each of the others
-        self._rung()
+            os.eventfd_read(self._eventfd)  # takes one of the calls; the loop comes again for each of the others
+        self._callback()
 
     def __del__(self) -> None:
-        if self._rings >= 0:
-            os.close(self._rings)  # the loop has ended, or it would keep this; so would a thread that may ring
+        if self._eventfd >= 0:
+            os.close(self._eventfd)  # nobody uses it: the loop while it runs, and a thread that may notify, keep this
 
 
 class Worker:
@@ -73,8 +73,8 @@ class Worker:
         self._out = 0  # functions that have not returned
         self._waiting: dict[_Job, None] = {}  # those that are not late
         self._timer: asyncio.TimerHandle | None = None  # one for all of them: most return long before their limit
-        self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # for each of them the bell was rung
-        self._bell: _Bell | None = None
+        self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each
+        self._notifier: _Notifier | None = None
 
     @property
     def busy(self) -> bool:
@@ -87,13 +87,13 @@ class Worker:
         To be called from the event loop.
         """
         loop = asyncio.get_running_loop()
-        if self._bell is None or self._bell.loop is not loop:
-            self._bell, self._results = _Bell(loop, self._returned), deque()
-        job, bell, results = _Job(done, loop.time() + limit, limit), self._bell, self._results
+        if self._notifier is None or self._notifier.loop is not loop:
+            self._notifier, self._results = _Notifier(loop, self._returned), deque()
+        job, notifier, results = _Job(done, loop.time() + limit, limit), self._notifier, self._results
 
         def run() -> None:
             results.append((job, *_call(function)))
-            bell.ring()
+            notifier.notify()
 
         self._out += 1
         self._waiting[job] = None
