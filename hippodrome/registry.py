@@ -21,6 +21,7 @@ from hippodrome.model.project import (
     read_list,
     write_list,
 )
+from hippodrome.model.records import from_data
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage import uploaded_pages
@@ -135,7 +136,7 @@ def _parse(registration: object) -> Project:
         checked = parse_registration(registration)
     except ConfigErrors as errors:
         raise NotRegistered(f"{p.where}: {p.message}" for p in errors.diagnostics) from None
-    return msgspec.convert(checked, Project)
+    return from_data(checked, Project)
 
 
 def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:

@@ -34,7 +34,7 @@ from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.model import ids, participant, server
 from hippodrome.model.project import Project
-from hippodrome.model.records import to_json
+from hippodrome.model.records import from_data, to_json
 from hippodrome.storage.secret import KEY as SECRET
 from lambdas import (
     installed,
@@ -476,7 +476,7 @@ class Person:
         return self.finished or bool(self.told)
 
     def _has_come_to_the_game(self) -> None:
-        project = msgspec.convert(self.installation.project, Project)
+        project = from_data(self.installation.project, Project)
         arrived = participant.new_participant(project, self.user, {}, self.installation.clock.now())
         self.installation.put(participant.participant_key(PROJECT, self.user), to_json(arrived))
         for step in project.steps:

@@ -27,6 +27,7 @@ from deploy.study import definition, image, pages
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import agent_imports, parse_registration, remarks
 from hippodrome.model.project import LEGACY_PORT, Project, UnreadableEntry
+from hippodrome.model.records import from_data
 
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
@@ -225,7 +226,7 @@ def _registered(
 
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
     """Whether the registration says anything that is not registered yet."""
-    after = msgspec.convert(parse_registration(dict(registration)), Project)
+    after = from_data(parse_registration(dict(registration)), Project)
     ours = {"version": before.version, "salt": before.salt, "secret": before.secret}
     return bool(msgspec.structs.replace(after, **ours) != before)
 

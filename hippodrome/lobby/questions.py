@@ -19,7 +19,7 @@ import msgspec
 
 from hippodrome.lobby.entries import Waiting, seconds_since
 from hippodrome.model.project import Project
-from hippodrome.model.records import Record, to_json
+from hippodrome.model.records import Record, from_json, to_json
 
 WAITED_STEPS = 5
 """Seconds. How long a participant has waited is told in steps of so many, and asked again as often."""
@@ -89,7 +89,7 @@ def is_full(question: Question) -> bool:
 def read(body: bytes, question: Question) -> Answer:
     """The answer in a document that a server has written, and that may hold anything."""
     try:
-        found = msgspec.json.decode(body, type=_Groups).groups
+        found = from_json(body, _Groups).groups
     except (ValueError, RecursionError):
         return Answer(problem="the answer of match cannot be read")
     asked, taken, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""

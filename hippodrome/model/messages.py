@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from hippodrome.model import ids
-from hippodrome.model.records import Record
+from hippodrome.model.records import Record, from_data
 from hippodrome.ports import Message
 from protocol.session import is_session_id
 
@@ -220,7 +220,7 @@ def to_message(record: Record) -> Message:
 
 def _read(body: Any, kind: type[Any]) -> Any:
     try:
-        return msgspec.convert(body, kind)
+        return from_data(body, kind)
     except (msgspec.ValidationError, RecursionError):
         return None
 

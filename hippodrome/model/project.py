@@ -9,7 +9,7 @@ import msgspec
 
 from hippodrome.model import hippo_entry, ids
 from hippodrome.model.matching import MATCH
-from hippodrome.model.records import Record, from_json, to_json
+from hippodrome.model.records import Record, from_data, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
 STEPS_FOLDER: Literal["steps"] = "steps"
@@ -277,7 +277,7 @@ def read_list(body: bytes) -> MasterList:
     others: list[bytes] = []  # looked at last: of two entries with one id, ours counts
     for raw in map(bytes, from_json(body, _MasterListDocument).projects):
         try:
-            projects.append(_checked(msgspec.json.decode(raw, type=Project)))
+            projects.append(_checked(from_json(raw, Project)))
         except (ValueError, RecursionError) as error:
             if hippo_entry.is_hippos(_as_object(raw)):
                 others.append(raw)
@@ -286,7 +286,7 @@ def read_list(body: bytes) -> MasterList:
     hippos: dict[str, bytes] = {}
     for raw in others:
         try:
-            project = _checked(msgspec.convert(hippo_entry.fields_of(_as_object(raw)), Project))
+            project = _checked(from_data(hippo_entry.fields_of(_as_object(raw)), Project))
             if any(known.id == project.id for known in projects):
                 raise ValueError("another entry has its id")
         except (ValueError, RecursionError) as error:
@@ -335,7 +335,7 @@ def _without_secret(raw: bytes) -> bytes:
     """An entry that cannot be read, without the secret that an earlier version may have written into it."""
     if not _string(_as_object(raw), "secret"):
         return raw
-    entry = msgspec.json.decode(raw, type=dict[str, msgspec.Raw])
+    entry = from_json(raw, dict[str, msgspec.Raw])
     return msgspec.json.encode({key: value for key, value in entry.items() if key != "secret"})
 
 

@@ -32,6 +32,7 @@ from hippodrome.certificates.rules import location
 from hippodrome.http import Request, Response
 from hippodrome.log import logger
 from hippodrome.model import ids, server
+from hippodrome.model.records import from_json
 from hippodrome.model.server import Server, State
 from hippodrome.ports import Documents, Settings
 from hippodrome.servers.sessions import members_of
@@ -337,7 +338,7 @@ def _read(request: Request) -> SigningRequest:
     if request.body is None or len(request.body) > MAX_BODY:
         raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
     try:
-        asked = msgspec.json.decode(request.body, type=SigningRequest)
+        asked = from_json(request.body, SigningRequest)
     except (ValueError, RecursionError):
         raise Refusal(400, "The body must be JSON with server, credential and requests.") from None
     if not 0 < len(asked.requests) <= MAX_REQUESTS:

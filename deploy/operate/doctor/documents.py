@@ -11,8 +11,6 @@ from datetime import timedelta
 from functools import partial
 from typing import Any
 
-import msgspec
-
 from console.formatting import count
 from deploy.core import participants
 from deploy.core.finding import Finding, bad, good, look
@@ -25,6 +23,7 @@ from hippodrome.lobby.decisions import Decisions
 from hippodrome.model import server, warm_pool
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import Project, Step, UnreadableEntry
+from hippodrome.model.records import from_json
 from hippodrome.model.warm_pool import Pool
 from hippodrome.participants import pages
 from hippodrome.participants.pages import StepView
@@ -134,7 +133,7 @@ def _people(there: Documents, project: Project) -> Iterator[Finding]:
         for entry in those
         if entry.key == participant_key(project.id, user)
     )
-    read = _read_latest(there, entries, partial(msgspec.json.decode, type=Participant))
+    read = _read_latest(there, entries, partial(from_json, kind=Participant))
     if wrong := read.count(False):
         yield look(
             f"project {project.id}",
@@ -153,7 +152,7 @@ def _read_latest(there: Documents, entries: Iterable[Entry], read: Callable[[byt
 
 def _is(there: Documents, key: str, kind: type[Any]) -> bool:
     """Whether a document is a record of this kind, or is not there at all."""
-    return _can_be_read(there, key, partial(msgspec.json.decode, type=kind))
+    return _can_be_read(there, key, partial(from_json, kind=kind))
 
 
 def _can_be_read(there: Documents, key: str, read: Callable[[bytes], object]) -> bool:
