@@ -12,6 +12,8 @@ Each bridge says which gap of moto 5.2 it closes (search for "Gap:"). They work 
 
 Gap: moto's IAM proves nothing. Bridge: while a world is open, the handlers in `lambdas/` run with the roles and variables of
 `infra/template.yml`; see `testing/iam/enforcement.py`. A world whose handlers were refused something fails when it closes.
+
+What is read of moto's own is copied first: handlers may run in other threads meanwhile.
 """
 
 from __future__ import annotations
@@ -408,15 +410,15 @@ class MotoWorld:
 
     def task(self, task: str) -> Any:
         """moto's own object behind a task's ARN or id."""
-        for tasks in ecs_backends[ACCOUNT][self.region].tasks.values():
-            for arn, found in tasks.items():
+        for tasks in list(ecs_backends[ACCOUNT][self.region].tasks.values()):
+            for arn, found in list(tasks.items()):
                 if arn.endswith(aws_events.last(task)):
                     return found
         raise LookupError(task)
 
     def task_arns(self) -> list[str]:
         """Every task that ever ran, oldest first."""
-        return [arn for tasks in ecs_backends[ACCOUNT][self.region].tasks.values() for arn in tasks]
+        return [arn for tasks in list(ecs_backends[ACCOUNT][self.region].tasks.values()) for arn in list(tasks)]
 
     def task_event(
         self,
@@ -497,7 +499,7 @@ class MotoWorld:
     def records(self) -> dict[str, str]:
         """The A records of the zone: name without the final dot → address."""
         zone = route53_backends[ACCOUNT]["aws"].get_hosted_zone(self.ids["zone"])
-        return {r.name.rstrip("."): r.records[0] for r in zone.rrsets if r.type == "A"}
+        return {r.name.rstrip("."): r.records[0] for r in list(zone.rrsets) if r.type == "A"}
 
     # -- timers ---------------------------------------------------------------------------------------------------
 
@@ -505,7 +507,7 @@ class MotoWorld:
         """The one-time schedules: name → when (UTC) and the message."""
         schedules = scheduler_backends[ACCOUNT][self.region].schedule_groups["hippodrome"].schedules
         found = {}
-        for name, schedule in schedules.items():
+        for name, schedule in list(schedules.items()):
             at = datetime.strptime(schedule.schedule_expression, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
             found[name] = (at, json.loads(schedule.target["Input"]))
         return found
@@ -563,7 +565,9 @@ class _TokenConflict(_EcsError):
 
 def _check_batch(zone: Any, change_list: list[dict[str, Any]]) -> None:
     present = {
-        (_fold(r.name), r.type): (int(r.ttl), sorted(r.records)) for r in zone.rrsets if r.ttl is not None and r.records
+        (_fold(r.name), r.type): (int(r.ttl), sorted(r.records))
+        for r in list(zone.rrsets)
+        if r.ttl is not None and r.records
     }
     wrong = []
     for change in change_list:

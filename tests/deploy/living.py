@@ -132,7 +132,9 @@ class Living(Installed):
         def connect(host: str, port: int) -> tuple[str, int]:
             if host == f"study.{self.root_domain}":
                 return "127.0.0.1", int(self._site.server_address[1])
-            addresses = {self.public_ip(task): here for task, here in self._ports.items() if task not in self._ended}
+            addresses = {
+                self.public_ip(task): here for task, here in list(self._ports.items()) if task not in self._ended
+            }
             return "127.0.0.1", addresses.get(self.records().get(host, ""), NOBODY)
 
         servers = self.platform.settings.game_sources.split()
