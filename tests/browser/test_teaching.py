@@ -28,6 +28,7 @@ WATCH = """() => {
 }"""
 """Notes each word that the picture says the car has heard: on green or on red, at this place of it."""
 WORDS = ("good", "bad")
+LOOKS = 2_000  # milliseconds; a word teaches nothing about the car of less than 0.2 s ago, so a person looks first
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,7 @@ def test_a_participant_says_good_and_bad_and_sees_that_it_was_heard(
     page.locator("#overlay-button").click()
     page.wait_for_function("() => document.getElementById('mode').dataset.state === 'playing'")
     page.evaluate(WATCH)
+    page.wait_for_timeout(LOOKS)
     for word in ("Good", "Bad"):
         button = page.get_by_role("button", name=word, exact=True)
         box = button.bounding_box()
