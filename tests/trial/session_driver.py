@@ -41,7 +41,7 @@ class SessionDriver:
 
     NAMES = ("left", "right", "third", "fourth")
 
-    def __init__(self, count=2, *, vacant=(), recorded=None, turns=None, **section):
+    def __init__(self, count=2, *, vacant=(), recorded=None, turns=None, answered=None, **section):
         self.names = self.NAMES[:count]
         section = {
             "game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, "players": dict.fromkeys(self.names, "human"),
@@ -67,7 +67,7 @@ class SessionDriver:
             Player(name, SPACE, (self.settings.trial.substitute or "idle") if name in vacant else "human")
             for name in self.names
         )
-        self.event("start", players, recorded, self.now, places=places, vacant=tuple(vacant))
+        self.event("start", players, recorded, self.now, places=places, vacant=tuple(vacant), answered=answered)
         self.works()
 
     def view(self):

@@ -666,6 +666,23 @@ def test_who_was_refused_is_refused_on_the_next_server_too():
     assert (second.errors(1), second.done(1).outcome) == ([PING], "ping")
 
 
+def test_who_was_refused_in_an_earlier_game_is_out_of_this_one_too():
+    answered = {"P1": {"outcome": "ping", "player": "right"}}
+    driver = SessionDriver(maxPing=100, pingSamples=1, answered=answered, **POLICY).come(0).trip(0, 0.02).wait(3.2)
+    assert driver.taken, "the others do not wait for them"
+    driver.come(1)
+    assert (driver.errors(1), driver.done(1).outcome) == ([PING], "ping")
+    driver.say(0, command="stop").take()
+    assert driver.outcomes == {"P0": "stopped"}, "the answer that is there stays"
+    assert ("right", "refused") in driver.presence()
+
+
+def test_an_answer_of_a_member_who_was_not_refused_keeps_nobody_out():
+    driver = SessionDriver(answered={"P1": {"outcome": "finished"}}, **POLICY).begin().wait(0.2)
+    assert driver.taken
+    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+
+
 def test_the_next_server_knows_whose_feedback_the_agent_has_not_heard():
     lines = [
         {"kind": "reset", "episode": 1, "seed": 7},

@@ -719,14 +719,12 @@ def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
 
 def test_a_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
     recorder, _ = recorder_of(tmp_path, Member("anna", None, 0), Member("", None, 1), Member("bert", None, 2))
-    assert asyncio.run(recorder.earlier_answers()) is None
+    assert asyncio.run(recorder.members_answers()) == {}
+    bert = {"bert": {"score": 2, "session": SID}}
     asyncio.run(recorder.save_member("bert", {"score": 2}))
-    assert asyncio.run(recorder.earlier_answers()) is None
+    assert asyncio.run(recorder.members_answers()) == bert
     asyncio.run(recorder.save_member("anna", {"score": 1}))
-    assert asyncio.run(recorder.earlier_answers()) == {
-        "anna": {"score": 1, "session": SID},
-        "bert": {"score": 2, "session": SID},
-    }
+    assert asyncio.run(recorder.members_answers()) == bert | {"anna": {"score": 1, "session": SID}}
 
 
 # ---- round trips
@@ -800,6 +798,28 @@ def test_the_others_play_on_without_a_member_who_is_too_far_away(launch, open_cl
     asyncio.run(run())
     assert server.wait() == 0
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
+
+
+def test_who_is_too_far_away_is_out_of_the_later_games_too(launch, open_client):
+    """They come there before the others, who still play, and would be sent away again and again."""
+    instead = {"substitute": "idle", "afterAbsent": "policy"}
+    trial = {"pingSamples": 3, "maxPing": 150, "countdown": 0, **instead}
+    server = launch_session(launch, trial=trial, GAME_STEPS="3,5,7")
+    form(server.store)
+    later = {"outcome": "ping", "player": "right", "session": SID}
+
+    async def run():
+        async with near_and_far(server, 0.15) as (anna, bert):
+            assert await bert.closed() == 1000
+            assert [answer(server.store, "bert", step)["answers"] for step in "57"] == [later, later]
+            await anna.until(lambda: len(anna.frames) > 5)
+            await anna.say(command="stop")
+            assert await anna.closed() == 1000
+        async with member(server, "anna", step="5") as anna:
+            await anna.until(lambda: anna.state.get("state") == "playing")
+            assert anna.state["people"]["right"] == "policy"
+
+    asyncio.run(run())
 
 
 class CountsPings(ClientConnection):

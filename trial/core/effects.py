@@ -243,6 +243,8 @@ class SaveMember:
 
     human: str
     answers: Mapping[str, Any]
+    later: Mapping[str, Any] | None = None
+    """The answer of each later game step, in which they do not play either; None: they do."""
 
 
 # ---- the log

@@ -59,6 +59,7 @@ class Session:
         *,
         vacant: Sequence[str],
         gone: Sequence[str],
+        answered: Mapping[str, Mapping[str, Any]],
         recorded: RecordedTrial | None,
         trial_id: str,
         say_each: Callable[[Callable[[str], str | None]], None],
@@ -67,6 +68,8 @@ class Session:
     ) -> None:
         """In the places of `vacant` a policy plays from the start. Those of `gone` are of members who never come back:
         the game is over for all once what was played of it stands. `recorded` is what earlier servers have recorded.
+        `answered` are the answers of this step that some members have: who was refused, here or in an earlier game,
+        does not play.
 
         `say_each` tells each client what a function has for its player.
         """
@@ -110,6 +113,11 @@ class Session:
                 self._stopped.add(player)
         for player in gone:
             self.presence.has_left(player)
+        for human, answers in answered.items():
+            if human in places and answers.get("outcome") == "ping":
+                self.presence.refused(places[human])
+                self._answered[human] = dict(answers)
+                self._stored.add(human)
 
     @property
     def _plays_on(self) -> bool:
@@ -296,12 +304,15 @@ class Session:
         self._say_each(lambda player: self.sentence(player) if player in players else None)
 
     def _save_refused(self, seconds: float) -> None:
-        """Store the answers of members who were refused while the others play on."""
+        """Store the answers of members who were refused while the others play on: of this game and of later ones.
+
+        They come to a later game before the others, who still play, and from the same place.
+        """
         for player in self._replaced:
             human = self._humans[player]
             if human not in self._answered and self.presence.over(player) == "ping":
                 self._answered[human] = self._answer(player, seconds)
-                self._emit(SaveMember(human, self._answered[human]))
+                self._emit(SaveMember(human, self._answered[human], {"outcome": "ping", "player": player}))
 
     # ---- recordings and answers
 

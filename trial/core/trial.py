@@ -182,11 +182,13 @@ class Trial:
         places: Mapping[str, str] | None = None,
         vacant: Sequence[str] = (),
         gone: Sequence[str] = (),
+        answered: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> list[Effect]:
         """The agent has started: these are the environment's players, and what earlier servers recorded of the step.
 
         In a session, `places` says which player each member plays, by their id, and `vacant` are the places of humans
-        that no member has: policies are in them. In those of `gone` nobody plays any more.
+        that no member has: policies are in them. In those of `gone` nobody plays any more. `answered` are the answers
+        of this step that some members have, by their ids.
         """
         if self.phase is not Phase.STARTING:
             return []
@@ -199,6 +201,7 @@ class Trial:
                 places,
                 vacant=vacant,
                 gone=gone,
+                answered=answered or {},
                 recorded=recorded,
                 trial_id=self.id,
                 say_each=self._clients.say_each,

@@ -46,24 +46,21 @@ class Recorder:
     # ---- before
 
     async def earlier_answers(self) -> dict[str, Any] | None:
-        """What an earlier server answered for this step; None if the step has not been played.
+        """What an earlier server answered for the participant's step; None if the step has not been played."""
+        return await self._earlier_answer(self._settings.user_id)
 
-        In a session: the answers of its members, by their ids; None unless each of them has one. A server that is lost
-        between two answers has stored all recordings before, so the next one stores those that are missing.
+    async def members_answers(self) -> dict[str, Any]:
+        """In a session: the answers of this step that are there, by the members' ids.
+
+        If each of them has one, the step is over. A server that is lost between two answers has stored all recordings
+        before, so the next one stores those that are missing. Who was refused in an earlier game has one from there.
         """
-        if not self._settings.session:
-            return await self._earlier_answer(self._settings.user_id)
-        found: dict[str, Any] = {}
-        for user_id in self._settings.seats:
-            answers = await self._earlier_answer(user_id)
-            if answers is None:
-                return None
-            found[user_id] = answers
-        return found or None
+        found = {user_id: await self._earlier_answer(user_id) for user_id in self._settings.seats}
+        return {user_id: answers for user_id, answers in found.items() if answers is not None}
 
     async def _earlier_answer(self, user_id: str) -> dict[str, Any] | None:
         try:
-            found = await asyncio.to_thread(self._store.get, self._answer_key(user_id))
+            found = await asyncio.to_thread(self._store.get, answer_key(self._settings.project_id, user_id, self._step))
         except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
             log.warning("cannot look for an earlier answer (%s)", short_error(error))
             return None
@@ -201,19 +198,24 @@ class Recorder:
         if self.storing:
             log.error("a recording is not stored yet; the answer does not wait for it")
 
-    async def save_member(self, user_id: str, answers: Mapping[str, Any]) -> None:
-        """Store the answer of a member of a session. One that is there already stays as it is."""
+    async def save_member(
+        self, user_id: str, answers: Mapping[str, Any], later: Mapping[str, Any] | None = None
+    ) -> None:
+        """Store the answer of a member of a session. One that is there already stays as it is.
+
+        `later` is the answer of each later game step, if they are out of those, too. It is stored first: a member whose
+        own step has its answer goes on, and comes to no game that does not take them.
+        """
         settings = self._settings
         group = next((member.group for member in settings.members if member.user_id == user_id), None)
-        more = {"session": settings.session}
-        await self._create(user_id, Answer(self._step, GAME, group, datetime.now(UTC), {**answers, **more}))
+        following = settings.game_steps[settings.game_steps.index(self._step) + 1 :] if later is not None else ()
+        for step, said in (*((step, later or {}) for step in following), (self._step, answers)):
+            found = {**said, "session": settings.session}
+            await self._create(user_id, Answer(step, GAME, group, datetime.now(UTC), found))
 
     async def _create(self, user_id: str, answer: Answer) -> None:
-        key, data = self._answer_key(user_id), to_json(answer)
+        key, data = answer_key(self._settings.project_id, user_id, answer.step), to_json(answer)
         await retry_forever("write the answer", lambda: asyncio.to_thread(self._store.create, key, data))
-
-    def _answer_key(self, user_id: str) -> str:
-        return answer_key(self._settings.project_id, user_id, self._step)
 
 
 def _whose(settings: Settings) -> dict[str, Any]:

@@ -188,7 +188,7 @@ class TrialLoop:
     # ---- events
 
     async def _start(self, agent_ready: Awaitable[Started | None]) -> None:
-        answers = await self._recorder.earlier_answers()
+        answers, answered = await self._earlier()
         if answers is not None:
             self._apply(self.core.already_played(answers))
             return
@@ -203,7 +203,16 @@ class TrialLoop:
         self._find_callbacks(started, table.players)
         now = self._loop.time()
         places, vacant, gone = table.places, table.vacant, table.gone
-        self._apply(self.core.start(table.players, recorded, now, places=places, vacant=vacant, gone=gone))
+        start = partial(self.core.start, places=places, vacant=vacant, gone=gone, answered=answered)
+        self._apply(start(table.players, recorded, now))
+
+    async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
+        """The answers of a step that is over; and, in a session whose step is not, those of some members."""
+        if not self._settings.session:
+            return await self._recorder.earlier_answers(), {}
+        found = await self._recorder.members_answers()
+        over = bool(found) and len(found) == len(self._settings.seats)
+        return (found, {}) if over else (None, found)
 
     async def _table(self, started: Started) -> Table | None:
         """Who plays whom; None if the policies cannot be loaded, which the log says."""
@@ -421,7 +430,7 @@ class TrialLoop:
             self._do(self.core.answer_saved)
 
     def _save_member(self, effect: SaveMember) -> None:
-        task = asyncio.create_task(self._recorder.save_member(effect.human, effect.answers))
+        task = asyncio.create_task(self._recorder.save_member(effect.human, effect.answers, effect.later))
         self._saving_members.add(task)
 
         def saved(task: asyncio.Task[None]) -> None:
