@@ -196,6 +196,15 @@ def test_the_server_draws_frames_of_an_atlas(tmp_path: Path) -> None:
     assert pixel(raster(found).draw(as_scene([middle])), 50, 25) in ("#7f7fff", "#8080ff")
 
 
+def test_a_sprite_that_is_shown_through_leaves_the_image_of_others_as_it_is(tmp_path: Path) -> None:
+    found = loaded(tmp_path, cook_png=image())
+    sprite = {"id": 1, "type": "sprite", "image": "cook.png", "x": 0, "y": 0}
+    plain = raster(found).draw(as_scene([sprite]))
+    faint = raster(found).draw(as_scene([sprite | {"alpha": 0.5}]))
+    assert pixel(plain, 0, 0) != pixel(faint, 0, 0)
+    assert pixel(raster(found).draw(as_scene([sprite])), 0, 0) == pixel(plain, 0, 0)
+
+
 def test_a_missing_image_is_a_grey_box() -> None:
     sprite = {"id": 1, "type": "sprite", "image": "../../etc/passwd", "x": 0, "y": 0, "width": 10, "height": 10}
     assert pixel(raster().draw(as_scene([sprite])), 5, 5) == "#c0c0c0"

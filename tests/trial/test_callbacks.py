@@ -7,10 +7,12 @@ import logging
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from protocol import exits
+from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
 from trial.agent.callbacks import MOST_VALUES, About, Callbacks, Session, listening
@@ -251,6 +253,25 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
     callbacks.stepped({}, {}, {}, {})
     assert [(line["step"], line["value"]) for line in lines(callbacks)] == [(6, 6)]
     callbacks.close()
+
+
+def test_a_callback_that_returns_as_its_time_is_over_is_on_time_or_announced(monkeypatch):
+    before = {*threading.enumerate()}
+
+    class Returned(threading.Event):
+        def wait(self, timeout=None):
+            """The time is over; before the agent's thread can say so, the callback returns, and its thread goes on."""
+            callbacks.close()
+            for thread in {*threading.enumerate()} - before:
+                thread.join(10)
+            assert self.is_set()
+            return False
+
+    monkeypatch.setattr(callbacks_module, "threading", SimpleNamespace(**{**vars(threading), "Event": Returned}))
+    announced = []
+    callbacks, _ = made(Noting(), late=announced.append)
+    callbacks.episode_began(1, {}, {})
+    assert (callbacks.first_late is not None) == bool(announced)
 
 
 def test_what_is_recorded_is_bounded():

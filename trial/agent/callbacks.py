@@ -353,6 +353,7 @@ class _Thread:
     def __init__(self, late: Callable[[], None]) -> None:
         self._late = late
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._deciding = threading.Lock()  # whether a callback is late: both threads see it in the same way
         self.running: str | None = None
         """The name of the callback that has not returned."""
         threading.Thread(target=self._run, name="callbacks", daemon=True).start()
@@ -362,7 +363,9 @@ class _Thread:
         job = _Job(work, threading.Event())
         self.running = name
         self._jobs.put(job)
-        job.awaited = job.returned.wait(seconds)
+        job.returned.wait(seconds)
+        with self._deciding:
+            job.awaited = job.returned.is_set()
         return job.awaited
 
     def close(self) -> None:
@@ -374,8 +377,10 @@ class _Thread:
                 job.work()
             finally:
                 self.running = None
-                job.returned.set()
-            if not job.awaited:
+                with self._deciding:
+                    job.returned.set()
+                    late = not job.awaited
+            if late:
                 self._late()
 
 

@@ -118,6 +118,7 @@ class Raster:
             height = height or round(width * picture.height / picture.width) or 1
             picture = picture.resize((width, height), self._filter)
         if alpha < 1:
+            picture = picture.copy()  # it may be the image itself, which other sprites show too
             picture.putalpha(picture.getchannel("A").point(lambda value: round(value * alpha)))
         return picture
 
