@@ -15,11 +15,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 from local.check import idle
 from local.check.outside import Outside
@@ -71,7 +71,31 @@ class _Early(os._Environ[str]):
                 self.asked.append(place)
 
 
-def _try(report: Path) -> None:
+class _Deadline:
+    """When the time is over, it ends the process and writes down where that hangs."""
+
+    def __init__(self, stack: IO[str], seconds: float) -> None:
+        self._stack, self._at = stack, time.monotonic() + seconds
+        self._set(seconds)
+
+    @contextlib.contextmanager
+    def within(self, seconds: float) -> Iterator[None]:
+        """Meanwhile the time is over after so many seconds."""
+        self._set(min(seconds, self._left))
+        try:
+            yield
+        finally:
+            self._set(self._left)
+
+    @property
+    def _left(self) -> float:
+        return max(0.001, self._at - time.monotonic())  # no time at all is refused
+
+    def _set(self, seconds: float) -> None:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=self._stack)
+
+
+def _try(report: Path, deadline: _Deadline) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
@@ -94,7 +118,7 @@ def _try(report: Path) -> None:
         return player.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
-    if question and not progress.call("match", lambda: _match(adapter, question, progress)):
+    if question and not _matches(adapter, question, progress, deadline):
         return
     spaces = {PLAYER: player.action_space} if isinstance(player, AgentAdapter) else player.action_spaces
     progress.known = _actions(player, config)
@@ -118,6 +142,15 @@ def _try(report: Path) -> None:
     played = _play(player, progress, reset, config)
     if played and _seen_idle(player, players, config, progress) and progress.call("close", player.close):
         progress.over()
+
+
+def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress, deadline: _Deadline) -> bool:
+    """Whether `match` returns, in the time that it has on a server."""
+    progress.known["within"] = match.SECONDS
+    with deadline.within(match.SECONDS):
+        went_well = progress.call("match", lambda: _match(adapter, question, progress))
+    del progress.known["within"]
+    return went_well
 
 
 def _match(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress) -> None:
@@ -377,8 +410,10 @@ def _told(error: BaseException, folder: Path) -> dict[str, Any]:
 
 def _main(report: Path) -> None:
     with report.with_suffix(".stack").open("w") as stack:
-        faulthandler.dump_traceback_later(float(os.environ.pop("SECONDS")), exit=True, file=stack)
-        thread = threading.Thread(target=_try, args=[report], daemon=True)  # as in a server, not the main thread
+        deadline = _Deadline(stack, float(os.environ.pop("SECONDS")))
+        thread = threading.Thread(
+            target=_try, args=[report, deadline], daemon=True
+        )  # as in a server, not the main thread
         thread.start()
         thread.join()
         sys.stdout.flush()

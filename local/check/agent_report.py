@@ -83,7 +83,7 @@ class AgentReport:
         """In which step of which episode it was; nothing for the first step in all groups."""
         steps, episodes = self._report.get("steps", 0), self._report.get("episodes", 0)
         group = "" if self._group is None else f", group {self._group}"
-        if self._report.get("call") in ("start", "players", "policies", "close"):
+        if self._report.get("call") in ("start", "match", "players", "policies", "close"):
             return f" ({group.removeprefix(', ')})" if self._group else ""
         if steps < 2 and not episodes and not self._group:
             return ""
@@ -224,7 +224,9 @@ class AgentReport:
             stack = self._stack()
             if stack or status is None:
                 hung, player = self._hung(stack), self._asked_policy()
-                message = f"{call} has not come back within {self._seconds:g} s{self._where()}"
+                message = f"{call} has not come back within {self._allowed:g} s{self._where()}"
+                if report.get("call") == "match":
+                    message += ": a server waits no longer, and matches nobody"
                 if hung is None and player is not None:
                     return [self._in_config(self._player(player), message)]
                 return [self._at(hung, message)]
@@ -242,6 +244,12 @@ class AgentReport:
         remark = report["call"] == "close"
         message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
         return [self._at(place, message, remark=remark)]
+
+    @property
+    def _allowed(self) -> float:
+        """Seconds that the last call had."""
+        within: float = self._report.get("within", self._seconds)
+        return min(self._seconds, within)
 
     def _of_players(self, error: Mapping[str, Any], place: tuple[str, int] | None) -> Diagnostic | None:
         """What to say of who plays whom, and of a policy that cannot play; None if it is another error."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from local.check import agent as agent_check
 from local.check.project import check_project
 from tests.local.check.test_players import AGENT
 from tests.local.conftest import write_study
+from trial.agent.match import SECONDS
 
 pytestmark = pytest.mark.usefixtures("forked")
 
@@ -48,9 +50,9 @@ def looked(folder: Path) -> list[str]:
     return [str(problem) for problem in check_project(folder, read_project(folder))]
 
 
-def tried(folder: Path, said: list[str] | None = None) -> list[str]:
+def tried(folder: Path, said: list[str] | None = None, seconds: float = 60) -> list[str]:
     say = (said if said is not None else []).append
-    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), 60, say)]
+    return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds, say)]
 
 
 def test_a_game_of_two_people_is_played_with_random_keys_in_both_places(folder: Path) -> None:
@@ -256,3 +258,30 @@ def test_match_is_called_with_made_up_people(folder: Path, code: str, said: str 
     found = tried(configured(folder, "  matching: match\n"))
     line = before.count("\n") + (2 if said and "NameError" in said else 1)
     assert found == ([f"agent.py:{line}: {said}"] if said else [])
+
+
+@pytest.mark.parametrize(
+    ("code", "line"), [("time.sleep(99)", 2), ("return sleepy()", 5)], ids=["itself", "its groups"]
+)
+def test_a_match_that_does_not_return_is_named_after_the_seconds_that_a_server_gives_it(
+    folder: Path, code: str, line: int
+) -> None:
+    before = f"import time\n{AGENT}\n\n"
+    groups = "def sleepy():\n    yield time.sleep(99)\n"
+    (folder / "agent.py").write_text(f"{before}def match(waiting):\n    {code}\n\n{groups}")
+    began = time.monotonic()
+    assert tried(configured(folder, "  matching: match\n")) == [
+        f"agent.py:{before.count(chr(10)) + line}: match() has not come back within {SECONDS:g} s: a server waits no "
+        "longer, and matches nobody"
+    ]
+    assert time.monotonic() - began < 30, "not the 60 s in which the agent must have played"
+
+
+def test_after_match_the_agent_has_the_rest_of_its_time(folder: Path) -> None:
+    matches = "def match(waiting):\n    return [[one['id'] for one in waiting[:2]]]\n"
+    hangs = AGENT.replace("def reset(self, seed=None):", "def reset(self, seed=None):\n        time.sleep(99)")
+    (folder / "agent.py").write_text(f"import time\n{hangs}\n\n{matches}")
+    began = time.monotonic()
+    (line,) = tried(configured(folder, "  matching: match\n"), seconds=3)
+    assert line.endswith("reset() has not come back within 3 s")
+    assert time.monotonic() - began < 10, "the process ended itself"
