@@ -51,12 +51,13 @@ class ProjectCache:
         found = self.document(MASTER_LIST, fresh)
         if found is None:
             return MasterList()
-        if self._parsed is None or self._parsed[0] != found.etag:
+        parsed = self._parsed  # another thread may keep another list meanwhile
+        if parsed is None or parsed[0] != found.etag:
             listed = read_list(found.body)
             for entry in listed.unreadable:
                 logger.error("a project cannot be read and counts as closed", extra={"project": entry.id})
-            self._parsed = (found.etag, listed)
-        return self._parsed[1]
+            parsed = self._parsed = (found.etag, listed)
+        return parsed[1]
 
     def is_unreadable(self, project_id: str) -> bool:
         """Whether the project is registered but its entry cannot be read, so that it counts as closed."""

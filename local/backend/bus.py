@@ -100,8 +100,9 @@ class _Queue:
     @property
     def idle(self) -> bool:
         """No message that is due waits, and no handler runs."""
-        due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
-        return not due and not self._busy
+        with self._changed:
+            due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
+            return not due and not self._busy
 
     def drain(self, until: float) -> bool:
         """Wait until the queue is idle, at most until `until` (monotonic); return whether it is."""

@@ -91,6 +91,31 @@ def test_a_message_arrives_as_an_sqs_batch_and_its_file_goes(tmp_path: Path, mad
     assert _files(tmp_path) == []
 
 
+def test_no_thread_takes_from_a_queue_while_it_is_seen_whether_it_is_idle(
+    tmp_path: Path, made: list[FolderBus]
+) -> None:
+    queue = _bus(tmp_path, made, start=Functions())._queues["start"]
+
+    class Watched(list[Any]):
+        """Whenever somebody sees how many wait, another thread takes them, if it may."""
+
+        def __len__(self) -> int:
+            count = super().__len__()
+            other = threading.Thread(target=self._take)
+            other.start()
+            other.join()
+            return count
+
+        def _take(self) -> None:
+            if queue._changed.acquire(blocking=False):
+                self.clear()
+                queue._changed.release()
+
+    queue.put({"userId": "ada"})
+    queue._waiting, queue._open = Watched(queue._waiting), True
+    assert not queue.idle
+
+
 def test_batches_have_at_most_ten(tmp_path: Path, made: list[FolderBus]) -> None:
     stop = Functions()
     bus = _bus(tmp_path, made, stop=stop)
