@@ -121,7 +121,8 @@ class MotoWorld:
 
     def client(self, service: str) -> Any:
         """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""
-        return _own_client(service, self.region)
+        with _making:
+            return _own_client(service, self.region)
 
     # -- watching and troubling the calls -------------------------------------------------------------------------
 
@@ -190,11 +191,20 @@ class MotoWorld:
 
     # -- bridges --------------------------------------------------------------------------------------------------
 
+    def one_at_a_time(self, app: Callable[..., Any]) -> Callable[..., Any]:
+        """A WSGI application before this account, such as moto's server: one request at a time, of whatever client."""
+
+        def serve(environ: dict[str, Any], start_response: Any) -> Any:
+            with self._lock:
+                return app(environ, start_response)
+
+        return serve
+
     def _bridge(self) -> None:
         world = self
 
         # Gap: moto reads, compares and writes without a lock, so two conditional writes in two threads can both win.
-        # AWS decides each one atomically. Bridge: one request at a time.
+        # AWS decides each one atomically. Bridge: one request at a time; see `one_at_a_time` for moto's server.
         serve = BotocoreStubber.__call__
 
         def one_at_a_time(stubber: Any, event_name: str, request: Any, **kwargs: Any) -> Any:
@@ -481,18 +491,20 @@ class MotoWorld:
         ec2 = self.client("ec2")
         details = {item["name"]: item["value"] for item in self.task(task).attachments[0]["details"]}
         interface = details["networkInterfaceId"]
-        found = ec2.describe_network_interfaces(NetworkInterfaceIds=[interface])["NetworkInterfaces"][0]
-        if found.get("Association"):
-            return str(found["Association"]["PublicIp"])
-        address = ec2.allocate_address(Domain="vpc")
-        ec2.associate_address(AllocationId=address["AllocationId"], NetworkInterfaceId=interface)
-        return str(address["PublicIp"])
+        with self._lock:
+            found = ec2.describe_network_interfaces(NetworkInterfaceIds=[interface])["NetworkInterfaces"][0]
+            if found.get("Association"):
+                return str(found["Association"]["PublicIp"])
+            address = ec2.allocate_address(Domain="vpc")
+            ec2.associate_address(AllocationId=address["AllocationId"], NetworkInterfaceId=interface)
+            return str(address["PublicIp"])
 
     def _remove_interface(self, interface: str) -> None:
         backend = ec2_backends[ACCOUNT][self.region]
-        if interface in backend.enis:
-            backend.addresses = [a for a in backend.addresses if a.eni is None or a.eni.id != interface]
-            del backend.enis[interface]
+        with self._lock:
+            if interface in backend.enis:
+                backend.addresses = [a for a in backend.addresses if a.eni is None or a.eni.id != interface]
+                del backend.enis[interface]
 
     # -- names ----------------------------------------------------------------------------------------------------
 
@@ -525,6 +537,7 @@ class MotoWorld:
         return dict(json.loads(schedule.target["Input"]))
 
 
+_making = threading.Lock()  # making a client is not thread-safe, using one is
 _own_session = botocore.session.get_session()  # made before any world's recorder, which so does not see its calls
 
 

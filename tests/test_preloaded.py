@@ -114,6 +114,14 @@ def test_it_ends_by_a_signal_and_is_waited_for(begin: Any, number: signal.Signal
     process.send_signal(number)  # and nothing happens
 
 
+def test_one_that_ends_as_a_signal_is_sent_is_no_error(begin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    process = begin("0", stderr=subprocess.STDOUT)
+    if isinstance(process, preloaded.Forked):
+        monkeypatch.setattr(process, "poll", lambda: [process.wait(20), None][1])  # it ends meanwhile
+    process.kill()
+    assert process.wait(20) in (0, -signal.SIGKILL)
+
+
 def test_each_has_variables_and_memory_of_its_own(begin: Any) -> None:
     first, second = begin(stderr=subprocess.STDOUT), begin(stderr=subprocess.STDOUT)
     assert first.pid != second.pid

@@ -259,6 +259,8 @@ class Installed(MotoWorld):
 
         server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
         server.start()
+        assert server._server
+        server._server.app = self.one_at_a_time(server._server.app)
         host, port = server.get_host_and_port()
         try:
             yield environment(f"http://{host}:{port}")

@@ -93,11 +93,10 @@ class Living(Installed):
     def __exit__(self, *error: object) -> None:
         self._over.set()
         for thread in getattr(self, "_threads", ()):
-            thread.join(20)
+            thread.join()
         for process in self._processes.values():
             process.kill()
             process.wait()
-        installed.use(None)
         super().__exit__(*error)
         assert error[0] or not self.troubles, self.troubles
 
@@ -108,6 +107,7 @@ class Living(Installed):
         botocore.handlers.BUILTIN_HANDLERS.append(ours)
         self._stack.callback(botocore.handlers.BUILTIN_HANDLERS.remove, ours)
         installed.use(self.platform)
+        self._stack.callback(installed.use, None)
         authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         self.authority = authority
         SecretCache(self.platform.documents).get_or_create()  # there is one once a server has started
@@ -117,6 +117,7 @@ class Living(Installed):
         self._site = _site(self, Path(self._temporary), certificate + key)
         self._signer = _signer(self)
         for server in (self._site, self._signer):
+            server.daemon_threads = False  # so that `server_close` waits for what is being answered
             self._stack.callback(server.server_close)
             self._stack.callback(server.shutdown)
         threading.Thread(target=self._signer.serve_forever, daemon=True).start()
