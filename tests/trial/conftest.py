@@ -207,13 +207,23 @@ class Client(TakesMessages):
             self.state = message
             self.states.append(message["state"])
 
+    async def heard(self) -> None:
+        """Return when the server has heard all that was said so far; the next picture but one is of a later step."""
+        self.controls = {}
+        await self.say(command="requestUI")
+        await self.until(lambda: self.controls)
+
+    async def sees(self, more: int) -> None:
+        """Take messages until so many more pictures have come."""
+        seen = len(self.frames)
+        await self.until(lambda: len(self.frames) >= seen + more)
+
     async def play(self, frames: int = 5) -> None:
         """Say hello, start, and see some frames."""
         await self.hello()
         await self.until(lambda: self.controls)
         await self.say(command="start")
-        seen = len(self.frames)
-        await self.until(lambda: len(self.frames) >= seen + frames)
+        await self.sees(frames)
 
 
 @contextlib.asynccontextmanager

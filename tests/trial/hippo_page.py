@@ -89,6 +89,12 @@ class HippoPage(TakesMessages):
             self.frame_count += 1
             self.frame_id = message["frameId"]
 
+    async def heard(self) -> None:
+        """Return when the server has heard all that was said so far; the next picture but one is of a later step."""
+        self.ui = []
+        await self.command("requestUI")
+        await self.until(lambda: self.ui)
+
     async def frames(self, more: int) -> None:
         until = self.frame_count + more
         await self.until(lambda: self.frame_count >= until)

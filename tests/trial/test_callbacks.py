@@ -251,6 +251,7 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
         (1, None, 4),
     ]
     callbacks.stepped({}, {}, {}, {})
+    wait_for(lambda: not callbacks.busy)
     assert [(line["step"], line["value"]) for line in lines(callbacks)] == [(6, 6)]
     callbacks.close()
 
@@ -342,12 +343,22 @@ class Agent(Agent):
 TRIAL = {"maxEpisodes": 2, "startingFrameRate": 60, "maxFrameRate": 60, "ui": {"start": True, "good": True}}
 
 
+WAITS = """
+import os, time
+class Agent(Agent):
+    def step(self, action):
+        while self.env.t == 20 and not os.path.exists("go_on"): time.sleep(0.02)
+        return super().step(action)
+"""
+
+
 def values(found):
     return [(line["name"], line["value"]) for line in found if line["kind"] == "callback" and line["name"] != "t"]
 
 
 def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
-    server = launch(grid(30) + CALLBACKS, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
+    agent = grid(30) + CALLBACKS + WAITS
+    server = launch(agent, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
 
     async def journey():
         async with open_client(server.address) as client:
@@ -356,6 +367,7 @@ def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
             await client.say(command="start")
             await client.say(command="good")
             await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
+        server.log.with_name("go_on").touch()
         async with open_client(server.address) as client:
             await client.hello()
             await client.until(lambda: client.controls)
@@ -448,7 +460,7 @@ class Agent(Agent):
 
 
 def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid, open_client):
-    deterministic = grid(60) + RESUMED
+    deterministic = grid(60) + RESUMED + WAITS
 
     async def some(server):
         async with open_client(server.address) as client:
@@ -468,6 +480,7 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
     first = launch(deterministic, trial, SERVER="a-1")
     asyncio.run(some(first))
     first.terminate()
+    first.log.with_name("go_on").touch()
     first.wait()
     second = launch(deterministic, trial, SERVER="a-2")
     asyncio.run(rest(second))

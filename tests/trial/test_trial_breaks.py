@@ -10,6 +10,7 @@ from trial.core.ended import Break, Episode
 from trial.core.players import PLAYER, alone
 from trial.core.progress import PlayState, Progress
 from trial.core.unfinished import RecordedTrial
+from trial.recordings import recording
 from trial.recordings.resume import add_lines
 from trial.settings import trial_section
 
@@ -164,7 +165,7 @@ def test_nothing_moves_in_a_break_and_feedback_still_belongs_to_the_episode(laun
     async def play():
         async with open_client(server.address) as client:
             await to_the_break(client)
-            await client.watch(0.3)
+            await client.until(lambda: client.frame[8, 8, 0] == 255)  # the picture of the last step
             before, frames = calls.read_text(), len(client.frames)
             await client.say(action="left", held=True)
             await client.say(action="up")
@@ -223,7 +224,9 @@ def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(la
             await to_the_break(client)
             await client.say(command="good")
             if kill:
-                await client.watch(0.8)  # what was recorded is written after half a second
+                (part,) = first.store.rglob("*.part")
+                while kinds(recording.read(part.read_bytes()))[-1:] != ["end"]:  # it is written every half second
+                    await client.watch(0.05)
                 first.process.kill()
             else:
                 first.terminate()

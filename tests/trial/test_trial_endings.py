@@ -88,8 +88,8 @@ def test_kill_loses_a_second_at_most(launch, open_client):
     last = asyncio.run(play())
     server.wait()
     (part,) = server.store.rglob("*.part")
-    steps = steps_of(recording.read(part.read_bytes()))
-    assert last - steps[-1]["frame"] <= 50
+    left = recording.read(part.read_bytes())
+    assert last - steps_of(left)[-1]["frame"] <= 50
     # The next process of this server stores what is left, and begins a file of its own.
     again = launch(trial={"startingFrameRate": 50, "ui": UI})
 
@@ -103,7 +103,7 @@ def test_kill_loses_a_second_at_most(launch, open_client):
     assert again.wait() == 0
     kept = again.recordings()
     assert len(kept) == 2
-    assert sorted(len(steps_of(lines)) for lines in kept.values())[-1] == len(steps)
+    assert left in kept.values()
     assert not list(server.store.rglob("*.part"))
 
 
@@ -114,24 +114,24 @@ def test_nobody_comes(launch):
 
 
 def test_a_participant_who_leaves_is_waited_for(launch, open_client):
-    server = launch(IDLE_SECONDS="1", GRACE_SECONDS="5")
+    server = launch(IDLE_SECONDS="3", GRACE_SECONDS="6")
 
     async def play():
         async with open_client(server.address) as client:
             await client.play()
-            await client.watch(1.5)
+            await client.watch(3.2)
         left = time.monotonic()
         await asyncio.sleep(1.5)
         async with open_client(server.address) as client:
             await client.hello()
             await client.until(lambda: client.frames)
             assert client.controls["state"] == "paused"
-            assert time.monotonic() - left < 5, "this machine is too slow for the test"
+            assert time.monotonic() - left < 6, "this machine is too slow for the test"
             return time.monotonic()
 
     left = asyncio.run(play())
     assert server.wait() == 0
-    assert time.monotonic() - left > 4.9
+    assert time.monotonic() - left > 5.9
     (lines,) = server.recordings().values()
     assert lines[-1]["why"] == "shutdown"
 
@@ -182,7 +182,8 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
             await client.play(10)
             await client.say(command="stop")
             await client.until(lambda: client.state["state"] == "ended")
-            await client.watch(1)
+            while "trying again" not in server.said():
+                await client.watch(0.05)
             assert not server.answered()
             assert client.done is None, "not done before the data are safe"
             blocked.unlink()

@@ -269,7 +269,7 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
 
 
 def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch: Any) -> None:
-    server = launch(agent(), SERVES, IDLE_SECONDS="3")
+    server = launch(agent(), SERVES, IDLE_SECONDS="5")
 
     def train() -> None:
         with served(server) as env:

@@ -123,7 +123,7 @@ def does_not_begin(server, open_client, user, status=NO_AGENT):
             assert client.done is None
 
     asyncio.run(play())
-    assert server.wait(5) == status
+    assert server.wait() == status
     assert not (server.store / f"study/users/{user}/answers").exists()
     assert user not in server.said()
 
@@ -208,14 +208,19 @@ def test_a_step_that_never_returns(launch, open_client):
 
 
 def test_a_stuck_step_does_not_hold_up_the_end(launch, open_client):
-    source = BASE.replace("self.steps += 1", "self.steps += 1\n        while self.steps > 5: time.sleep(1)")
+    source = BASE.replace(
+        "self.steps += 1",
+        "self.steps += 1\n        while self.steps > 5:\n            open('stuck', 'w').close()\n            time.sleep(1)",
+    )
     server = launch(source, NAMES)
+    stuck = server.log.with_name("stuck")  # the server's folder
 
     async def play():
         async with open_client(server.address) as client:
             await client.hello()
             await client.say(command="start")
-            await client.watch(1)
+            while not stuck.exists():
+                await client.watch(0.02)
             server.terminate()
             assert await client.closed() == 1001
 
@@ -258,7 +263,8 @@ def test_a_slow_step_leaves_the_connection_alive(launch, open_client, tmp_path):
 
 def steps_by(launch, open_client, source):
     """What one episode's steps say of who chose; `left` is held in the later ones."""
-    server = launch(source, {**NAMES, "maxEpisodes": 1})
+    waits = "self.steps += 1\n        while self.steps == 20 and not os.path.exists('go_on'): time.sleep(0.02)"
+    server = launch("import os\n" + source.replace("self.steps += 1", waits), {**NAMES, "maxEpisodes": 1})
 
     async def play():
         async with open_client(server.address) as client:
@@ -267,6 +273,8 @@ def steps_by(launch, open_client, source):
             await client.say(command="start")
             await client.until(lambda: len(client.frames) > 3)
             await client.say(action="left", held=True)
+            await client.heard()
+            server.log.with_name("go_on").touch()
             assert await client.closed() == 1000
 
     asyncio.run(play())

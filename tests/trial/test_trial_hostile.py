@@ -126,7 +126,7 @@ def test_floods_are_4429(launch, open_client):
         async with open_client(server.address) as client:
             await client.play()
             with contextlib.suppress(ConnectionClosed):
-                for _ in range(300):
+                for _ in range(2000):  # ten times as many as are allowed in a second, however slow this machine is
                     await client.say(action="left")
             assert await client.closed() == 4429
         async with open_client(server.address) as client:
@@ -145,9 +145,9 @@ def test_many_strangers_do_not_keep_the_participant_out(launch, open_client):
             strangers = [await stack.enter_async_context(open_client(server.address)) for _ in range(90)]
             async with open_client(server.address) as client:
                 await client.play()
-            await asyncio.sleep(0.2)
-            cut = sum(stranger.websocket.close_code is not None for stranger in strangers)
-            assert cut >= 20
+            async with asyncio.timeout(15):
+                while sum(stranger.websocket.close_code is not None for stranger in strangers) < 20:
+                    await asyncio.sleep(0.02)
             for stranger in strangers:
                 stranger.websocket.transport.abort()
 
@@ -159,7 +159,7 @@ def test_many_strangers_do_not_keep_the_participant_out(launch, open_client):
 def test_plain_http(launch, path, status):
     server = launch()
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", timeout=5) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", timeout=20) as answer:
             found, text = answer.status, answer.read()
     except urllib.error.HTTPError as error:
         found, text = error.code, error.read()

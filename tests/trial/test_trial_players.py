@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import itertools
+import statistics
 import time
 
 import pytest
@@ -46,9 +47,13 @@ def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client)
     assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
     lines = steps(server)
     parts = [line["players"] for line in lines]
-    assert [part["right"]["observed"] for part in parts[:5]] == [0, 1, 2, 3, 4], "asked after each step"
-    assert [part["right"]["action"] for part in parts[:5]] == [1, 2, 0, 1, 2]
-    assert {part["right"]["by"] for part in parts} == {"policy"}
+    partners = [part["right"] for part in parts]
+    prompt = [part for part in partners if part["by"] == "policy"]
+    assert len(prompt) > len(partners) / 2
+    assert [part["action"] for part in prompt] == [number % 3 for number in range(1, len(prompt) + 1)]
+    for step, (before, part) in enumerate(itertools.pairwise(partners), 1):
+        if (before["by"], part["by"]) == ("policy", "policy"):
+            assert part["observed"] == step, "asked after each step"
     assert parts[-1]["left"] == {"action": 1, "actionName": "up", "by": "human", "reward": 1.0}
     assert (lines[-1]["action"], lines[-1]["by"], lines[-1]["reward"]) == (1, "human", 1.0), "as with one player"
     assert lines[-1]["human"] == 1
@@ -107,8 +112,9 @@ def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
     for before, late in itertools.pairwise(parts):
         if late["by"] == "late":
             assert late["action"] == before["action"], "its last action goes on"
-    times = [line["ns"] for line in lines[:30]]
-    assert (times[-1] - times[0]) / 1e9 < (len(times) - 1) / 20 + 1.0
+    times = [line["ns"] / 1e9 for line in lines]
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert statistics.median(gaps) < 0.1, "a step takes 0.05 s, and the policy 0.2 s"
 
 
 @pytest.mark.parametrize(
@@ -257,8 +263,6 @@ def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(lau
             assert len(client.frames) == waiting, "no step for a participant who pressed nothing"
             await client.say(action="up", held=True)
             await client.until(lambda: len(client.frames) >= waiting + 2)
-            (mine, _), (theirs, _) = client.frames[-2:]
-            assert theirs - mine > 0.05, "the participant sees each move"
             await client.until(lambda: client.state.get("toAct"))
             await client.watch(0.4)
             assert len(client.frames) == waiting + 2, "a key that is held acts once"
@@ -268,6 +272,7 @@ def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(lau
     asyncio.run(run())
     assert server.wait() == 0
     mine, theirs = steps(server)
+    assert theirs["ns"] - mine["ns"] > 50_000_000, "the participant sees each move"
     assert mine["players"]["left"] == {"action": 1, "actionName": "up", "by": "human", "reward": 1.0}
     assert (mine["players"]["right"]["action"], mine["players"]["right"]["by"]) == (None, None)
     assert (theirs["players"]["right"]["action"], theirs["players"]["right"]["by"]) == (1, "policy")

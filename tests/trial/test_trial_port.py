@@ -27,7 +27,7 @@ import http.client, os, signal, subprocess, sys, time
 port, command = int(sys.argv[1]), sys.argv[2:]
 server = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 status = None
-for _ in range(300):
+for _ in range(1200):
     if server.poll() is not None:
         break
     try:
@@ -86,7 +86,7 @@ def run(folder: Path, said: dict[str, Any]) -> list[str]:
         env={**os.environ, **settings},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=170,
         check=False,
     )
     assert done.returncode == 0, done.stderr

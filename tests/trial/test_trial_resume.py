@@ -97,8 +97,25 @@ def test_a_third_server_goes_on_after_the_second(launch, open_client):
 
 def test_episodes_that_were_over_are_not_played_again(launch, open_client, grid):
     trial = {"maxEpisodes": 3, "startingFrameRate": 60}
-    first = launch(agent=grid(12), trial=trial, SERVER="a-1")
-    play(first, open_client, 18)
+    waits = (
+        "\nimport os, time\nclass Agent(Agent):\n    def step(self, action):\n"
+        "        while self.env.t == 6 and os.path.exists('reset') and not os.path.exists('go_on'): time.sleep(0.02)\n"
+        "        return super().step(action)\n"
+        "    def reset(self, seed=None):\n        os.path.exists('begun') and open('reset', 'w').close()\n"
+        "        open('begun', 'w').close()\n        return super().reset(seed)\n"
+    )
+    first = launch(agent=grid(12) + waits, trial=trial, SERVER="a-1")
+
+    async def until_the_second_episode():
+        async with open_client(first.address) as client:
+            await client.play(1)
+            await client.until(lambda: client.state["episode"] == 2)
+            first.terminate()
+            first.log.with_name("go_on").touch()  # its step is over, and so is the server
+            await client.closed()
+
+    asyncio.run(until_the_second_episode())
+    assert first.wait() == 0
     assert list(first.recordings(server="a-1")) == ["3-episode-0001.jsonl.gz", "3-episode-0002.jsonl.gz"]
     second = launch(agent=grid(12), trial=trial, SERVER="a-2")
 

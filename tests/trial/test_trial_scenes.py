@@ -187,7 +187,7 @@ def test_a_picture_of_pixels_may_come_between(launch: Any, open_client: Any, tmp
     async def play() -> None:
         async with open_client(server.address) as client:
             await client.play(frames=12)
-            assert set(client.kinds) >= {4, 0}
+            await client.until(lambda: set(client.kinds) >= {4, 0})
             await client.until(lambda: client.kinds[-1] == 4)
             assert set(client.scene.objects) == {"wall", "dot", "cook"}
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 import time
 
 import pytest
@@ -76,6 +77,11 @@ async def both_play(server, open_client, frames=5, *, stop=True):
         return anna, bert
 
 
+async def both_see(frames, *clients):
+    """Whoever did not take their pictures would be away after some seconds, and the game would be held."""
+    await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in clients))
+
+
 # ---- before the session is formed
 
 
@@ -112,10 +118,9 @@ def test_the_server_looks_for_the_session_by_itself(launch):
 
 def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
     server = launch_session(launch, IDLE_SECONDS="0", GRACE_SECONDS="0", DEADLINE=str(time.time() + 3))
-    time.sleep(1)
-    assert server.process.poll() is None
     assert server.wait() == 0
     assert "ending: deadline" in server.said()
+    assert "idle" not in server.said()
 
 
 def test_a_session_whose_members_never_come_ends_the_server(launch):
@@ -280,7 +285,7 @@ def test_what_was_played_with_one_whose_data_were_erased_counts_for_the_others(l
     async def play():
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(action="up", held=True)
-            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 20) for each in (anna, bert)))
+            await both_see(21, anna, bert)
             first.terminate()
             await asyncio.gather(anna.closed(), bert.closed())
 
@@ -746,7 +751,7 @@ def test_round_trips_of_each_member_stand_in_the_recording(launch, open_client):
     form(server.store)
 
     async def run():
-        async with near_and_far(server, 0.1) as (anna, bert):
+        async with near_and_far(server, 0.3) as (anna, bert):
             await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
             await anna.say(command="stop")
             await asyncio.gather(anna.closed(), bert.closed())
@@ -759,16 +764,16 @@ def test_round_trips_of_each_member_stand_in_the_recording(launch, open_client):
         if line["kind"] in ("ping", "reset"):
             trips |= line.get("roundTrip", {})
     assert trips.keys() == {"left", "right"}
-    assert trips["right"] >= 200
+    assert trips["right"] >= 600
     assert trips["left"] < trips["right"]
 
 
 def test_a_member_who_is_too_far_away_is_told_and_so_are_the_others(launch, open_client):
-    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 150})
+    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700})
     form(server.store)
 
     async def run():
-        async with near_and_far(server, 0.15) as (anna, bert):
+        async with near_and_far(server, 0.4) as (anna, bert):
             assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
             assert (anna.done["outcome"], bert.done["outcome"]) == ("partnerLeft", "ping")
             assert anna.errors
@@ -783,11 +788,11 @@ def test_a_member_who_is_too_far_away_is_told_and_so_are_the_others(launch, open
 
 def test_the_others_play_on_without_a_member_who_is_too_far_away(launch, open_client):
     instead = {"substitute": "idle", "afterAbsent": "policy"}
-    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 150, **instead})
+    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700, **instead})
     form(server.store)
 
     async def run():
-        async with near_and_far(server, 0.15) as (anna, bert):
+        async with near_and_far(server, 0.4) as (anna, bert):
             assert await bert.closed() == 1000
             assert answer(server.store, "bert")["answers"]["outcome"] == "ping"
             await anna.until(lambda: len(anna.frames) > 20)
@@ -833,22 +838,22 @@ class CountsPings(ClientConnection):
 def test_only_a_session_sends_pings_of_its_own(launch):
     """A participant who plays alone gets no byte more."""
 
-    async def pings(server, hello):
+    async def pings(server, hello, most=math.inf, seconds=2):
         async with connect(
             server.address, create_connection=CountsPings, subprotocols=["hippodrome.3"], proxy=None
         ) as websocket:
             await websocket.send(json.dumps(hello))
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(2):
-                    async for _ in websocket:
-                        pass
+                async with asyncio.timeout(seconds):
+                    while websocket.pings < most:
+                        await asyncio.sleep(0.02)
             return websocket.pings
 
     alone = launch()
     assert asyncio.run(pings(alone, {"userId": "P1", "token": TOKEN, "step": "3"})) == 0
     server = launch_session(launch)
     form(server.store)
-    assert asyncio.run(pings(server, hello_of("anna"))) >= 5
+    assert asyncio.run(pings(server, hello_of("anna"), 5, 20)) == 5
 
 
 # ---- a lost server
@@ -867,7 +872,7 @@ def test_after_a_kill_the_next_server_goes_on_at_the_last_recorded_step_for_both
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(command="start")
             await anna.say(action="up", lasts=None)
-            await bert.until(lambda: len(bert.frames) >= 40)
+            await both_see(40, anna, bert)
             first.process.kill()
             await asyncio.gather(anna.closed(), bert.closed())
 
@@ -898,7 +903,7 @@ def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_pr
     async def killed():
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(command="start")
-            await bert.until(lambda: len(bert.frames) >= 30)
+            await both_see(30, anna, bert)
             first.process.kill()
 
     asyncio.run(killed())

@@ -160,7 +160,7 @@ def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_
 
 
 def test_the_next_game_step_is_played_while_the_answer_of_one_to_the_step_before_is_refused(launch):
-    section = {"gather": 1, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
+    section = {"gather": 4, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
     server = launch_session(launch, trial=section, GAME_STEPS="3,5")
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
@@ -188,7 +188,7 @@ def test_the_next_game_step_is_played_while_the_answer_of_one_to_the_step_before
 
 def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_before_the_game(launch):
     """Their answer is given to the store while the others still play, and may be stored long after their game."""
-    section = {"maxPing": 1000, "pingSamples": 1, "afterAbsent": "policy", "substitute": "idle"}
+    section = {"maxPing": 1000, "pingSamples": 3, "afterAbsent": "policy", "substitute": "idle"}
     server = launch_session(launch, trial=section)
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")

@@ -86,8 +86,9 @@ def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(lau
     server = launch(grid(None), {"gym": "advise", "startingFrameRate": 30})
 
     async def play() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        async with program(server) as websocket, open_client(server.address) as client:
+        async with program(server) as websocket, open_client(server.address) as client, asyncio.TaskGroup() as reading:
             await client.play()
+            watching = reading.create_task(client.watch(60))  # who takes no pictures is held to be away
             assert await ask(websocket, "action_space") == {
                 "name": "Discrete",
                 "n": 6,
@@ -100,7 +101,9 @@ def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(lau
             while (await steps(websocket, 1))[0]["human"] is None:
                 pass
             await ask(websocket, "advise", action=3)
-            return alone, await steps(websocket, 3)
+            together = await steps(websocket, 3)
+            watching.cancel()
+            return alone, together
 
     alone, together = asyncio.run(play())
     advised = [line for line in alone if line["by"] == "advice"]
@@ -203,7 +206,7 @@ def test_programs_that_watch_are_limited(launch, grid):
 
 
 def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch, grid):
-    server = launch(grid(None), {"gym": "watch"}, IDLE_SECONDS="1")
+    server = launch(grid(None), {"gym": "watch"}, IDLE_SECONDS="4")
 
     async def come() -> int | None:
         async with program(server) as websocket:

@@ -48,18 +48,24 @@ def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
 
 def test_a_limit_that_is_left_over_from_before_ends_nothing() -> None:
     async def work() -> Heard:
-        worker, heard = Worker(), Heard()
-        async with asyncio.timeout(10):
-            for number in range(3):
-                await worker.call(lambda: None, limit=0.1)
-                worker.submit(lambda: threading.Event().wait(0.15), 5.0, lambda *said: heard.append(said))
-                while worker.busy:
-                    await asyncio.sleep(0.001)
-                assert len(heard) == number + 1
+        worker, heard, loop, later = Worker(), Heard(), asyncio.get_running_loop(), [0.0]
+        clock = loop.time
+        loop.time = lambda: clock() + later[0]  # type: ignore[method-assign]
+        for number in range(3):
+            free = threading.Event()
+            await worker.call(lambda: None, limit=1000.0)
+            worker.submit(lambda free=free: free.wait(10), 5000.0, lambda *said: heard.append(said))
+            later[0] += 2000.0
+            for _ in range(3):
+                await asyncio.sleep(0)  # the loop looks at its clock
+            free.set()
+            while worker.busy:
+                await asyncio.sleep(0.001)
+            assert len(heard) == number + 1
         worker.close()
         return heard
 
-    assert asyncio.run(work()) == [(False, None)] * 3
+    assert asyncio.run(work()) == [(True, None)] * 3
 
 
 def test_a_failure_in_what_hears_of_one_result_loses_no_other() -> None:
