@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.browser.conftest import own_page
-from tests.browser.test_pages_browser import World, shot, tell, world  # noqa: F401
+from tests.browser.test_pages_browser import NOWHERE, World, shot, tell, world  # noqa: F401
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}
@@ -223,8 +223,15 @@ def test_a_picture_that_stands_still_as_the_connection_is_dead_is_explained_with
     phone.wait_for_selector("#mode[data-state=playing]", state="attached")
     phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=6_000)
     shot(phone, "360-hangs")
+    phone.evaluate(
+        """() => {
+            const title = document.getElementById("overlay-title"), trouble = document.getElementById("trouble");
+            const note = () => title.textContent && (window.beside ??= trouble.textContent);
+            new MutationObserver(note).observe(title, { childList: true });
+        }"""
+    )
     phone.wait_for_selector("#overlay-title:text('Connection lost')", timeout=7_000)
-    phone.wait_for_selector("#trouble:empty", state="attached")
+    assert phone.evaluate("window.beside") == "", "what hangs is not said of a connection that is lost"
 
 
 def test_an_answer_takes_the_explanation_away(world: World, phone: Any) -> None:
@@ -234,3 +241,58 @@ def test_an_answer_takes_the_explanation_away(world: World, phone: Any) -> None:
     phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=10_000)
     tell(world, state="playing")
     phone.wait_for_selector("#trouble:empty", state="attached")
+
+
+MESSAGES_STAY = """{
+    const plain = setTimeout;
+    window.setTimeout = (then, ms, ...more) => plain(then, ms === 8000 ? 1e9 : ms, ...more);
+}"""
+COVERED = """() => {
+    const box = (each) => each.getBoundingClientRect(), words = box(document.getElementById("trouble"));
+    return [...document.getElementById("overlay").children].filter((each) => {
+        const { top, bottom, left, right } = box(each);
+        return bottom > top && top < words.bottom && bottom > words.top && left < words.right && right > words.left;
+    }).map((each) => each.textContent);
+}"""
+
+
+@pytest.mark.parametrize("size", [(360, 640), (740, 360), (768, 1024), (1280, 800)], ids=lambda size: f"{size[0]}")
+def test_a_message_covers_none_of_the_words_over_the_picture(world: World, phone: Any, size: tuple[int, int]) -> None:
+    phone.add_init_script(MESSAGES_STAY)
+    play(world, phone, size, {}, ALL)
+    failed = "Something went wrong in the game, so this round has ended. The next round begins."
+    world.connections[0].send(json.dumps({"error": failed}))
+    tell(world, state="break", nextIn=9)
+    phone.wait_for_selector("#overlay-hint:text('The next game begins')")
+    assert (phone.evaluate(COVERED), phone.inner_text("#trouble")) == ([], failed)
+    shot(phone, f"{size[0]}-message-in-a-break")
+    world.connections[0].send(json.dumps({"error": failed}))
+    world.state = {**world.state, "url": NOWHERE}
+    world.connections[0].socket.close()
+    world.connections[0].close()
+    phone.wait_for_selector("#overlay-title:text('Connection lost')")
+    assert (phone.evaluate(COVERED), phone.inner_text("#trouble")) == ([], failed)
+    shot(phone, f"{size[0]}-message-and-lost")
+
+
+def test_scores_of_any_kind_stand_in_one_line_above_the_picture(world: World, phone: Any) -> None:
+    play(world, phone, (360, 640), {}, ALL)
+    height = "document.querySelector('.hud').scrollHeight"
+    tell(world, state="playing", episode=10, maxEpisodes=12, score=70, episodeScore=30)
+    phone.wait_for_selector("#episode:text('Game 10 of 12')")
+    before = phone.evaluate(height)
+    tell(world, state="playing", episode=10, maxEpisodes=12, score=-12345.6789, episodeScore=-234.5678)
+    phone.wait_for_selector("#score:text('-234.57')")
+    assert phone.inner_text("#total") == "Total -12,346"
+    assert phone.evaluate(height) == before
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 360
+    right = "Math.max(...[...document.querySelectorAll('.hud span')].map((each) => each.getBoundingClientRect().right))"
+    assert phone.evaluate(right) <= 360
+    shot(phone, "360-scores")
+
+
+@pytest.mark.parametrize(("score", "shown"), [(0.1 + 0.2, "0.3"), (999.996, "1,000"), (1234.5, "1,235"), (-7, "-7")])
+def test_of_a_score_up_to_a_thousand_two_decimals_are_shown(world: World, phone: Any, score: float, shown: str) -> None:
+    play(world, phone, (360, 640), {}, ALL)
+    tell(world, state="playing", score=score, episodeScore=score)
+    phone.wait_for_selector(f"#score:text-is('{shown}')")

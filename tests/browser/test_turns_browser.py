@@ -30,11 +30,15 @@ def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, tab: Any, width:
     tab.wait_for_selector("#turn:text('Your turn (7 s)')")
     tell(in_turns, state="playing", toAct=False)
     tab.wait_for_selector("#turn:text('The other player\u2019s turn')")
+    assert tab.inner_text("#announce") == "", "a screen reader finds no turn that is over"
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-other-turn")
+    tell(in_turns, state="playing", toAct=True)
+    tab.wait_for_selector("#announce:text('Your turn')", state="attached")
     tell(in_turns, state="paused", toAct=False)
     tab.wait_for_function("() => document.getElementById('turn').textContent === ''")
+    assert tab.inner_text("#announce") == "Paused"
 
 
 def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) -> None:

@@ -69,6 +69,7 @@ async function playOn(server) {
   }
   game.state = "loading";
   const end = await play(server, hear);
+  lookWhetherItHangs();
   releaseAll(false);
   game.state = end.why;
   return end;
@@ -94,14 +95,16 @@ function playHere() {
   });
 }
 
-clearDrafts();
-setInterval(() => find("wait").hidden || showClock(), 1_000);
-setInterval(() => {
+function lookWhetherItHangs() {
   const silent = watch(isRunning());
   if (silent > SILENT && isRunning()) setText(find("trouble"), HANGS);
   else if (find("trouble").textContent === HANGS) hideMessage();
   if (game.state === "loading" && silent > LONG) setText(find("overlay-hint"), "This takes longer than usual. Please stay on this page.");
-}, 1_000);
+}
+
+clearDrafts();
+setInterval(() => find("wait").hidden || showClock(), 1_000);
+setInterval(lookWhetherItHangs, 1_000);
 setInterval(countDown, 200);
 find("again").addEventListener("submit", noteRestart);
 find("overlay-button").addEventListener("click", () => {

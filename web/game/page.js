@@ -29,6 +29,7 @@ export function duration(seconds) {
   return `${Math.floor(seconds / 60)} min ${seconds % 60} s`;
 }
 
+// Up to 1,000 with two decimals: all that is said in the line above the picture has to stand in it on a phone.
 export function points(score) {
-  return Number(score ?? 0).toLocaleString();
+  return Number(score ?? 0).toLocaleString([], { maximumFractionDigits: Math.abs(score) < 1000 ? 2 : 0 });
 }

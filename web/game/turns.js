@@ -3,6 +3,7 @@ import { hooks } from "./hooks.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
+const MINE = "Your turn";
 const turn = make("span", { id: "turn" });
 let turnEndsAt = null;
 let wasMine = false;
@@ -22,7 +23,8 @@ hooks.said.push((message) => {
   turnEndsAt = typeof message.turnEndsIn === "number" ? performance.now() + 1000 * message.turnEndsIn : null;
   showTurn();
   const mine = isMine();
-  if (mine && !wasMine) setText(find("announce"), "Your turn");
+  const announced = find("announce").textContent === MINE;
+  if (mine ? !wasMine : announced) setText(find("announce"), mine ? MINE : "");
   wasMine = mine;
 });
 
@@ -33,7 +35,7 @@ function showTurn() {
   const left = turnEndsAt === null ? "" : ` (${Math.max(0, Math.ceil((turnEndsAt - performance.now()) / 1000))} s)`;
   turn.classList.toggle("mine", isMine());
   if (game.state !== "playing") setText(turn, "");
-  else if (isMine()) setText(turn, `Your turn${left}`);
+  else if (isMine()) setText(turn, MINE + left);
   else setText(turn, game.players ? others : "");
 }
 
