@@ -124,7 +124,8 @@ def test_a_mutant_that_never_ends_is_killed(project: Path) -> None:
     mutants = Mutants("core.py", ENDLESS)
     changes = {mutant.becomes: mutant for mutant in map(mutants.__getitem__, range(len(mutants)))}
     tests = {"core.py": ["test_core.py"]}
-    assert [killed for _, killed in Runner(project, seconds=3).judge([changes["continue"]], tests)] == [True]
+    quick = Runner(project, seconds=3, idle=120)
+    assert [killed for _, killed in quick.judge([changes["continue"]], tests)] == [True]
     assert [killed for _, killed in Runner(project).judge([changes["if step > 10:"]], tests)] == [False]
 
 

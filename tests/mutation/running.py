@@ -57,12 +57,17 @@ class Fails(Exception):
 
 
 class Runner:
-    """Judges mutants of the files in `root`, `at_once` at a time. `seconds`: the limit for a mutant's tests, CPU and idle."""
+    """Judges mutants of the files in `root`, `at_once` at a time.
 
-    def __init__(self, root: Path, *, at_once: int = 2, seconds: float = 60) -> None:
+    A mutant's tests may take `seconds` of CPU time. They end after `idle` seconds by the clock (by default three times
+    as long) if they take none, or get none.
+    """
+
+    def __init__(self, root: Path, *, at_once: int = 2, seconds: float = 60, idle: float | None = None) -> None:
         self._root = root
         self._at_once = at_once
         self._seconds = seconds
+        self._idle = 3 * seconds if idle is None else idle
 
     def warm(self, tests: Sequence[str]) -> None:
         """Run the tests unchanged, then import here all the libraries that they have imported. Raises Fails."""
@@ -105,7 +110,7 @@ class Runner:
                     mutant, folder = todo.pop(), free.pop()
                     _write(folder / mutant.module, mutant.source)
                     process = _fork(folder, tests[mutant.module], self._seconds)
-                    runs[process] = Run(process, folder, mutant, time.monotonic() + self._seconds * 3)
+                    runs[process] = Run(process, folder, mutant, time.monotonic() + self._idle)
                 time.sleep(0.01)
                 for run in list(runs.values()):
                     if time.monotonic() > run.until:
