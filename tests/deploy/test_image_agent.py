@@ -17,14 +17,14 @@ from tests.trial.conftest import grid_agent
 __all__ = ["folder", "machine", "recipe", "town"]
 
 
-def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "30", **trial: Any) -> tuple[int, str]:
+def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "150", **trial: Any) -> tuple[int, str]:
     """The exit status and output of the step that tries the agent, where the image's files are."""
     make_bundle(folder, trial=trial).write_folder(tmp_path / "context")
     (command,) = (json.loads(step) for step in stages()[1].all("RUN"))
     assert command[3:] == ["/hippodrome/check.json", "60"]
     command[3:] = [str(tmp_path / "context/check.json"), seconds]
     container = Container(recipe, tmp_path / "context", tmp_path / "root", {}, command)
-    said, wrong = container.process.communicate(timeout=60)
+    said, wrong = container.process.communicate(timeout=170)
     assert wrong == ""
     assert container.files() == container.before
     assert len(said.splitlines()) == 1
@@ -193,13 +193,13 @@ def test_policies_are_tried_too(
 @pytest.mark.parametrize(
     ("first", "seconds", "words"),
     [
-        ("import os; os.environ['nosuch']", "30", "agent.py:1: KeyError: 'nosuch'"),
-        ("open('model.bin')", "30", "agent.py:1: FileNotFoundError"),
-        ("import urllib.error; raise urllib.error.URLError('no network')", "30", "agent.py:1: URLError"),
-        ("raise SystemExit(1)", "30", "agent.py:1: SystemExit"),
-        ("import os; os._exit(7)", "30", "ended Python itself (status 7)"),
+        ("import os; os.environ['nosuch']", "150", "agent.py:1: KeyError: 'nosuch'"),
+        ("open('model.bin')", "150", "agent.py:1: FileNotFoundError"),
+        ("import urllib.error; raise urllib.error.URLError('no network')", "150", "agent.py:1: URLError"),
+        ("raise SystemExit(1)", "150", "agent.py:1: SystemExit"),
+        ("import os; os._exit(7)", "150", "ended Python itself (status 7)"),
         ("import time; time.sleep(600)", "1", "has not come back within 1 s"),
-        ("def f(:", "30", "SyntaxError"),
+        ("def f(:", "150", "SyntaxError"),
     ],
 )
 def test_what_a_server_may_have_and_a_build_has_not_is_a_warning(

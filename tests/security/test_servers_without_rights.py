@@ -34,7 +34,7 @@ GOT = {}
 
 def send(method, url, body=None, headers=None):
     parts = urllib.parse.urlsplit(url)
-    link = http.client.HTTPConnection(parts.hostname, parts.port, timeout=5)
+    link = http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)
     try:
         link.request(method, parts.path + ("?" + parts.query if parts.query else ""), body, headers or {})
         answer = link.getresponse()
@@ -175,7 +175,7 @@ def got(site: Site, tmp_path: Path) -> dict[str, Any]:
     }  # fmt: skip
     inherited = {key: value for key, value in os.environ.items() if not key.startswith(("AWS_", "ECS_"))}
     done = subprocess.run(
-        [sys.executable, "-m", "trial"], cwd=tmp_path, env={**inherited, **told}, capture_output=True, text=True, timeout=60, check=False,
+        [sys.executable, "-m", "trial"], cwd=tmp_path, env={**inherited, **told}, capture_output=True, text=True, timeout=170, check=False,
     )  # fmt: skip
     assert (tmp_path / "got.json").exists(), done.stderr
     found: dict[str, Any] = json.loads((tmp_path / "got.json").read_text())

@@ -83,9 +83,9 @@ def test_text_without_tags_stays_as_it_is(text: str) -> None:
 @pytest.mark.parametrize("size", [200_000])
 @pytest.mark.parametrize("piece", ["{{", "<!--", '<a ="', "<script>", "</", "<", "{% a", "<img srcset='a, "])
 def test_time_grows_with_the_page_not_with_its_square(piece: str, size: int) -> None:
-    began = time.perf_counter()
+    began = time.thread_time()
     prepare(piece * (size // len(piece)), BASE)
-    assert time.perf_counter() - began < 3
+    assert time.thread_time() - began < 3
 
 
 # What is dropped
