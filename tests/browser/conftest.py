@@ -117,6 +117,7 @@ NARROW = {"viewport": {"width": 360, "height": 640}}
 def narrow(chromium: Any) -> Iterator[Any]:
     """What the tabs of a file share."""
     context = chromium.new_context(**NARROW)
+    context.set_default_timeout(PATIENCE)
     context.new_page()  # its window stays: to make one for each tab takes Chromium longer than some tests
     yield context
     context.close()
@@ -133,9 +134,58 @@ def tab(narrow: Any) -> Iterator[Any]:
 def lone_tab(chromium: Any) -> Iterator[Any]:
     """A page in a context of its own."""
     context = chromium.new_context(**NARROW)
+    context.set_default_timeout(PATIENCE)
     with without_errors(context.new_page()) as page:
         yield page
         context.close()
+
+
+@pytest.fixture
+def standing(lone_tab: Any) -> Any:
+    """A page whose clock stands but for `standing.clock.run_for(ms)`: what it counts down is what a test has let pass."""
+    lone_tab.clock.install(time="2026-01-01T00:00:00Z")
+    lone_tab.clock.pause_at("2026-01-01T00:00:01Z")
+    return lone_tab
+
+
+HOLDS = """(() => {
+    const lengths = %s, held = new Map(), { setTimeout: begin, clearTimeout: end } = window;
+    let last = 0;
+    window.setTimeout = (done, ms, ...more) => {
+        if (!lengths.includes(ms)) return begin(done, ms, ...more);
+        held.set(last -= 1, done);
+        return last;
+    };
+    window.clearTimeout = (id) => { if (!held.delete(id)) end(id); };
+    window.letGo = () => { for (const [id, done] of [...held]) if (held.delete(id)) done(); };
+})()"""
+
+
+def hold_timers(page: Any, *lengths: int) -> None:
+    """Timers of so many milliseconds wait for `window.letGo()`: what the page shows only for so long stays to be looked at.
+
+    For a page that is not open yet.
+    """
+    page.add_init_script(HOLDS % json.dumps(lengths))
+
+
+NOTES = """selector => {
+    const found = document.querySelector(selector), texts = [found.textContent];
+    (window.noted ??= {})[selector] = texts;
+    new MutationObserver(() => texts.push(found.textContent)).observe(found, { childList: true, characterData: true, subtree: true });
+}"""
+
+
+def note_texts(page: Any, selector: str) -> None:
+    """From now on, note each text of this element for `noted`: some stand there for less than a second."""
+    page.evaluate(NOTES, selector)
+
+
+def noted(page: Any, selector: str, text: str) -> None:
+    """This text has stood there since `note_texts`, or does so soon."""
+    page.wait_for_function(
+        "([selector, text]) => window.noted[selector].some((each) => each.includes(text))", arg=[selector, text]
+    )
 
 
 @pytest.fixture(scope="module")

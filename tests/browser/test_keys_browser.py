@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
+from tests.browser.conftest import PATIENCE, hold_timers, note_texts, noted
+from tests.browser.test_pages_browser import FLAWS, LAST_PICTURE, World, play, shot, tell, world
 from tests.trial.conftest import Running, grid_agent
 
 __all__ = ["world"]  # a fixture
@@ -108,6 +111,9 @@ def test_labels_alone_are_the_texts_of_the_usual_buttons(world: World, tab: Any)
 
 # Pages beside the game
 
+BETWEEN = (
+    2_500  # ms for which the last picture is shown before the page between two games, as web/game/reading.js has it
+)
 RULES = "<h1>The rules</h1><p>Jump over the stones.</p>"
 PAUSE = "<h2>Have a rest</h2><p>Look out of the window.</p>"
 
@@ -167,6 +173,7 @@ def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_lead
     told: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
+    hold_timers(tab, BETWEEN)
     tab.goto(told.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
@@ -176,6 +183,7 @@ def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_lead
     assert not tab.is_visible("text=Have a rest")
     assert tab.inner_text("#overlay-hint") == ""
     shot(tab, f"{width}-last-picture")
+    tab.evaluate("window.letGo()")
     tab.wait_for_selector("text=Have a rest")
     assert tab.inner_text("#reading-score") == "Game 1 of 2 is over. Your score: 30"
     assert not tab.is_visible("text=Jump over the stones.")
@@ -189,14 +197,15 @@ def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_lead
 
 
 def test_who_has_seen_the_last_picture_opens_the_page_between_at_once(told: World, tab: Any) -> None:
+    hold_timers(tab, BETWEEN)
     tab.goto(told.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
     told.wait_for({"command": "start"})
     before = len(told.given())
     tell(told, state="break")
-    tab.click("#overlay-button:text('Go on')", timeout=2_000)
-    tab.wait_for_selector("text=Have a rest", timeout=1_000)
+    tab.click("#overlay-button:text('Go on')")
+    tab.wait_for_selector("text=Have a rest")
     assert told.given()[before:] == []
 
 
@@ -204,7 +213,8 @@ def test_who_has_seen_the_last_picture_opens_the_page_between_at_once(told: Worl
 
 
 @SIZES
-def test_the_first_picture_stands_still_with_a_countdown(world: World, tab: Any, width: int, height: int) -> None:
+def test_the_first_picture_stands_still_with_a_countdown(world: World, standing: Any, width: int, height: int) -> None:
+    tab = standing
     tab.set_viewport_size({"width": width, "height": height})
     world.trial = {"resetFreeze": 3, "episodeSeconds": 90}
     play(world, tab)
@@ -214,20 +224,25 @@ def test_the_first_picture_stands_still_with_a_countdown(world: World, tab: Any,
     assert tab.inner_text("#left") == "1:30"
     assert tab.inner_text("#overlay-hint") == "3"
     shot(tab, f"{width}-countdown")
-    tab.wait_for_selector("#overlay-hint:text('2')")
-    tab.wait_for_selector("#overlay-hint:text('1')")
+    for left in ("2", "1"):
+        tab.clock.run_for(1_000)
+        assert tab.inner_text("#overlay-hint") == left
     assert tab.inner_text("#left") == "1:30"
     assert tab.inner_text("#announce") == "Get ready. The game begins in 3 seconds."
     tell(world, state="playing", timeLeft=11.5)
     tab.wait_for_selector("#overlay", state="hidden")
     assert tab.inner_text("#announce") == "Playing"
-    tab.wait_for_selector("#left:text('0:11')")
+    assert tab.inner_text("#left") == "0:12"
+    tab.clock.run_for(1_000)
+    assert tab.inner_text("#left") == "0:11"
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-time-left")
-    tab.wait_for_selector("#announce:text('10 seconds left')", state="attached")
+    tab.clock.run_for(800)
+    assert tab.inner_text("#announce") == "10 seconds left"
     tell(world, state="paused", timeLeft=9.2)
-    tab.wait_for_timeout(1_500)
+    tab.wait_for_selector("#overlay-title:text('Paused')")
+    tab.clock.run_for(1_500)
     assert tab.inner_text("#left") == "0:10"
 
 
@@ -241,6 +256,15 @@ def test_the_words_of_the_projects_pages_are_not_taken_for_the_game_pages_own(to
 
 
 # On a real server
+
+WAITS = grid_agent(1000).replace(
+    "        self.t += 1\n",
+    """        self.t += 1
+        while self.t == 5 and not pathlib.Path(PRESSED).exists():
+            time.sleep(0.01)
+""",
+).replace("import gymnasium\n", "import pathlib\nimport time\n\nimport gymnasium\n", 1)  # fmt: skip
+"""A game that waits at its fifth step until somebody has pressed a key, however long that takes."""
 
 
 @pytest.mark.parametrize(("width", "height", "touch"), [(360, 740, True), (1280, 800, False)])
@@ -256,9 +280,14 @@ def test_a_game_with_all_of_it_on_a_real_server(
     context = chromium.new_context(
         viewport={"width": width, "height": height}, has_touch=touch, is_mobile=touch, reduced_motion="reduce"
     )
+    context.set_default_timeout(PATIENCE)
     tab, wrong = context.new_page(), []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
-    server = Running(tmp_path, grid_agent(1000), section, {})
+    tab.on("websocket", lambda socket: socket.on("framesent", lambda said: told.append(str(said))))
+    hold_timers(tab, BETWEEN, LAST_PICTURE)
+    told: list[str] = []
+    pressed = tmp_path / "pressed"
+    server = Running(tmp_path, WAITS.replace("PRESSED", repr(str(pressed))), section, {})
     try:
         world.trial, world.texts, world.step = section, {"instructions": RULES, "betweenEpisodes": PAUSE}, 2
         ready = {"state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
@@ -268,12 +297,16 @@ def test_a_game_with_all_of_it_on_a_real_server(
         tab.wait_for_selector("#overlay-title:text('Ready?')")
         shot(tab, f"{width}-real-ready")
         assert tab.is_visible("#legend") is not touch
+        note_texts(tab, "#overlay-title")
         tab.click("#overlay-button")
-        tab.wait_for_selector("#overlay-title:text('Get ready')")
+        noted(tab, "#overlay-title", "Get ready")
         shot(tab, f"{width}-real-countdown")
         tab.wait_for_selector("#overlay", state="hidden")
-        hold(tab, "#controls .others button" if touch else "Enter", touch)
-        tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
+        with held(tab, "#controls .others button" if touch else "Enter", touch):
+            while not any("Enter" in each for each in told):
+                tab.wait_for_timeout(20)
+            pressed.touch()
+            tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
         shot(tab, f"{width}-real-over")
         tab.click("#overlay-button")
         tab.click("text=Next game")
@@ -297,16 +330,17 @@ def test_a_game_with_all_of_it_on_a_real_server(
     assert {message["key"] for message in said} == {"Enter"}
 
 
-def hold(tab: Any, what: str, touch: bool) -> None:
-    """Hold a key, or a finger on a button, for a while."""
+@contextlib.contextmanager
+def held(tab: Any, what: str, touch: bool) -> Iterator[None]:
+    """A key is down, or a finger on a button."""
     if touch:
         box = tab.locator(what).bounding_box()
         finger = tab.context.new_cdp_session(tab)
         point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
         finger.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
-        tab.wait_for_timeout(300)
+        yield
         finger.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
     else:
         tab.keyboard.down(what)
-        tab.wait_for_timeout(300)
+        yield
         tab.keyboard.up(what)

@@ -21,7 +21,7 @@ from websockets.sync.server import serve
 
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import frame, game_modules, pages
-from tests.browser.conftest import SHOTS
+from tests.browser.conftest import PATIENCE, SHOTS, hold_timers
 from tests.trial.conftest import Running, grid_agent
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
@@ -36,6 +36,7 @@ PROJECT = Project(
     researcher="Ada",
 )
 RED, BLUE = bytes((255, 0, 0)), bytes((0, 0, 255))
+LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as web/game/overlay.js has it
 
 
 def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:
@@ -59,6 +60,8 @@ class World:
     heard: list[dict[str, Any]] = field(default_factory=list)
     connections: list[Any] = field(default_factory=list)
     slow: float = 0.0
+    may_answer: threading.Event = field(default_factory=threading.Event)
+    """Forms are answered once this is set."""
     joined: bool = True
     """Whether the game page carries its script, or loads the modules of it."""
     trial: dict[str, Any] = field(default_factory=dict)
@@ -103,7 +106,7 @@ class World:
         return [command for command in self.commands("command") if command != "requestUI"]
 
     def wait_for(self, message: dict[str, Any]) -> None:
-        until = time.monotonic() + 10
+        until = time.monotonic() + PATIENCE / 1000
         while message not in self.heard:
             assert time.monotonic() < until, self.heard
             time.sleep(0.02)
@@ -138,6 +141,7 @@ class World:
 @pytest.fixture
 def world() -> Iterator[World]:
     here = World()
+    here.may_answer.set()
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
@@ -167,6 +171,7 @@ def world() -> Iterator[World]:
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"])).decode()
             time.sleep(here.slow)
+            here.may_answer.wait(PATIENCE / 1000)
             here.posts.append(dict(parse_qsl(body, keep_blank_values=True)))
             action = here.posts[-1].get("hippodrome-action")
             if action == "leave":
@@ -242,16 +247,23 @@ def test_answers_survive_a_reload_and_go_when_they_are_sent(world: World, tab: A
 
 
 def test_a_second_click_sends_nothing(world: World, tab: Any) -> None:
-    world.slow = 0.7
+    world.may_answer.clear()
+    sent: list[str] = []
+    tab.on("request", lambda request: sent.append(request.method))
     tab.goto(world.url)
     said = tab.evaluate(
-        """() => {
-            for (let i = 0; i < 5; i += 1) document.querySelector('.send button').click();
+        """async () => {
+            for (let i = 0; i < 5; i += 1) {
+                document.querySelector('.send button').click();
+                await new Promise((done) => setTimeout(done, 20));  // a browser sends only the last of clicks at once
+            }
             return document.querySelector('.status').textContent;
         }"""
     )
     assert said == "Sending…"
-    tab.wait_for_timeout(1500)
+    world.may_answer.set()
+    tab.wait_for_selector("text=Step 2 of 4")
+    assert sent.count("POST") == 1
     assert len(world.posts) == 1
 
 
@@ -436,6 +448,7 @@ def test_keys_are_held_and_let_go(world: World, tab: Any) -> None:
     world.wait_for({"action": "left", "held": False})
     tab.keyboard.press("Space")
     world.wait_for({"action": "fire", "held": True})
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
     tab.keyboard.press("KeyP")
     world.wait_for({"command": "pause"})
     tab.keyboard.press("KeyR")
@@ -594,7 +607,8 @@ def test_the_header_has_the_score_of_this_game_and_the_total(world: World, tab: 
     assert tab.evaluate("document.documentElement.scrollWidth") <= 360
 
 
-def test_a_break_shows_the_score_and_counts_down(world: World, tab: Any) -> None:
+def test_a_break_shows_the_score_and_counts_down(world: World, standing: Any) -> None:
+    tab = standing
     play(world, tab)
     tab.keyboard.down("ArrowLeft")
     world.wait_for({"action": "left", "held": True})
@@ -608,7 +622,8 @@ def test_a_break_shows_the_score_and_counts_down(world: World, tab: Any) -> None
     tab.keyboard.press("Space")  # fires here
     world.wait_for({"action": "fire", "held": False})
     assert world.given() == before, "no key of the game ends the break"
-    tab.wait_for_selector("#overlay-hint:text('The next game begins in 1 second.')")
+    tab.clock.run_for(2_000)
+    assert tab.inner_text("#overlay-hint") == "The next game begins in 1 second."
     tab.click("text=Go on now")
     world.wait_for({"command": "start"})
     tab.wait_for_selector("#overlay", state="hidden")
@@ -628,47 +643,46 @@ def test_a_control_of_the_projects_own_is_a_button_that_says_its_word(world: Wor
     world.wait_for({"command": "reallyGood"})
 
 
-NOTE_WHEN = """text => {
-    const note = name => { sessionStorage[name] = Date.now() }
-    const watch = new MutationObserver(() => {
-        if (!document.body.innerText.includes(text)) return
-        watch.disconnect()
-        note('shown')
-    })
-    watch.observe(document.body, {subtree: true, childList: true, characterData: true, attributes: true})
-    addEventListener('pagehide', () => note('left'))
-}"""
-"""Notes when the page shows the text and when it is left: by its own clock, so a busy machine makes no difference."""
+def page_that_follows(tab: Any, *, within: int) -> None:
+    """It comes before so many milliseconds have passed on the clock that stands."""
+    for _ in range(0, within, 10):
+        if tab.is_visible("text=Next page"):
+            return
+        tab.clock.run_for(10)
+        tab.wait_for_timeout(100)  # for the site to answer
+    raise AssertionError
 
 
-def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: World, tab: Any) -> None:
+def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: World, standing: Any) -> None:
+    tab = standing
     play(world, tab)
-    tab.evaluate(NOTE_WHEN, "Your total score in 2 games: 1,370")
     world.step = 3
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 1370}))
     tab.wait_for_selector("#overlay-score:visible:text('Your total score in 2 games: 1,370')")
     assert tab.inner_text("#overlay-title") == "The game is over"
+    tab.clock.run_for(3_900)
     assert tab.is_visible("#screen")
-    tab.wait_for_selector("text=Next page")
-    assert tab.evaluate("() => sessionStorage.left - sessionStorage.shown") > 3900
+    assert tab.is_visible("#overlay-score")
+    tab.clock.run_for(100)
+    page_that_follows(tab, within=4_000)
 
 
-def test_who_has_seen_the_last_picture_goes_on_at_once(world: World, tab: Any) -> None:
+def test_who_has_seen_the_last_picture_goes_on_at_once(world: World, standing: Any) -> None:
+    tab = standing
     play(world, tab)
-    tab.evaluate(NOTE_WHEN, "Your score: 7")
     world.step = 3
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
     tab.wait_for_selector("#overlay-button:text('Go on')")
     assert tab.evaluate("document.activeElement.id") == "overlay-button"
     tab.keyboard.press("Enter")
-    tab.wait_for_selector("text=Next page")
-    assert tab.evaluate("() => sessionStorage.left - sessionStorage.shown") < 3900
+    page_that_follows(tab, within=3_900)
     assert {"command": "start"} not in world.heard
 
 
 def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, tab: Any) -> None:
+    hold_timers(tab, LAST_PICTURE)
     play(world, tab)
     tab.keyboard.press("Space")
     world.wait_for({"command": "start"})
@@ -681,20 +695,20 @@ def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, t
 
 def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None:
     play(world, tab)
-    for ui in (["left", "start"], ["left"]):
+    for score, ui in enumerate((["left", "start"], ["left"]), 1):
         said = {"UI": ui, "actionSpace": ["noop", "left"], "state": "ready", "episode": 1}
         world.connections[0].send(json.dumps(said))
         tab.wait_for_function("() => document.querySelectorAll('#legend > span').length === 2")
-        tell(world, state="playing")
-        tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+        tell(world, state="playing", episodeScore=score)
+        tab.wait_for_function(f"() => document.getElementById('score').textContent === '{score}'")
         assert tab.inner_text("#legend") == "← move\nSpace start"
         assert tab.locator("[data-command=toggle]:visible").count() == 0
-        heard = len(world.heard)
+        before = world.given()
         tab.keyboard.press("KeyP")
         tab.keyboard.press("Space")
         tab.keyboard.press("ArrowLeft")
         world.wait_for({"action": "left", "held": False})
-        assert not [each for each in world.heard[heard:] if "command" in each]
+        assert world.given() == before
         world.heard.clear()
         tell(world, state="paused")  # as when the page was away
         tab.wait_for_selector("#overlay-button:visible")
@@ -707,7 +721,8 @@ def test_two_games_on_a_real_server(world: World, tab: Any, tmp_path: Path, widt
     """From one game through the break into the next and to the end, with pictures for people to look at."""
     tab.set_viewport_size({"width": width, "height": height})
     ui = dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
-    server = Running(tmp_path, grid_agent(40), {"maxEpisodes": 2, "betweenEpisodes": 4, "ui": ui}, {})
+    server = Running(tmp_path, grid_agent(40), {"maxEpisodes": 2, "betweenEpisodes": 600, "ui": ui}, {})
+    hold_timers(tab, LAST_PICTURE)
     try:
         play_two_games(world, tab, server, width)
     finally:
@@ -725,13 +740,14 @@ def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
     assert tab.evaluate(FLAWS) == []
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     shot(tab, f"{width}-game-break")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    assert tab.inner_text("#episode") == "Game 2 of 2"
+    tab.click("text=Go on now")
+    tab.wait_for_selector("#episode:text('Game 2 of 2')")
     world.step, world.source = 3, "<h1>Next page</h1>"
     tab.wait_for_selector("#overlay-title:text('The game is over')")
     assert tab.inner_text("#overlay-score") == "Your total score in 2 games: 120"
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-game-end")
+    tab.evaluate("window.letGo()")
     tab.wait_for_selector("text=Next page")
 
 
@@ -788,11 +804,11 @@ def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_ask
     lone_tab.clock.install()
     lone_tab.goto(world.url)
     assert len(loads) == 1
-    for _ in range(200):
+    until = time.monotonic() + PATIENCE / 1000
+    while len(loads) == 1:
+        assert time.monotonic() < until
         lone_tab.clock.run_for(4_000)
         lone_tab.wait_for_timeout(5)
-        if len(loads) > 1:
-            break
     lone_tab.wait_for_selector("h1:visible:text('Your game is getting ready')")
     assert len(loads) == 2
 
@@ -826,11 +842,7 @@ def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: An
 def test_a_broken_frame_costs_a_connection_and_not_the_game(world: World, tab: Any) -> None:
     play(world, tab)
     world.connections[0].send(pack(3, RED * 4)[:-4] + b"nonsense")
-    until = time.monotonic() + 10
-    while len(world.connections) < 2:
-        assert time.monotonic() < until
-        tab.wait_for_timeout(50)
-    tab.wait_for_selector("#overlay-button:visible")
+    reconnected(world, tab)
 
 
 def test_the_servers_words_are_shown(world: World, tab: Any) -> None:

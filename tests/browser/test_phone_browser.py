@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import own_page
-from tests.browser.test_pages_browser import NOWHERE, World, shot, tell, world  # noqa: F401
+from tests.browser.conftest import PATIENCE, hold_timers, own_page
+from tests.browser.test_pages_browser import LAST_PICTURE, NOWHERE, World, shot, tell, world  # noqa: F401
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}
@@ -21,6 +21,7 @@ SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "p
 def pocket(chromium: Any) -> Iterator[Any]:
     """What the phones of all tests share."""
     context = chromium.new_context(viewport={"width": 360, "height": 640}, has_touch=True, is_mobile=True)
+    context.set_default_timeout(PATIENCE)
     context.new_page()  # its window stays, as in `narrow`
     yield context
     context.close()
@@ -158,6 +159,7 @@ def test_two_thumbs_hold_two_buttons_at_once(world: World, phone: Any) -> None:
 def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: World, phone: Any) -> None:
     play(world, phone, (360, 640), {"resetFreeze": 2}, ALL)
     tell(world, state="playing", startsIn=2)
+    world.stands |= {"startsIn": 2}
     phone.wait_for_selector("#overlay-title:text('Get ready')")
     shot(phone, "360-freeze")
     assert box(phone, "#overlay")["height"] < box(phone, "#screen")["height"] / 4
@@ -184,6 +186,7 @@ def test_a_page_that_is_twice_as_large_has_the_picture_beside_the_buttons_and_th
 
 
 def test_the_last_picture_is_covered_by_no_message_and_its_score_is_announced(world: World, phone: Any) -> None:
+    hold_timers(phone, LAST_PICTURE)
     play(world, phone, (360, 640), {}, ALL)
     world.connections[0].send(json.dumps({"error": "That move is not possible now"}))
     phone.wait_for_selector("#trouble:text('not possible')")
@@ -215,38 +218,41 @@ def silent(world: World, heard: list[dict[str, Any]]) -> None:
 
 
 def test_a_picture_that_stands_still_as_the_connection_is_dead_is_explained_within_six_seconds(
-    world: World, phone: Any
+    world: World, standing: Any
 ) -> None:
     heard: list[dict[str, Any]] = []
     silent(world, heard)
-    phone.goto(world.url)
-    phone.wait_for_selector("#mode[data-state=playing]", state="attached")
-    phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=6_000)
-    shot(phone, "360-hangs")
-    phone.evaluate(
+    standing.goto(world.url)
+    standing.wait_for_selector("#mode[data-state=playing]", state="attached")
+    standing.clock.run_for(6_000)
+    assert standing.inner_text("#trouble") == HANGS
+    shot(standing, "360-hangs")
+    standing.evaluate(
         """() => {
             const title = document.getElementById("overlay-title"), trouble = document.getElementById("trouble");
             const note = () => title.textContent && (window.beside ??= trouble.textContent);
             new MutationObserver(note).observe(title, { childList: true });
         }"""
     )
-    phone.wait_for_selector("#overlay-title:text('Connection lost')", timeout=7_000)
-    assert phone.evaluate("window.beside") == "", "what hangs is not said of a connection that is lost"
+    standing.clock.run_for(7_000)
+    standing.wait_for_selector("#overlay-title:text('Connection lost')")
+    assert standing.evaluate("window.beside") == "", "what hangs is not said of a connection that is lost"
 
 
-def test_an_answer_takes_the_explanation_away(world: World, phone: Any) -> None:
+def test_an_answer_takes_the_explanation_away(world: World, standing: Any) -> None:
     heard: list[dict[str, Any]] = []
     silent(world, heard)
-    phone.goto(world.url)
-    phone.wait_for_selector(f"#trouble:text('{HANGS}')", timeout=10_000)
-    tell(world, state="playing")
-    phone.wait_for_selector("#trouble:empty", state="attached")
+    standing.goto(world.url)
+    standing.wait_for_selector("#mode[data-state=playing]", state="attached")
+    standing.clock.run_for(6_000)
+    assert standing.inner_text("#trouble") == HANGS
+    tell(world, state="playing", episodeScore=30)
+    standing.wait_for_selector("#score:text('30')")
+    standing.clock.run_for(1_000)
+    assert standing.inner_text("#trouble") == ""
 
 
-MESSAGES_STAY = """{
-    const plain = setTimeout;
-    window.setTimeout = (then, ms, ...more) => plain(then, ms === 8000 ? 1e9 : ms, ...more);
-}"""
+MESSAGE = 8_000  # ms for which the page shows one, as web/game/overlay.js has it
 COVERED = """() => {
     const box = (each) => each.getBoundingClientRect(), words = box(document.getElementById("trouble"));
     return [...document.getElementById("overlay").children].filter((each) => {
@@ -258,7 +264,7 @@ COVERED = """() => {
 
 @pytest.mark.parametrize("size", [(360, 640), (740, 360), (768, 1024), (1280, 800)], ids=lambda size: f"{size[0]}")
 def test_a_message_covers_none_of_the_words_over_the_picture(world: World, phone: Any, size: tuple[int, int]) -> None:
-    phone.add_init_script(MESSAGES_STAY)
+    hold_timers(phone, MESSAGE)
     play(world, phone, size, {}, ALL)
     failed = "Something went wrong in the game, so this round has ended. The next round begins."
     world.connections[0].send(json.dumps({"error": failed}))
