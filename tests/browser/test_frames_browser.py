@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from testing.browser import game_page
+from tests.browser.conftest import PATIENCE
 from tests.browser.test_pages_browser import World, play, reconnected, world
 from tests.trial.conftest import launch
 from trial.pictures.encoder import Encoder
@@ -66,7 +67,7 @@ def time_of(picture: Frame) -> int:
 
 
 def until(tab: Any, true: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30
+    end = time.monotonic() + PATIENCE / 1000
     while not true():
         assert time.monotonic() < end
         tab.wait_for_timeout(20)
@@ -146,11 +147,14 @@ def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: W
     """JPEGs that wait behind a slow one are left out when a later picture is ready; none comes after a newer one."""
     tab.add_init_script(
         """const plain = window.createImageBitmap;
+        const first = new Promise((done) => { window.goOn = done; });
         let calls = 0;
-        window.drawn = 0;
+        window.drawn = window.decoded = 0;
         window.createImageBitmap = async (...parts) => {
-            if (calls++ === 0) await new Promise((done) => setTimeout(done, 500));
-            return plain(...parts);
+            if (calls++ === 0) await first;
+            const bitmap = await plain(...parts);
+            window.decoded += 1;
+            return bitmap;
         };
         const draw = CanvasRenderingContext2D.prototype.drawImage;
         CanvasRenderingContext2D.prototype.drawImage = function (...parts) { window.drawn += 1; draw.apply(this, parts); };"""
@@ -159,6 +163,8 @@ def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: W
     flat = [np.full((16, 16, 3), value, np.uint8) for value in range(10, 90, 10)]
     for number, frame in enumerate(flat, 3):
         new_world.connections[0].send(header(JPEG, frame, number) + jpeg(frame))
+    until(tab, lambda: tab.evaluate("window.decoded") == len(flat) - 1)
+    tab.evaluate("window.goOn()")
     new_world.wait_for({"ack": 10})
     assert np.abs(shown(tab, 16, 16).astype(int) - flat[-1]).max() <= 3
     assert 1 <= tab.evaluate("window.drawn") < len(flat)

@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from local.rehearsal.study_process import ROOT
+from tests.browser.conftest import PATIENCE
 from tests.browser.test_pages_browser import FLAWS, World, deflated_zeros, shot, world  # noqa: F401
 from tests.trial.conftest import Running
 
@@ -31,7 +32,7 @@ class Agent:
         self.t = self.x = 0
     def step(self, action):
         self.t += 1
-        self.x += action
+        self.x = max(self.x, action)
         return None, 1.0, self.t >= 5000, False, {}
     def render(self):
         return {"hud": "Caught: <b>3</b> of 10", "objects": [
@@ -42,7 +43,7 @@ class Agent:
             {"id": "box", "type": "rectangle", "x": 0.6, "y": 0.5, "width": 60, "height": 60, "angle": 45, "origin": (0.5, 0.5), "color": "#7a4fbf"},
             {"id": "label", "type": "text", "x": 0.5, "y": 0.05, "origin": (0.5, 0), "text": "3 < 4 <b>&amp;\\nsecond line", "size": 24},
             {"id": "cook", "type": "sprite", "image": "cook", "frame": 1, "x": 0.4, "y": 0.75, "width": 64, "height": 64},
-            {"id": "runner", "type": "sprite", "image": "cook", "animation": "walk", "x": 0.2 * self.x, "y": 0.8, "width": 64, "tween": 3000},
+            {"id": "runner", "type": "sprite", "image": "cook", "animation": "walk", "x": 0.2 * self.x, "y": 0.8, "width": 64, "tween": 10000},
             {"id": "lost", "type": "sprite", "image": "nowhere", "x": 0.75, "y": 0.8, "width": 40, "height": 40},
         ]}
     def close(self):
@@ -102,13 +103,15 @@ def test_every_type_of_object_is_drawn_where_it_belongs(game: Any, tab: Any, wid
     game(width=width, height=height)
     tab.click("#overlay-button")
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    tab.wait_for_timeout(200)
     spots = {
         **{(0.01, 0.3): "#bfe3f2", (0.5, 0.98): "#4f9d69", (0.85, 0.15): "#f6c445", (0.17, 0.6): "#b5533c"},
         **{(0.6, 0.5): "#7a4fbf", (0.6, 0.41): "#7a4fbf", (0.66, 0.43): "#bfe3f2"},  # turned about its middle
         (0.45, 0.83): "#c82040",  # the red frame of the atlas
     }
-    assert {spot: tab.evaluate(SHOWN, list(spot)) for spot in spots} == spots
+    until = time.monotonic() + PATIENCE / 1000
+    while (shown := {spot: tab.evaluate(SHOWN, list(spot)) for spot in spots}) != spots and time.monotonic() < until:
+        tab.wait_for_timeout(20)
+    assert shown == spots
     assert tab.inner_text("#scene-hud") == "Caught: <b>3</b> of 10"
     assert tab.evaluate(FLAWS) == []
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
@@ -123,22 +126,24 @@ def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -
     game()
     tab.click("#overlay-button")
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    places = """async () => {
-        const easel = document.querySelectorAll(".stage canvas")[1];
-        const seen = [];
-        for (let n = 0; n < 40; n += 1) {
-            await new Promise(requestAnimationFrame);
-            const row = easel.getContext("2d").getImageData(0, Math.floor(0.88 * easel.height), easel.width, 1).data;
-            for (let x = 0; x < easel.width; x += 1) {
-                if (row[4 * x + 1] < 100) { seen.push(x / easel.width); break; }
-            }
-        }
-        return seen;
-    }"""
+    tab.evaluate(
+        """() => {
+            const easel = document.querySelectorAll(".stage canvas")[1];
+            window.seen = [];
+            const look = () => {
+                const row = easel.getContext("2d").getImageData(0, Math.floor(0.88 * easel.height), easel.width, 1).data;
+                for (let x = 0; x < easel.width; x += 1) {
+                    if (row[4 * x + 1] < 100) { seen.push(x / easel.width); break; }
+                }
+                requestAnimationFrame(look);
+            };
+            look();
+        }"""
+    )
     tab.keyboard.press("ArrowRight")
-    seen = tab.evaluate(places)
+    tab.wait_for_function("() => new Set(seen.map((place) => place.toFixed(4))).size > 5")
+    seen = tab.evaluate("seen")
     assert seen == sorted(seen)
-    assert len({round(place, 4) for place in seen}) > 5, seen
 
 
 def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> None:
@@ -160,7 +165,7 @@ def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> Non
     tab.route_web_socket("ws://127.0.0.1:*/", hold)
     game(noise=900)
     tab.wait_for_selector("#overlay progress:visible")
-    until = time.monotonic() + 20
+    until = time.monotonic() + PATIENCE / 1000
     while not held:
         assert time.monotonic() < until
         tab.wait_for_timeout(20)
