@@ -64,13 +64,33 @@ class Agent:
 """
 
 
-def write_study(folder: Path, *, live: bool = True, start: int = 1, frames: int = 30, warm: int = 0) -> Path:
-    """A project folder: hello, a game of so many frames, bye, end; so many servers are kept warm."""
+HOLDS = """
+import os, time
+
+class Env(Env):
+    def step(self, action):
+        while self.n == {holds} and os.path.exists({hold!r}):
+            time.sleep(0.02)
+        return super().step(action)
+"""
+
+
+def write_study(
+    folder: Path, *, live: bool = True, start: int = 1, frames: int = 30, warm: int = 0, holds: int = 0
+) -> Path:
+    """A project folder: hello, a game of so many frames, bye, end; so many servers are kept warm.
+
+    The game `holds` after so many frames, as long as there is the file `hold` beside the folder.
+    """
     (folder / "steps").mkdir(parents=True)
     (folder / "config.yml").write_text(
         CONFIG.format(live=str(live).lower(), start=start, warm=f"  warmServers: {warm}\n" if warm else "")
     )
-    (folder / "agent.py").write_text(AGENT.format(frames=frames))
+    hold = folder.parent / "hold"
+    held = HOLDS.format(holds=holds, hold=str(hold)) if holds else ""
+    (folder / "agent.py").write_text(AGENT.format(frames=frames) + held)
+    if holds:
+        hold.touch()
     for page in ("hello", "bye"):
         (folder / "steps" / f"{page}.html").write_text(f"<h1>{page}</h1><input name=word><button>Go on</button>")
     (folder / "steps" / "end.html").write_text("<h1>end</h1>")
@@ -89,6 +109,10 @@ class Local:
         self.url = ""
         self.through_pipe = False  # so that what it says arrives even if it may write no file
         self.process: preloaded.Forked | subprocess.Popen[str] | None = None
+
+    def goes_on(self) -> None:
+        """A game that holds goes on."""
+        (self.folder.parent / "hold").unlink()
 
     def begin(self, *options: str) -> preloaded.Forked | subprocess.Popen[str]:
         with self.output.open("wb") as file:

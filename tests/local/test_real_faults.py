@@ -28,6 +28,7 @@ from testing import exploration
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens
 from tests.local.walk import Walker
+from trial.recordings import recording
 
 Make = Callable[..., Local]
 SHARED = Path("/dev/shm")
@@ -58,13 +59,18 @@ def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
         game.send(json.dumps({"command": "start"}))
         for _ in range(60):
             game.recv(timeout=10)
-        time.sleep(0.6)  # what was played is written twice a second
+        (part,) = (here.state / "spool").rglob("*.part")
+        until = time.monotonic() + 20
+        while not any(line["kind"] == "step" for line in recording.read(part.read_bytes())):
+            assert time.monotonic() < until
+            time.sleep(0.02)
     return walker, state
 
 
 def kill_server(here: Local) -> None:
     for process in servers_of(here.data, {"P1"}):
         os.kill(process.pid, signal.SIGKILL)
+    here.goes_on()
 
 
 def goes_on(here: Local, walker: Walker) -> None:
@@ -89,7 +95,7 @@ def goes_on(here: Local, walker: Walker) -> None:
     reason="there is no other file system here; test_faults.py has the same with links that are refused",
 )
 def test_the_state_is_on_another_file_system_than_the_data(local: Make) -> None:
-    here = local(frames=240)
+    here = local(frames=240, holds=120)
     other = Path(tempfile.mkdtemp(dir=SHARED))
     try:
         (here.place / ".hippodrome").symlink_to(other)
@@ -105,7 +111,7 @@ def test_the_state_is_on_another_file_system_than_the_data(local: Make) -> None:
 @linux
 @pytest.mark.parametrize("restart", [pytest.param(False, marks=pytest.mark.hunt), True], ids=["", "killed meanwhile"])
 def test_a_server_dies_when_no_more_files_can_be_opened(local: Make, restart: bool) -> None:
-    here = local(frames=240).run()
+    here = local(frames=240, holds=120).run()
     walker, _ = begun(here)
     assert here.process
     used = len(os.listdir(f"/proc/{here.process.pid}/fd"))
@@ -130,7 +136,7 @@ def test_connections_that_say_nothing_use_up_all_files(local: Make) -> None:
     with limited(here, resource.RLIMIT_NOFILE, used + 40), ExitStack() as silent:
         for _ in range(200):
             silent.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
-        until = time.monotonic() + 8
+        until = time.monotonic() + 30
         while not _well(here):
             assert time.monotonic() < until, here.text()
             time.sleep(0.1)
@@ -150,7 +156,7 @@ def _well(here: Local) -> bool:
 @pytest.mark.parametrize("restart", [False, pytest.param(True, marks=pytest.mark.hunt)], ids=["", "killed meanwhile"])
 def test_a_server_dies_when_nothing_can_be_written(local: Make, restart: bool) -> None:
     """No file may have a byte (RLIMIT_FSIZE), as on a full disk."""
-    here = local(frames=240)
+    here = local(frames=240, holds=120)
     here.through_pipe = True
     here.run()
     walker, _ = begun(here)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -148,6 +150,7 @@ def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
         time.sleep(0.2)
         injector = refusing(*call, reach=Reach.SPELL, error=errno.EIO)
         until(lambda: injector.struck)
+        until(lambda: [line for line in told if "Input/output error" in line])
         time.sleep(0.6)  # longer than the spell, and some looks
     finally:
         platform.close(1)
@@ -187,8 +190,10 @@ def test_files_of_a_project_that_cannot_be_seen_are_not_gone(tmp_path: Path, ref
 def test_an_exit_status_that_could_not_be_written_down_is_known_all_the_same(here: Here) -> None:  # noqa: F811
     """As on a full disk: the shell cannot write it."""
     tasks = here.tasks()
-    tasks.run(request(FAKE_SECONDS="0.5", FAKE_STATUS="3"))
+    tasks.run(request(FAKE_STATUS="3"))
+    here.wait("RUNNING")
     (here.state / "tasks" / f"{NAME}.exit").mkdir()
+    os.kill(int((here.state / "tasks" / f"{NAME}.pid").read_text()), signal.SIGTERM)
     until(lambda: [event for event in here.events if event["detail"]["lastStatus"] == "STOPPED"] or _free(here))
     assert here.wait("STOPPED")["containers"][0]["exitCode"] == 3
 

@@ -310,7 +310,7 @@ def test_bytes_go_both_ways_and_the_end_of_one_side_ends_the_other(echo: tuple[i
 
 def test_what_is_no_tls_is_closed(echo: tuple[int, ssl.SSLContext]) -> None:
     port, _ = echo
-    with socket.create_connection(("127.0.0.1", port), timeout=5) as client:
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
         client.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert re.fullmatch(rb"(\x15.*)?", client.recv(1024), re.DOTALL)
 
@@ -320,10 +320,10 @@ def test_connections_that_say_nothing_keep_nobody_out_of_the_port_of_names(
 ) -> None:
     port, trusted = echo
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    silent = [socket.create_connection(("127.0.0.1", port), timeout=5) for _ in range(12)]
+    silent = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(12)]
     try:
         with (
-            socket.create_connection(("127.0.0.1", port), timeout=5) as plain,
+            socket.create_connection(("127.0.0.1", port), timeout=20) as plain,
             trusted.wrap_socket(plain, server_hostname="echo.localhost") as client,
         ):
             client.sendall(b"here")

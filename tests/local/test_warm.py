@@ -39,7 +39,7 @@ def test_who_comes_gets_a_server_that_waited_and_their_recording_lies_where_it_a
     (waiting,) = here.servers()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
-    state = walker.until("ready", seconds=5)
+    state = walker.until("ready", seconds=20)
     assert waiting in here.servers()
     assert [process.environ()["SERVER"] for process in servers_of(here.data, {"P1"})].count(waiting) >= 1
     assert walker.play(state)["score"] == 30
@@ -65,7 +65,7 @@ def test_only_who_was_given_the_server_gets_in(local: Make) -> None:
     ready(here, 1)
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
-    state = walker.until("ready", seconds=5)
+    state = walker.until("ready", seconds=20)
     other = Walker(here.url, "quick", "P2")
     with other.connect(state) as game, pytest.raises(ConnectionClosedError) as closed:
         deque(game, maxlen=0)
@@ -75,22 +75,23 @@ def test_only_who_was_given_the_server_gets_in(local: Make) -> None:
 
 
 def test_a_server_lost_while_it_waited_is_replaced_and_one_lost_in_play_goes_on_with_another(local: Make) -> None:
-    here = local(warm=1, frames=240).run()
+    here = local(warm=1, frames=240, holds=120).run()
     ready(here, 1)
     for process in servers_of(here.data):
         os.kill(process.pid, signal.SIGKILL)
     ready(here, 2)
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
-    state = walker.until("ready", seconds=5)
+    state = walker.until("ready", seconds=20)
     ready(here, 3)
     with walker.connect(state) as game:
         game.send(json.dumps({"command": "start"}))
         for _ in range(60):
-            game.recv(timeout=5)
+            game.recv(timeout=20)
         for process in servers_of(here.data, {"P1"}):
             os.kill(process.pid, signal.SIGKILL)
-    until = time.monotonic() + 10
+        here.goes_on()
+    until = time.monotonic() + 40
     while (again := walker.state()).get("attempt") != 2 or again["state"] != "ready":
         assert time.monotonic() < until, again
         time.sleep(0.1)
@@ -109,7 +110,7 @@ def test_a_changed_agent_replaces_those_that_wait(local: Make) -> None:
     assert here.servers() != [before]
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
-    assert walker.play(walker.until("ready", seconds=5))["score"] == 40
+    assert walker.play(walker.until("ready", seconds=20))["score"] == 40
 
 
 def test_none_is_left_when_it_ends_or_the_study_closes(local: Make) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import AsyncIterator
 from typing import Any
 
 from websockets.asyncio.client import ClientConnection
@@ -31,6 +32,17 @@ class TakesMessages:
             async with asyncio.timeout(seconds):
                 while True:
                     await self.take()
+
+    @contextlib.asynccontextmanager
+    async def reading(self) -> AsyncIterator[None]:
+        """Take what comes meanwhile: who takes no pictures is away after some seconds, and the game of all is held."""
+        task = asyncio.create_task(self.watch(600))
+        try:
+            yield
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                await task
 
     async def closed(self, seconds: float = 15) -> int | None:
         """Take messages until the connection is closed; the code."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 import textwrap
@@ -85,8 +86,8 @@ def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: li
     assert match.groups(found["match"], {"id": "0" * 20, "players": 2, "waiting": PEOPLE}) == (chosen, "")
 
 
-def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 0.3, question: bytes | None = None) -> Any:
-    """The answer that a server without members stores; None if it stores none."""
+def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 20, question: bytes | None = None) -> Any:
+    """The answer that a server without members stores; None if it stores none within so many seconds."""
     store = FolderStore(tmp_path)
     store.create(waiting_key("maze"), question if question is not None else json.dumps(QUESTION).encode())
 
@@ -94,8 +95,12 @@ def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 0.3, q
         project_id, session, assigned, agent_dir = "maze", "s." + "0" * 20, False, tmp_path
 
     async def run() -> None:
-        working = asyncio.create_task(Matching(store, lambda: cast(Settings, Open), function).run())
-        await asyncio.sleep(seconds)
+        server = Matching(store, lambda: cast(Settings, Open), function)
+        working = asyncio.create_task(server.run())
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while not server._answered:
+                    await asyncio.sleep(0.01)
         working.cancel()
 
     asyncio.run(run())
@@ -121,7 +126,7 @@ def test_a_match_that_hangs_is_given_up(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(match, "SECONDS", 0.1)
-    assert served(tmp_path, lambda waiting: time.sleep(1) or [], seconds=0.5) == {"groups": []}
+    assert served(tmp_path, lambda waiting: time.sleep(1) or []) == {"groups": []}
     assert "match() has not returned within 0.1 s" in caplog.text
 
 
@@ -131,4 +136,4 @@ def test_a_match_that_hangs_is_given_up(
 )
 def test_a_question_that_is_none_is_left_alone(tmp_path: Path, body: bytes) -> None:
     assert matching.read(body) is None
-    assert served(tmp_path, lambda waiting: [], question=body) is None
+    assert served(tmp_path, lambda waiting: [], 0.3, question=body) is None

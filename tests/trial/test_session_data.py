@@ -51,9 +51,10 @@ def store(launch: Any) -> Path:
                 await bert.say(action="down")
                 await anna.say(command="good")
                 await bert.say(command="bad")
-                await bert.until(lambda: len(bert.frames) >= 8)
+                await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= 8) for each in (anna, bert)))
             async with member(server, "bert") as bert:
-                await bert.until(lambda: len(bert.frames) >= 5)
+                async with anna.reading():
+                    await bert.until(lambda: len(bert.frames) >= 5)
                 await anna.say(command="stop")
                 await asyncio.gather(anna.closed(), bert.closed())
 

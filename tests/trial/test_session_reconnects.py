@@ -1,6 +1,8 @@
 """A member who connects to a real server again and again: how often they are let in, and what the others notice."""
 
 import asyncio
+import contextlib
+import time
 
 from websockets.exceptions import ConnectionClosed
 
@@ -27,21 +29,25 @@ def test_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(laun
 
     async def run():
         async with member(server, "bert") as bert:
-            codes = [await connects(server, open_client, "anna") for _ in range(150)]
+            async with bert.reading():
+                codes, began = [], time.monotonic()
+                while codes.count(4429) < 100:
+                    codes.append(await connects(server, open_client, "anna"))
+                lasted = time.monotonic() - began
             await bert.until(lambda: len(bert.frames) > 5)
             assert bert.websocket.close_code is None
             await asyncio.sleep(SECONDS_EACH)
             async with member(server, "anna") as anna:
                 await anna.say(command="stop")
                 await asyncio.gather(anna.closed(), bert.closed())
-        return codes
+        return codes, lasted
 
-    codes = asyncio.run(run())
+    codes, lasted = asyncio.run(run())
     assert set(codes[:AT_ONCE]) == {None}
-    assert 4429 in codes
+    assert codes.count(None) <= AT_ONCE + 1 + lasted / SECONDS_EACH
     (lines,) = recordings(server.store).values()
     of_anna = [line for line in lines if line["kind"] == "presence" and line["player"] == "left"]
-    assert len([line for line in of_anna if line["what"] in ("joined", "returned")]) < 60, "of 151"
+    assert len([line for line in of_anna if line["what"] in ("joined", "returned")]) <= codes.count(None) + 1
 
 
 def test_what_one_member_does_is_not_counted_against_another(launch, open_client):
@@ -49,12 +55,13 @@ def test_what_one_member_does_is_not_counted_against_another(launch, open_client
     form(server.store)
 
     async def run():
-        async with member(server, "anna"):
-            codes = [await connects(server, open_client, "bert") for _ in range(AT_ONCE + 5)]
+        async with member(server, "anna") as anna, anna.reading():
+            while (code := await connects(server, open_client, "bert")) is None:
+                pass
             async with member(server, "anna"):
-                return codes
+                return code
 
-    assert asyncio.run(run())[-1] == 4429
+    assert asyncio.run(run()) == 4429
 
 
 def test_a_refused_connection_does_not_replace_the_one_that_plays(launch, open_client):
@@ -62,11 +69,17 @@ def test_a_refused_connection_does_not_replace_the_one_that_plays(launch, open_c
     form(server.store)
 
     async def run():
-        for _ in range(AT_ONCE - 1):
-            await connects(server, open_client, "anna")
-        async with member(server, "anna") as anna:
-            codes = [await connects(server, open_client, "anna") for _ in range(3)]
-            await anna.watch(0.3)
-            return codes, anna.websocket.close_code
+        async with contextlib.AsyncExitStack() as stack:
+            newest, refused = None, None
+            while refused is None:
+                playing = newest
+                newest = await stack.enter_async_context(open_client(server.address))
+                await newest.hello(**hello_of("anna"))
+                try:
+                    await newest.until(lambda client=newest: client.controls)
+                except ConnectionClosed:
+                    refused = newest.websocket.close_code
+            await playing.watch(0.3)
+            return refused, playing.websocket.close_code
 
-    assert asyncio.run(run()) == ([4429] * 3, None)
+    assert asyncio.run(run()) == (4429, None)

@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import signal
+import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -136,7 +137,7 @@ def test_a_request_that_is_too_large_ends_its_connection_alone(launch: Any) -> N
     with served(server) as env, connect(url(server), compression=None, proxy=None) as large:
         large.send("x" * (LARGEST_REQUEST + 1))
         with pytest.raises(ConnectionClosed):
-            large.recv(10)
+            large.recv(SECONDS)
         assert large.close_code == 1009
         env.reset()
 
@@ -243,7 +244,14 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
         env.reset()
         return env
 
-    async def play() -> tuple[int, int]:
+    async def stalls(worst: list[float]) -> None:
+        """For how long this machine has let nobody run who wanted to."""
+        while True:
+            before = time.monotonic()
+            await asyncio.sleep(0.02)
+            worst[0] = max(worst[0], time.monotonic() - before - 0.02)
+
+    async def play() -> tuple[int, int, float]:
         async with open_client(server.address) as client:
             await client.play()
             beginning = asyncio.create_task(asyncio.to_thread(begin))
@@ -252,20 +260,25 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
             with beginning.result() as env:
                 hanging = threading.Thread(target=_hang, args=(env,), daemon=True)
                 hanging.start()
+                worst = [0.0]
+                watching = asyncio.create_task(stalls(worst))
                 since = time.monotonic_ns()
-                await client.watch(3)
+                await client.sees(90)
                 ended = time.monotonic_ns()
+                watching.cancel()
                 assert hanging.is_alive()
             server.terminate()
             await client.closed()
-            return since, ended
+            return since, ended, worst[0]
 
-    since, ended = asyncio.run(play())
+    since, ended, stalled = asyncio.run(play())
     assert server.wait() == 0
     steps = (line["ns"] for lines in server.recordings().values() for line in lines if line["kind"] == "step")
     times = [since, *(ns for ns in steps if since < ns < ended)]  # by the server's clock, which is this machine's
     assert len(times) > 60  # of 90
-    assert max(later - earlier for earlier, later in itertools.pairwise(times)) < 500_000_000
+    gaps = [(later - earlier) / 1e9 for earlier, later in itertools.pairwise(times)]
+    assert statistics.median(gaps) < 0.05
+    assert max(gaps) < 0.5 + stalled
 
 
 def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch: Any) -> None:
@@ -290,7 +303,7 @@ def test_before_a_warm_server_has_its_participant_it_makes_none(launch: Any) -> 
     server = launch(agent(), SERVES, SPARE="on")
     with connect(url(server), compression=None, proxy=None) as program:
         with pytest.raises(ConnectionClosed):
-            program.recv(10)
+            program.recv(SECONDS)
         assert program.close_code == 1013
     assert processes(server) == []
 

@@ -86,24 +86,25 @@ def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(lau
     server = launch(grid(None), {"gym": "advise", "startingFrameRate": 30})
 
     async def play() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        async with program(server) as websocket, open_client(server.address) as client, asyncio.TaskGroup() as reading:
+        async with program(server) as websocket, open_client(server.address) as client:
             await client.play()
-            watching = reading.create_task(client.watch(60))  # who takes no pictures is held to be away
-            assert await ask(websocket, "action_space") == {
-                "name": "Discrete",
-                "n": 6,
-                "names": ["noop", "up", "right", "left", "down", "upright"],
-            }
-            await ask(websocket, "watch")
-            assert await ask(websocket, "advise", action=3) is True
-            alone = await steps(websocket, 4)
-            await client.say(action="up", held=True)
-            while (await steps(websocket, 1))[0]["human"] is None:
-                pass
-            await ask(websocket, "advise", action=3)
-            together = await steps(websocket, 3)
-            watching.cancel()
-            return alone, together
+            async with client.reading():
+                return await advise(websocket, client)
+
+    async def advise(websocket: ClientConnection, client: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        assert await ask(websocket, "action_space") == {
+            "name": "Discrete",
+            "n": 6,
+            "names": ["noop", "up", "right", "left", "down", "upright"],
+        }
+        await ask(websocket, "watch")
+        assert await ask(websocket, "advise", action=3) is True
+        alone = await steps(websocket, 4)
+        await client.say(action="up", held=True)
+        while (await steps(websocket, 1))[0]["human"] is None:
+            pass
+        await ask(websocket, "advise", action=3)
+        return alone, await steps(websocket, 3)
 
     alone, together = asyncio.run(play())
     advised = [line for line in alone if line["by"] == "advice"]

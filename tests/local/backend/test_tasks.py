@@ -80,7 +80,7 @@ class Here:
 
     def written(self) -> None:
         """Wait until all that was told is written down: an event is sent before its version is saved."""
-        until = time.monotonic() + 5
+        until = time.monotonic() + 20
         for event in self.events:
             file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
             while json.loads(file.read_text())["version"] < event["detail"]["version"]:
@@ -211,7 +211,7 @@ def test_children_of_a_server_go_with_it(here: Here, tmp_path: Path) -> None:
     here.tasks(command=(sys.executable, str(script))).run(request())
     here.wait("STOPPED")
     child = int(here.log().split()[0])
-    until = time.monotonic() + 5
+    until = time.monotonic() + 20
     while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -350,7 +350,7 @@ def test_processes_that_nobody_knows_of_are_ended(here: Here) -> None:
     here.written()
     (here.state / "tasks" / f"{NAME}.json").unlink()
     here.tasks().start()
-    until = time.monotonic() + 5
+    until = time.monotonic() + 20
     while here.processes():
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -519,9 +519,9 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
         player.send(json.dumps({"userId": "P1", "token": "secret", "step": "3"}))
         assert "actionSpace" in json.loads(player.recv(10))
         player.send('{"command": "start"}')
-        until = time.monotonic() + 1.5
-        while time.monotonic() < until:
-            player.recv(5)
+        [part] = (here.state / "spool").rglob("*.part")
+        while [line["kind"] for line in recording.read(part.read_bytes())].count("step") <= 20:
+            player.recv(10)
         kill(here)
     stopped = here.wait("STOPPED")
     assert stopped["containers"][0]["exitCode"] == 137
@@ -534,7 +534,7 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
 
 
 def test_closing_ends_all_and_starts_none(here: Here) -> None:
-    tasks = here.tasks()
+    tasks = here.tasks(stop_timeout=600)
     names = [f"s{'a' * 20}-{n}" for n in range(1, 6)]
     for n, name in enumerate(names):
         tasks.run(request(name, **({"FAKE_STUBBORN": "yes"} if n == 0 else {})))
@@ -542,7 +542,7 @@ def test_closing_ends_all_and_starts_none(here: Here) -> None:
         here.wait("RUNNING", name)
     began = time.monotonic()
     tasks.close(1)
-    assert time.monotonic() - began < 3
+    assert time.monotonic() - began < 20, "the stubborn one has a second here, and else ten minutes"
     assert here.processes() == []
     for name in names:
         here.wait("STOPPED", name, 0)

@@ -214,7 +214,7 @@ def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int
         assert process.stdout is not None
         process.stdout.readline()
         process.send_signal(number)
-        assert process.communicate(timeout=20) == (
+        assert process.communicate(timeout=40) == (
             "",
             f"Ended. Recordings are in {tmp_path}.\n" if recorded else "Ended.\n",
         )
@@ -241,7 +241,7 @@ sys.exit(main(["--port", "0"]))
         time.sleep(0.2)  # it waits for connections
         process.send_signal(signal.SIGINT)
         try:
-            assert process.communicate(timeout=10) == ("", "Ended.\n")
+            assert process.communicate(timeout=40) == ("", "Ended.\n")
         finally:
             process.kill()
         assert process.returncode == 0

@@ -309,9 +309,7 @@ def test_what_is_no_http_is_dropped(server: GymServer) -> None:
 
 @pytest.fixture
 def small() -> Iterator[GymServer]:
-    with gym_server(
-        *("--workers", "2", "--connections", "4", "--idle-seconds", "1", "--steps-per-second", "10")
-    ) as found:
+    with gym_server(*("--workers", "2", "--connections", "4", "--steps-per-second", "10")) as found:
         yield found
 
 
@@ -354,8 +352,8 @@ def test_no_more_steps_a_second_than_allowed(small: GymServer) -> None:
         assert len(client.ask("step", instance_id=made, action=0)) == 5
 
 
-def test_a_connection_without_requests_is_closed(small: GymServer) -> None:
-    with Client(small.url) as client:
+def test_a_connection_without_requests_is_closed() -> None:
+    with gym_server("--idle-seconds", "1") as own, Client(own.url) as client:
         client.make("CartPole-v1")
         assert closed_within(client) == "There was no request for 1 s."
 
