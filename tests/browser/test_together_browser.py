@@ -789,6 +789,9 @@ def test_a_second_tab_takes_the_game_and_the_first_one_says_so(together: World, 
     together.connections[0].close(4409, "opened elsewhere")
     tab.wait_for_selector("text=Play here instead")
     assert names(tab) == ["You: Blue", "Red"]
+    assert tab.inner_text("#overlay-hint") == "If you have closed it there, go on here."
+    fits(tab)
+    shot(tab, "360-elsewhere")
 
 
 def test_when_the_pictures_have_come_the_page_says_again_what_the_game_waits_for(together: World, tab: Any) -> None:

@@ -93,6 +93,7 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Any]:
     assert [person.complaints for person in people] == [[] for _ in people]
 
 
+ELSEWHERE = "The game was opened in another tab or on another device"
 SEATS = (["You: Red", "Blue"], ["Red", "You: Blue"])
 """What the two read of who plays which player. Seats are drawn by lot."""
 
@@ -237,14 +238,24 @@ def test_a_link_that_two_people_open_is_one_participant_whose_last_page_plays(co
         second = other.new_page()
         second.set_default_timeout(45_000)
         second.goto(gwen.link)
-        gwen.sees("The game is open in another tab or on another device")
+        gwen.sees(ELSEWHERE)
         second.wait_for_selector("#mode[data-state=playing]", state="attached")
         hans.plays()
         gwen.page.wait_for_timeout(3_000)  # a page that takes the game back by itself would do so by now
         assert second.locator("#overlay-title:text('another tab'):visible").count() == 0
         gwen.page.locator("#overlay-button").click()
         gwen.plays()
-        second.wait_for_selector("#overlay-title:text('The game is open in another tab or on another device'):visible")
+        second.wait_for_selector(f"#overlay-title:text('{ELSEWHERE}'):visible")
+        hans.plays()
+        second.locator("#overlay-button").click()
+        gwen.sees(ELSEWHERE)
+        second.close()
+        hans.sees("Waiting for the other participant")
+        # What the page says is true also now, and says the way back.
+        gwen.sees(ELSEWHERE)
+        assert gwen.page.inner_text("#overlay-hint") == "If you have closed it there, go on here."
+        shot(gwen.page, "1280-two-players-elsewhere")
+        gwen.page.locator("#overlay-button").click()
         hans.plays()
     finally:
         other.close()

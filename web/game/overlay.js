@@ -13,7 +13,11 @@ export const overlays = {
     title: "Your game cannot be reached – trying again…",
     note: "Your game is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.",
   },
-  elsewhere: { title: "The game is open in another tab or on another device", button: "Play here instead" },
+  elsewhere: {
+    title: "The game was opened in another tab or on another device",
+    button: "Play here instead",
+    note: "If you have closed it there, go on here.",
+  },
   ended: { title: "Saving your game…", band: true },
   over: { title: "The game is over", button: "Go on", band: true, shown: 4_000 }, // ms, unless the participant goes on
 };
