@@ -38,6 +38,7 @@ from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import scene, walk
 from hippodrome.certificates.rules import location
 from hippodrome.config import read_project
+from hippodrome.model.server import Server
 from hippodrome.storage.secret import SecretCache
 from lambdas import (
     installed,
@@ -57,6 +58,7 @@ from tests.deploy.registering import _stream
 Process = preloaded.Forked | subprocess.Popen[str]
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
 NEAR = timedelta(minutes=2)
+UNTIL_KILLED = 100.0  # seconds
 NOBODY = 1  # a port on which nobody listens
 
 
@@ -350,16 +352,28 @@ def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPS
 
 
 @contextlib.contextmanager
-def held(folder: Path, patch: pytest.MonkeyPatch, *, play: float, email: str) -> Iterator[Living]:
+def held(
+    folder: Path, patch: pytest.MonkeyPatch, *, play: float, email: str, together: bool = False
+) -> Iterator[Living]:
     """An installation that lives, with the study of this folder, as `make deploy` leaves it; its rehearsals are short.
 
-    `play` is the longest game of a bot in seconds; `email` gets the alarms.
+    `play` is the longest game of a bot in seconds; but those on the server that is killed play until it is, however
+    long that takes here: the victim, and who plays `together` with it. `email` gets the alarms.
     """
     for name, value in KEYS.items():
         patch.setenv(name, value)
     patch.setattr(scene, "PAUSE", 0.2)
-    patch.setattr(walk, "PLAY", play)
-    patch.setattr(walk, "VICTIM_PLAYS", 3.0)
+    kill = walk.Walk._kill
+
+    def killed(walked: walk.Walk) -> Server | None:
+        struck = kill(walked)
+        for bot in walked.all:
+            bot.play = play  # on the next server
+        return struck
+
+    patch.setattr(walk.Walk, "_kill", killed)
+    patch.setattr(walk, "PLAY", UNTIL_KILLED if together else play)
+    patch.setattr(walk, "VICTIM_PLAYS", UNTIL_KILLED)
     patch.setattr(walk, "STRUCK", 1.0)
     patch.setattr(walk, "ARRIVALS", 0.1)
     with Living(folder) as world:

@@ -83,7 +83,7 @@ def living_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Liv
         project={"players": 2},
         trial={**both, "ui": {"up": True, "down": True, "start": True}},
     )
-    with held(study, monkeypatch, play=1.5, email="admin@example.org") as world:
+    with held(study, monkeypatch, play=1.5, email="admin@example.org", together=True) as world:
         yield world
 
 
