@@ -474,7 +474,7 @@ def test_who_is_refused_does_not_wait_for_the_others():
 
 
 def test_policies_do_not_play_while_the_only_member_is_still_measured():
-    driver = SessionDriver(maxPing=100, pingSamples=2, **POLICY).come(1).trip(1, 0.02).wait(100)
+    driver = SessionDriver(maxPing=100, pingSamples=2, gather=10, **POLICY).come(1).trip(1, 0.02).wait(19)
     assert driver.taken == []
     assert driver.trip(1, 0.02).wait(3.2).taken
     assert driver.told(1)["people"] == {"left": "policy", "right": "here"}
@@ -511,7 +511,7 @@ def test_the_time_of_a_member_does_not_run_while_their_round_trip_is_measured():
 
 def test_it_runs_on_if_they_go_meanwhile():
     driver = SessionDriver(maxPing=100, pingSamples=2).come(0).trip(0, 0.02).trip(0, 0.02).wait(30)
-    driver.come(1).trip(1, 0.02).wait(100).go(1)
+    driver.come(1).trip(1, 0.02).wait(19).go(1)
     assert driver.told(0)["heldFor"] == 30
     assert driver.wait(30).outcomes == {"P0": "partnerLeft", "P1": "left"}
 
@@ -534,6 +534,44 @@ def test_who_never_answers_is_refused_as_soon_as_that_is_certain(samples, until)
             driver.trip(1, 10.0)
     assert driver.told(0)["people"]["right"] == "policy"
     assert driver.errors(1) == [PING]
+
+
+@pytest.mark.parametrize("samples", [5, 100])
+def test_who_answers_no_ping_holds_the_others_for_twenty_seconds_however_many_samples_are_wanted(samples):
+    driver = SessionDriver(maxPing=100, pingSamples=samples, **POLICY).come(0)
+    for _ in range(samples):
+        driver.trip(0, 0.02)
+    driver.come(1).wait(10).trip(1, 10.0).wait(9.9)
+    assert (driver.told(0)["people"]["right"], driver.errors(1)) == ("awaited", [])
+    driver.wait(0.1)
+    assert (driver.told(0)["people"]["right"], driver.errors(1)) == ("policy", [PING])
+
+
+def test_the_twenty_seconds_go_on_when_they_connect_again_and_stand_while_they_are_away():
+    driver = SessionDriver(maxPing=100, pingSamples=5, **POLICY).come(0)
+    for _ in range(5):
+        driver.trip(0, 0.02)
+    driver.come(1).wait(9).go(1).wait(5).come(1).wait(9).go(1).wait(5).come(1).wait(1.9)
+    assert driver.told(0)["people"]["right"] == "awaited"
+    assert driver.wait(0.1).told(0)["people"]["right"] == "policy"
+    assert driver.errors(1) == [PING]
+
+
+@pytest.mark.parametrize("trips", [(10.0, 0.02, 0.03), (0.02, 10.0, 0.05, 9.0), (0.02, 9.9, 0.02, 9.9)], ids=str)
+def test_a_phone_that_is_slow_once_plays_also_if_the_time_is_over_before_its_samples_are(trips):
+    """Nor does it count that half of the samples were slow."""
+    driver = SessionDriver(maxPing=100, pingSamples=100, **POLICY).come(0)
+    for _ in range(100):
+        driver.trip(0, 0.02)
+    driver.come(1)
+    began = driver.now
+    for seconds in trips:
+        driver.wait(seconds).trip(1, seconds)
+    driver.wait(began + 19.95 - driver.now)
+    assert driver.told(0)["people"]["right"] == "awaited"
+    driver.wait(0.1)
+    assert driver.told(0)["people"]["right"] == "here"
+    assert driver.wait(3.2).taken
 
 
 def test_a_round_trip_that_comes_after_the_end_changes_no_outcome():

@@ -23,6 +23,8 @@ LEAST_ABSENCE = 3.0
 anew after it."""
 GIVEN_BACK = 0.25
 """So many seconds of their time a member has again for each second of play."""
+MEASURED_SECONDS = 20.0
+"""For so long at most is a member here whose round trip is not known: then the samples so far decide."""
 Over = Literal["absent", "ping"]
 """Why a member does not play any more: their time is over, or their round trip is too long."""
 
@@ -36,6 +38,10 @@ class _Member:
     measured: bool
     until: float | None = None
     """The clock runs: so long do the others wait."""
+    to_measure: float = MEASURED_SECONDS
+    """Seconds for which their round trip is still measured, while they are not measured."""
+    measured_until: float | None = None
+    """They are measured, until then at most."""
     connected: bool = False
     stalled: bool = False
     hidden: bool = False
@@ -57,8 +63,13 @@ class _Member:
 
     @property
     def gone(self) -> bool:
-        """The clock runs; it does not while they are measured, which takes ten seconds for each sample at most."""
+        """The clock runs; it does not while they are measured, which takes `MEASURED_SECONDS` at most."""
         return self.over is None and not self.takes_part
+
+    @property
+    def is_measured_now(self) -> bool:
+        """They are here, and their round trip is not known."""
+        return self.over is None and self.takes_part and not self.measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,12 +178,15 @@ class Presence:
         member.samples.append(seconds)
         if member.measured:
             return
-        too_long = sum(each * 1000 > rules.max_ping for each in member.samples) > rules.ping_samples // 2
+        too_long = self._too_long(member) > rules.ping_samples // 2
         if too_long or len(member.samples) == rules.ping_samples:
             member.measured = True
             if too_long or _median(member.samples) * 1000 > rules.max_ping:
                 member.over = "ping"
             self._changed(now)
+
+    def _too_long(self, member: _Member) -> int:
+        return sum(each * 1000 > self.rules.max_ping for each in member.samples)
 
     def page(self) -> None:
         """A break begins: nobody has gone on from it."""
@@ -192,11 +206,21 @@ class Presence:
     # ---- what follows
 
     def look(self, now: float) -> None:
-        """The others wait no longer for those whose time is over."""
-        over = [one for one in self._members.values() if one.until is not None and now >= one.until]
+        """The others wait no longer for those whose time is over, nor for a round trip that takes too long to measure.
+
+        Whoever has more than half of the samples so far too long, or none at all, is refused: one slow answer of
+        several refuses nobody.
+        """
+        members = self._members.values()
+        over = [one for one in members if one.until is not None and now >= one.until]
         for member in over:
             member.over = "absent"
-        if over:
+        decided = [one for one in members if one.measured_until is not None and now >= one.measured_until]
+        for member in decided:
+            member.measured = True
+            if not member.samples or self._too_long(member) > len(member.samples) // 2:
+                member.over = "ping"
+        if over or decided:
             self._changed(now)
 
     def may_play(self, now: float, *, on: bool) -> bool:
@@ -282,7 +306,8 @@ class Presence:
     def wake_at(self, now: float, *, on_break: bool) -> float:
         """When to call `look` again if nothing happens; infinite if there is no need to."""
         counts = math.inf if self._counts_until is None else self._counts_until
-        return min(self._until(now, reads=on_break), counts)
+        measured = [one.measured_until for one in self._members.values() if one.measured_until is not None]
+        return min(self._until(now, reads=on_break), counts, *measured)
 
     def round_trips(self) -> dict[str, int]:
         """The median of each member's last samples in milliseconds, of those who have some."""
@@ -310,6 +335,11 @@ class Presence:
             elif member.until is not None:
                 least = 0.0 if member.gone else self._least
                 member.left, member.until = max(0.0, min(member.until - now, member.left - least)), None
+            if member.is_measured_now:
+                if member.measured_until is None:
+                    member.measured_until = now + member.to_measure
+            elif member.measured_until is not None:
+                member.to_measure, member.measured_until = max(0.0, member.measured_until - now), None
 
     @property
     def _least(self) -> float:
