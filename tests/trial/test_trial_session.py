@@ -659,7 +659,7 @@ def test_a_step_that_all_have_answered_is_not_played_again(launch, open_client):
     asyncio.run(both_play(server, open_client))
     assert server.wait() == 0
     kept = {each: answer(server.store, each) for each in MEMBERS}
-    again = launch_session(launch, SERVER="pair-2")
+    again = launch_session(launch, SERVER="pair-2", LINGER_SECONDS="4")  # the second one comes by then
 
     async def run():
         async with member(again, "anna") as anna, member(again, "bert") as bert:

@@ -161,7 +161,7 @@ def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_
 
 def test_the_next_game_step_is_played_while_the_answer_of_one_to_the_step_before_is_refused(launch):
     section = {"gather": 4, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
-    server = launch_session(launch, trial=section, GAME_STEPS="3,5")
+    server = launch_session(launch, trial=section, GAME_STEPS="3,5", LINGER_SECONDS="4")
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
 

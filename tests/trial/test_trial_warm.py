@@ -205,7 +205,7 @@ def test_a_page_that_came_too_early_gets_in_the_next_time(launch_warm_server, op
 
 
 def test_many_who_come_at_the_moment_it_is_given(launch_warm_server, open_client):
-    server = launch_warm_server()
+    server = launch_warm_server(LINGER_SECONDS="60")
 
     async def come():
         with contextlib.suppress(AssertionError):  # too early, like a page that is opened again and again
