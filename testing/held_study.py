@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import Any
 
-from local.rehearsal.study_process import ROOT, Process, StudyProcess
+from local.rehearsal.study_process import ROOT, Process, StudyProcess, logs_of
 from testing import preloaded
+from trial.recordings.recording import read
 
 
 class HeldStudy(StudyProcess):
@@ -15,3 +17,11 @@ class HeldStudy(StudyProcess):
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         options["env"] = {**options["env"], "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT)}
         return preloaded.start("local", arguments, **options)
+
+    def steps_written(self, owner: str = "*") -> int:
+        """The steps in the recordings that servers of this participant or session have not finished."""
+        files, steps = (logs_of(self.data).parent / "spool").glob(f"*/*/{owner}/trials/*/*.part"), 0
+        for file in files:
+            with contextlib.suppress(FileNotFoundError):  # it is finished meanwhile
+                steps += sum(line["kind"] == "step" for line in read(file.read_bytes()))
+        return steps

@@ -190,9 +190,13 @@ def noted(page: Any, selector: str, text: str) -> None:
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
-    """The example study, in a copy whose game can be ended with a button."""
+    """The example study, in a copy whose game can be ended with a button.
+
+    Its steps last three times as long: at its own speed the game is over after half a minute in which nobody presses a key.
+    """
     folder = tmp_path_factory.mktemp("example")
     copy_of(ROOT, folder / "project")
+    change(folder / "project", {"  startingFrameRate: 30\n": "  startingFrameRate: 10\n"})
     held = HeldStudy(folder / "project", folder / "data")
     try:
         held.start()
@@ -206,25 +210,31 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
 Hold = Callable[..., StudyProcess]
 
 
+def change(project: Path, changes: Mapping[str, str]) -> None:
+    """Other lines of config.yml for these."""
+    config = project / "config.yml"
+    for line, instead in changes.items():
+        assert config.read_text().count(line) == 1, line
+        config.write_text(config.read_text().replace(line, instead))
+
+
 @pytest.fixture(scope="module")
 def hold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hold]:
     """An example, held once for all tests of the file, in a copy whose game can be ended with a button.
 
     `hold("gridworld")`. `changes` are lines of config.yml with what stands there instead.
     """
-    studies: dict[str, HeldStudy] = {}
+    studies: dict[tuple[str, ...], HeldStudy] = {}
 
     def start(name: str, changes: Mapping[str, str] | None = None) -> StudyProcess:
-        if name not in studies:
+        key = (name, *(changes or {}).values())
+        if key not in studies:
             folder = tmp_path_factory.mktemp(name)
             copy_of(ROOT / "examples" / name, folder / "project")
-            config = folder / "project" / "config.yml"
-            for line, instead in (changes or {}).items():
-                assert config.read_text().count(line) == 1, line
-                config.write_text(config.read_text().replace(line, instead))
-            studies[name] = HeldStudy(folder / "project", folder / "data")
-            studies[name].start()
-        return studies[name]
+            change(folder / "project", changes or {})
+            studies[key] = HeldStudy(folder / "project", folder / "data")
+            studies[key].start()
+        return studies[key]
 
     yield start
     for study in studies.values():

@@ -69,7 +69,6 @@ def test_a_participant_plays(
     come_to_the_game(page, with_user(study.link, name))
     page.locator("#overlay-button").click()
     page.wait_for_function(STATE, arg="playing")
-    page.wait_for_timeout(4_000)  # the first picture stands for a while
     for key, button, milliseconds in presses:
         press(page, key, button, narrow=narrow, milliseconds=milliseconds)
         page.wait_for_timeout(150)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from local.rehearsal.study_process import servers_of, wait_until_gone
+from tests.browser.conftest import PATIENCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 
@@ -281,7 +282,10 @@ def test_the_server_is_lost_in_mid_game(visit: Any, study: Any) -> None:
     visitor.page.keyboard.press("ArrowLeft")
     wait_for_game(visitor, "playing")
     see_motion(visitor)
-    visitor.page.wait_for_timeout(1500)  # of a game that is killed at once nothing would be kept
+    until = time.monotonic() + PATIENCE / 1000
+    while not study.steps_written("unlucky"):  # of a game that is killed at once nothing is kept
+        assert time.monotonic() < until
+        visitor.page.wait_for_timeout(100)
     for process in servers_of(study.data, {"unlucky"}):
         process.kill()
     wait_for_game(visitor, "ready")  # on another server, without a hand on this page
@@ -327,7 +331,7 @@ def test_two_clicks_on_a_button_send_once(visit: Any, study: Any) -> None:
     visitor.page.locator("form.page button").dblclick()
     visitor.page.wait_for_selector("body[data-step='2']")
     began = time.monotonic()
-    while not servers_of(study.data, {"twice"}) and time.monotonic() < began + 20:
+    while not servers_of(study.data, {"twice"}) and time.monotonic() < began + PATIENCE / 1000:
         visitor.page.wait_for_timeout(100)
     assert len({process.environ()["SERVER"] for process in servers_of(study.data, {"twice"})}) == 1
     visitor.complete()

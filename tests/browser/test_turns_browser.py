@@ -20,14 +20,16 @@ def in_turns(world: World) -> World:
 
 
 @pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
-def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, tab: Any, width: int, height: int) -> None:
+def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, standing: Any, width: int, height: int) -> None:
+    tab = standing
     tab.set_viewport_size({"width": width, "height": height})
     play(in_turns, tab)
     tell(in_turns, state="playing", toAct=True, turnEndsIn=8.5)
     tab.wait_for_selector("#turn:text('Your turn (9 s)')")
     assert tab.inner_text("#announce") == "Your turn"
     shot(tab, f"{width}-your-turn")
-    tab.wait_for_selector("#turn:text('Your turn (7 s)')")
+    tab.clock.run_for(2_000)
+    assert tab.inner_text("#turn") == "Your turn (7 s)"
     tell(in_turns, state="playing", toAct=False)
     tab.wait_for_selector("#turn:text('The other player\u2019s turn')")
     assert tab.inner_text("#announce") == "", "a screen reader finds no turn that is over"

@@ -11,7 +11,7 @@ import pytest
 
 from bots.links import with_user
 from local.rehearsal.study_process import StudyProcess
-from tests.browser.conftest import SHOTS, Hold
+from tests.browser.conftest import PATIENCE, SHOTS, Hold, note_texts, noted
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
@@ -19,10 +19,12 @@ pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.ma
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SHORT = {
     "  maxEpisodes: 3\n": "  maxEpisodes: 1\n",
-    "  episodeSeconds: 60\n": "  episodeSeconds: 14\n",
+    "  episodeSeconds: 60\n": "  episodeSeconds: 25\n",
     "  absent: 15\n": "  absent: 4\n",
     "  countdown: 3\n": "  countdown: 2\n",
+    "  patience: 30\n": "  patience: 300\n",  # a busy machine may take long to bring the second
 }
+ALONE = {"  patience: 30\n": "  patience: 10\n"}
 SAYS = "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)"
 PLAYS = "() => document.getElementById('mode').dataset.state === 'playing'"
 
@@ -31,8 +33,14 @@ Come = Callable[..., Any]
 
 @pytest.fixture(scope="module")
 def study(hold: Hold) -> StudyProcess:
-    """The example with a short game. The lobby's patience is 30 seconds, as for bots."""
+    """The example with a short game."""
     return hold("two-players", SHORT)
+
+
+@pytest.fixture(scope="module")
+def without_others(hold: Hold) -> StudyProcess:
+    """The example, whose participants soon go on without others."""
+    return hold("two-players", ALONE)
 
 
 @pytest.fixture
@@ -40,13 +48,13 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Come]:
     """A participant at the game step, in a browser of their own: `come("ada", 1280)`. Nothing may go wrong in it."""
     contexts, complaints = [], []
 
-    def arrive(name: str, width: int) -> Any:
+    def arrive(name: str, width: int, study: StudyProcess = study) -> Any:
         narrow = width < 600
         context = chromium.new_context(
             viewport={"width": width, "height": 740 if narrow else 800}, has_touch=narrow, is_mobile=narrow
         )
         contexts.append(context)
-        context.set_default_timeout(30_000)
+        context.set_default_timeout(PATIENCE)
         page = context.new_page()
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
@@ -116,13 +124,15 @@ def test_one_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, s
     wide, phone = come("cy", 1280), come("di", 360)
     for page in (wide, phone):
         page.wait_for_function(PLAYS)
+    for each in ("#overlay-title", "#overlay-hint", "#trouble"):
+        note_texts(wide, each)
     phone.goto("about:blank")
-    says(wide, "#overlay-title", "Waiting for the other participant")
-    says(wide, "#overlay-hint", "a computer player takes their place")
-    says(wide, "#trouble", "A computer player has taken the place")
+    noted(wide, "#overlay-title", "Waiting for the other participant")
+    noted(wide, "#overlay-hint", "a computer player takes their place")
+    noted(wide, "#trouble", "A computer player has taken the place")
     wide.wait_for_function(PLAYS)
     phone.goto(with_user(study.link, "di"))
-    says(wide, "#trouble", "The other participant is back")
+    noted(wide, "#trouble", "The other participant is back")
     phone.wait_for_function(PLAYS)
     for page in (wide, phone):
         page.wait_for_selector("body[data-step='4']")
@@ -135,10 +145,11 @@ def test_one_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, s
     assert by[-1] != "policy"
 
 
-def test_one_who_finds_no_other_goes_on_and_is_told_apart(come: Come, study: StudyProcess) -> None:
-    page = come("ed", 360)
+def test_one_who_finds_no_other_goes_on_and_is_told_apart(come: Come, without_others: StudyProcess) -> None:
+    study = without_others
+    page = come("ed", 360, study)
     says(page, "#lobby-then", "you go on to the next part of the study without this game")
-    page.wait_for_selector("body[data-step='4']", timeout=60_000)
+    page.wait_for_selector("body[data-step='4']")
     page.wait_for_selector("text=There was nobody to play with")
     page.get_by_label("Yes").check()
     page.get_by_role("button", name="Continue").click()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 import yaml
 
 from local.rehearsal.study_process import StudyProcess
+from testing import ports
 from testing.held_study import HeldStudy
 
 AGENT = '''
@@ -107,6 +107,4 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
 @pytest.fixture
 def free_port() -> int:
     """A port nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return ports.free()

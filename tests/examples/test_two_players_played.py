@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 import yaml
@@ -20,12 +19,13 @@ from bots.verification import document
 from local.new import LEFT_OUT
 from local.rehearsal.logs import verify
 from local.rehearsal.study_process import ROOT, servers_of, sessions_not_open, sessions_of, wait_until_gone
+from testing import ports
 from testing.held_study import HeldStudy
 from trial.recordings.recording import read
 
 EXAMPLE = ROOT / "examples" / "two-players"
 PROJECT = "two-players"
-PATIENCE = 60.0  # seconds in which a bot must have passed everything
+PATIENCE = 150.0  # seconds in which a bot must have passed everything
 
 Hold = Callable[..., HeldStudy]
 
@@ -38,7 +38,7 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
     """
     held: list[HeldStudy] = []
 
-    def start(project: dict[str, Any], trial: dict[str, Any], more: str = "") -> HeldStudy:
+    def start(project: dict[str, Any], trial: dict[str, Any], more: str = "", port: int = 0) -> HeldStudy:
         folder = tmp_path / "study"
         shutil.copytree(EXAMPLE, folder, ignore=LEFT_OUT)
         config = yaml.safe_load((folder / "config.yml").read_text())
@@ -47,7 +47,7 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
         (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
         with (folder / "agent.py").open("a") as agent:
             agent.write(more)
-        held.append(HeldStudy(folder, tmp_path / "run" / "data", log=tmp_path / "local.log"))
+        held.append(HeldStudy(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log"))
         held[-1].start()
         return held[-1]
 
@@ -110,6 +110,9 @@ def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
         while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
             assert not walking.done()
             await asyncio.sleep(0.05)
+        while study.steps_written() < bots[0].account.plays[0].frames - 5:  # a busy machine may write them late
+            assert not walking.done()
+            await asyncio.sleep(0.05)
         for server in servers_of(study.data):
             server.kill()
         return await walking
@@ -118,8 +121,11 @@ def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
     assert [(account.errors, account.finished) for account in accounts] == [([], True)] * 2
     assert [len(account.plays[0].addresses) for account in accounts] == [2, 2]
     assert [account.plays[0].outcome for account in accounts] == ["finished", "finished"]
-    missing = verify(study.data, PROJECT, accounts).missing
-    assert [line for line in missing if not line.endswith(" is cut off")] == []  # the killed server's recording is
+    missing = verify(study.data, PROJECT, accounts).missing  # the killed server's recording is cut off
+    assert [line for line in missing if not line.endswith(" is cut off") and " frames seen but " not in line] == []
+    steps = sum(line["kind"] == "step" for lines in recorded(study) for line in lines)
+    # Of what was seen, half a second may be lost, and what was played until the kill.
+    assert all(steps > account.plays[0].frames - 12 for account in accounts)
 
 
 def test_after_patience_one_may_play_with_the_helper_in_the_empty_place(hold: Hold) -> None:
@@ -153,8 +159,7 @@ def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(ho
 
 
 def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -> None:
-    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1})
-    study.port = urlsplit(study.link).port or 0
+    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1}, port=ports.free())
 
     async def kill_twice() -> list[Account]:
         ada, bo = bots_of(study, "ada", "bo")
