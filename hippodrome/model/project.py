@@ -64,7 +64,10 @@ class Ssl(Record, frozen=True):
 
 
 class ForPlayers(Record, frozen=True):
-    """What servers run for sessions of so many players: of the last registration with that number. As in `Project`."""
+    """What servers run for so many players: of the last registration with that number. As in `Project`.
+
+    For 1 it is what the servers run that participants of before the first registration of several have of their own.
+    """
 
     players: int
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
@@ -113,7 +116,7 @@ class Project(Record, frozen=True):
     page_folder: Literal["steps", ""] = (
         STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
     )
-    other_numbers: tuple[ForPlayers, ...] = ()  # of several players that were registered before
+    other_numbers: tuple[ForPlayers, ...] = ()  # that were registered before
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
     secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` fills it in; earlier versions stored it
@@ -144,15 +147,15 @@ class Project(Record, frozen=True):
         return self.players > 1
 
     def following(self, before: Project | None) -> Project:
-        """This registration, after the one `before`: sessions of other numbers of players keep what they run."""
+        """This registration, after the one `before`: games of other numbers of players keep what they run."""
         kept = {each.players: each for each in (before.other_numbers if before else ())}
-        if before is not None and before.has_sessions:
+        if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
         others = tuple(kept[players] for players in sorted(kept.keys() - {self.players}))
         return msgspec.structs.replace(self, other_numbers=others)
 
     def for_session(self, players: int) -> Project | None:
-        """The project as a session of so many players runs it; None if no such number is known. 0: as it is.
+        """The project as a game of so many players runs it; None if no such number is known. 0: as it is.
 
         If another number was registered since, it is played as its own was registered last. No warm server does that.
         """

@@ -260,6 +260,11 @@ def next_attempt(closed: Server) -> int | None:
     return closed.attempt + 1 if closed.reason in REPLACED else None
 
 
+def plays_on(record: Server) -> bool:
+    """Whether there is a server, or the next attempt comes without a request."""
+    return not record.is_closed or next_attempt(record) is not None
+
+
 def requestable_attempt(record: Server) -> int | None:
     """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
     if not record.is_closed or next_attempt(record) is not None:

@@ -191,6 +191,8 @@ class Journey:
             standing = self._shared_game.visit(project, user_id, shown)
         else:
             found = self._shared_game.decided(project, user_id)
+            if found is None and (alone := self._shared_game.state_alone(project, user_id, step)):
+                return alone
             if found is None:
                 raise PageError(403, "This page is out of date", "Please open your study link again.")
             standing = found

@@ -54,8 +54,11 @@ class Start:
             self._cancel_start(message)
             return
         if project.has_sessions and ids.is_user_id(message.user_id):
-            self._services.lobby.under_way(project, message.user_id)
-            return
+            before = self._as_it_plays(project, message)
+            if before is None:
+                self._services.lobby.under_way(project, message.user_id)
+                return
+            project = before
         if is_session_id(message.user_id):
             project = self._for_session(project, message)
         self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
@@ -69,6 +72,14 @@ class Start:
         own = self._assign_warm_server(project, stored)
         if own is not None:
             self._start(project, own)
+
+    def _as_it_plays(self, project: Project, message: StartServer) -> Project | None:
+        """The project as the participant's own server runs it, if that was started before several players were
+        registered, and starts still or is to be replaced; else None.
+        """
+        before = project.for_session(1)
+        stored = before and self._repository.server(ids.server_label(project.id, message.user_id))
+        return before if stored and (message.attempt > 1 or not stored.server.is_closed) else None
 
     def _for_session(self, project: Project, message: StartServer) -> Project:
         """The project as this session runs it, also if another number of players is registered since.

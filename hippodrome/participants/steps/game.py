@@ -37,6 +37,7 @@ class GameStep:
 
         Raises `StepAnswered` if the participant was not matched with others.
         """
+        registered, visit = visit.project, self._as_it_plays(visit)
         request, project, step = visit.request, visit.project, visit.step
         ticket = ids.ticket(project.secret, visit.user_id, step.key)
         if project.has_sessions:
@@ -57,7 +58,7 @@ class GameStep:
         )
         if request.wants_json:
             return http.as_json(200, {"page": _page_for_program(view, request.method), "css": frame.style(), **state})
-        shown = project.pages_in_game if played is project else self._still_there(visit, played.pages_in_game)
+        shown = project.pages_in_game if played is registered else self._still_there(visit, played.pages_in_game)
         sources = {page.key: source_of(self._services, visit, page) for page in shown}
         view = replace(
             view,
@@ -67,6 +68,11 @@ class GameStep:
         with rendering(visit, *sources.values()):
             page = pages.game_page(view)
         return http.html(200, page.html, page.headers)
+
+    def _as_it_plays(self, visit: Visit) -> Visit:
+        """The visit of who plays on their own server, though several players are registered since, is one of before."""
+        before = self._shared.alone(visit.project, visit.user_id) if visit.project.has_sessions else None
+        return replace(visit, project=before) if before else visit
 
     def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:
         """Those of the pages that an earlier registration names which have not been removed since."""

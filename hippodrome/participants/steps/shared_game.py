@@ -13,11 +13,12 @@ from hippodrome.lobby.lobby import Lobby, LobbyState, NoServerYet
 from hippodrome.model import participant
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, State, plays_on
 from hippodrome.participants.pages import LOBBY
 from hippodrome.participants.steps.services import StepServices
 from protocol.session import member_token
 
+ENDED = "ended"
 UNMATCHED = "unmatched"
 """A state beside those of a server, as `LOBBY` (docs/pages.md)."""
 
@@ -73,6 +74,26 @@ class SharedGame:
         """Where the participant is without having asked; None if that is not decided yet. Nothing is written."""
         membership = self._services.repository.membership(project.id, user_id)
         return self._standing(project, membership) if membership else None
+
+    def alone(self, project: Project, user_id: str) -> Project | None:
+        """The project as the participant's own server runs it, which was started before several players were
+        registered; None if they have none any more. A read, if one player was registered before.
+        """
+        before = project.for_session(1)
+        record = self._services.repository.server_of(project.id, user_id) if before else None
+        return before if record and plays_on(record) else None
+
+    def state_alone(self, project: Project, user_id: str, step: Step | None) -> dict[str, Any] | None:
+        """The state for a page that was made when one player was registered; None if that never was. A read.
+
+        Without a server it says that it has ended: then the page is loaded again, and is the lobby.
+        """
+        before = project.for_session(1)
+        if before is None:
+            return None
+        record = self._services.repository.server_of(project.id, user_id)
+        state = self._services.state(before, user_id, step, record)
+        return state if record else state | {"state": ENDED}
 
     def leave(self, project: Project, user_id: str) -> None:
         """The participant has closed the lobby's page."""

@@ -144,6 +144,12 @@ def test_a_session_of_another_number_gets_no_warm_server() -> None:
     assert found.warm_servers == 0
 
 
-def test_a_first_registration_and_one_after_a_study_for_one_participant_keep_nothing() -> None:
+def test_a_first_registration_keeps_nothing() -> None:
     assert study(players=2).following(None).other_numbers == ()
-    assert study(players=2).following(study()).other_numbers == ()
+    assert study().following(study()).other_numbers == ()
+
+
+def test_who_plays_alone_plays_on_as_it_was_registered_for_one() -> None:
+    found = study(players=2, trial={"game": "two"}).following(study(trial={"game": "one"})).for_session(1)
+    assert found is not None
+    assert (found.has_sessions, found.trial) == (False, {"game": "one"})

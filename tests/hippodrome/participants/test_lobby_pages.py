@@ -16,6 +16,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.model.records import to_json
+from hippodrome.model.server import Reason
 from hippodrome.ports import Address, Topic
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
@@ -93,9 +94,13 @@ def matched(platform: FakePlatform, *players: Player) -> list[dict[str, Any]]:
 def serve(platform: FakePlatform) -> str:
     """Start the server of the one session, up to ready. Its token."""
     [sid] = {m["userId"] for topic, m in platform.bus.sent if topic is Topic.START and m["userId"].startswith("s.")}
-    Servers(platform).start(StartServer("maze", sid))
+    return serve_owner(platform, sid)
+
+
+def serve_owner(platform: FakePlatform, owner: str) -> str:
+    Servers(platform).start(StartServer("maze", owner))
     repository = Repository(platform.documents)
-    stored = repository.server(ids.server_label("maze", sid))
+    stored = repository.server(ids.server_label("maze", owner))
     assert stored
     named = server.naming(stored.server, "task", Address("203.0.113.9", 5000), platform.now())
     platform.documents.put(server.key(stored.server.label), to_json(server.ready(named, platform.now())))
@@ -357,6 +362,90 @@ def test_a_page_that_a_pairs_registration_named_and_that_is_gone_is_left_out(pla
     before = study(**{**STUDY, "trial": {**STUDY["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"}})
     platform.documents.keep(MASTER_LIST, to_json(MasterList([study(**{**STUDY, **THREE}).following(before)])))
     platform.wait(seconds=11)
+    page = ann.get()
+    assert 'id="text-betweenEpisodes"' in page
+    assert 'id="text-instructions"' not in page
+
+
+# One player was registered before
+
+ONE: dict[str, Any] = {"trial": {"game": "alone", "keys": {"x": "up"}}}
+
+
+def register_two(platform: FakePlatform) -> None:
+    again = study(**STUDY).following(study(**ONE))
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([again])))
+    platform.wait(seconds=11)
+
+
+@pytest.fixture
+def for_one() -> Iterator[FakePlatform]:
+    yield installed(study(**ONE))
+    place.use(None)
+
+
+def test_who_plays_alone_stays_in_their_own_game_when_several_players_are_registered(for_one: FakePlatform) -> None:
+    """Their page, as it is and loaded again, is that of their server; whoever comes next is in the lobby."""
+    ann = Player(for_one, "ann").to_game()
+    token = serve_owner(for_one, "ann")
+    address, before = ann.data["poll"], ann.data
+    register_two(for_one)
+    assert {key: ann.poll(address)[key] for key in ("state", "token")} == {"state": "ready", "token": token}
+    again = ann.data
+    assert again["state"] | {"seconds": 0} == before["state"] | {"seconds": 0}
+    assert {key: again.get(key) for key in before} | {"state": 0} == before | {"state": 0}
+    assert 'id="lobby"' not in ann.get()
+    bob = Player(for_one, "bob").to_game()
+    assert bob.data["state"]["state"] == "lobby"
+
+
+@pytest.mark.parametrize("how", ["lost", "stopped"])
+def test_their_own_game_is_theirs_while_there_is_a_server_or_the_next_one_comes(
+    for_one: FakePlatform, how: str
+) -> None:
+    ann = Player(for_one, "ann").to_game()
+    serve_owner(for_one, "ann")
+    address = ann.data["poll"]
+    register_two(for_one)
+    repository = Repository(for_one.documents)
+    stored = repository.server(ids.server_label("maze", "ann"))
+    assert stored
+    closed = server.close(stored.server, Reason.LOST if how == "lost" else Reason.STOPPED, for_one.now())
+    for_one.documents.put(server.key(stored.server.label), to_json(closed))
+    said = ann.poll(address)
+    if how == "lost":
+        assert (said["state"], said["replaces"]) == ("queued", True)
+        assert ann.data["state"]["state"] == "queued"
+    else:
+        assert said["state"] == "ended", "so that the page is loaded again"
+        assert ann.data["state"]["state"] == "lobby"
+
+
+def test_the_page_of_one_who_waits_for_a_server_that_does_not_start_is_loaded_again_and_is_the_lobby(
+    for_one: FakePlatform,
+) -> None:
+    ann = Player(for_one, "ann").to_game()
+    address = ann.data["poll"]
+    register_two(for_one)
+    assert ann.poll(address)["state"] == "ended"
+    assert ann.data["state"]["state"] == "lobby"
+
+
+def test_a_poll_without_a_ticket_is_refused_where_several_players_were_registered_first(platform: FakePlatform) -> None:
+    Player(platform, "ann").to_game()
+    answer = next_step.handler(
+        http_event("GET", "projectId=maze&userId=ann&poll=3", None, headers={"accept": "application/json"}), None
+    )
+    assert answer["statusCode"] == 403
+
+
+def test_a_page_that_only_the_registration_for_one_named_and_that_is_gone_is_left_out(for_one: FakePlatform) -> None:
+    ann = Player(for_one, "ann").to_game()
+    serve_owner(for_one, "ann")
+    before = study(trial={**ONE["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"})
+    project = study(**STUDY).following(before)
+    for_one.documents.keep(MASTER_LIST, to_json(MasterList([project])))
+    for_one.wait(seconds=11)
     page = ann.get()
     assert 'id="text-betweenEpisodes"' in page
     assert 'id="text-instructions"' not in page

@@ -701,6 +701,21 @@ def test_a_session_of_another_number_gets_no_warm_server() -> None:
     assert record(platform, OTHER).warm_server_name == warm.name
 
 
+def test_who_plays_alone_gets_the_next_server_of_their_own_if_several_players_are_registered_meanwhile() -> None:
+    platform = installed(study(trial={"game": "alone"}))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    runs(platform, servers)
+    project = pairs(**TWO).following(study(trial={"game": "alone"}))
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))
+    platform.wait(seconds=11)
+    lose(platform, servers)
+    deliver(platform, servers)
+    assert task(platform)[0] == "alone"
+    servers.start(StartServer("maze", "bob"))
+    assert [each.label for each in open_sessions(platform)], "whoever comes now is on the way to a game of two"
+
+
 def test_who_plays_alone_gets_what_is_registered_now() -> None:
     platform = installed(study(trial={"game": "alone"}))
     servers = Servers(platform)
