@@ -199,12 +199,14 @@ def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) 
 def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
     assert look(world, capsys)["spentToday"]["likely"] == 0
     world.record("alice", State.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
-    spent = look(world, capsys)["spentToday"]
-    minutes = min(
-        10.0,
-        (datetime.now(UTC) - datetime.now(UTC).replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds() / 60,
-    )
-    assert spent["likely"] == pytest.approx(minutes / 60 * (0.04048 + 2 * 0.004445 + 0.005), rel=0.05)
+    before = datetime.now(UTC)
+    spent = look(world, capsys)["spentToday"]["likely"]
+    after = datetime.now(UTC)
+    midnight = after.replace(hour=0, minute=0, second=0, microsecond=0)
+    hours = [min(timedelta(minutes=10), now - midnight) / timedelta(hours=1) for now in (before, after)]
+    least, most = (each * (0.04048 + 2 * 0.004445 + 0.005) for each in hours)
+    rounded = 0.00005  # dollars
+    assert 0.95 * least - rounded <= spent <= 1.05 * most + rounded
 
 
 def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
