@@ -86,7 +86,8 @@ def played(living: Living) -> None:
     """Somebody has taken part, and their server is gone."""
     (project,) = registered_projects(living.platform.documents)
     living.participant("me", answered=5, project=project)
-    then = datetime.now(UTC) - timedelta(minutes=5)
+    now = datetime.now(UTC)
+    then = max(now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0))  # it was today
     living.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)
