@@ -201,7 +201,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     try:
         held.start()
         yield held
-        assert held.interrupt(30)
+        assert held.interrupt(PATIENCE / 1000)
     finally:
         left = held.clear()
     assert left == 0

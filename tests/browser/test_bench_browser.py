@@ -11,11 +11,15 @@ from bench import scenes, seen
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 
-@pytest.mark.parametrize("setting", [seen.ours, seen.bare], ids=["ours", "bare"])
+@pytest.mark.parametrize(
+    ("setting", "seconds"),
+    [(seen.ours, 1.0), (seen.bare, 4.0)],  # the yardstick makes up for pictures that it was late with
+    ids=["ours", "bare"],
+)
 def test_drawn_frames_and_effects_of_keys_are_timed(
-    chromium: Any, monkeypatch: pytest.MonkeyPatch, setting: Any
+    chromium: Any, monkeypatch: pytest.MonkeyPatch, setting: Any, seconds: float
 ) -> None:
-    monkeypatch.setattr(seen, "SECONDS", 1.0)
+    monkeypatch.setattr(seen, "SECONDS", seconds)
     monkeypatch.setattr(seen, "PRESSES", 3)
     found = seen.look(chromium, setting, "scrolling texture, 600 x 400", (30,), 30)
     assert len(found.waits) == 6

@@ -23,7 +23,7 @@ from trial.recordings.recording import read
 pytestmark = pytest.mark.xdist_group("examples")
 
 SHORT = {"maxEpisodes": 1, "resetFreeze": 0, "countdown": 1, "absent": 10}
-PATIENCE = 90.0
+PATIENCE = 150.0  # seconds in which both must have passed everything
 
 
 def lines_of_readme(folder: Path) -> dict[str, Any]:
