@@ -124,7 +124,9 @@ class ActivityLog:
         together = _SESSION.fullmatch(key)
         record = _json(body) if found or together or key.startswith("_servers/") else {}
         if key.startswith("_servers/"):
-            self._catch_up(folder_of(str(record.get("projectId")), str(record.get("userId"))))
+            folder = folder_of(str(record.get("projectId")), str(record.get("userId")))
+            self._reserved(str(record.get("spare")), folder)
+            self._catch_up(folder)
             self._server(record)
         elif found and found[2] == "participant":
             self._forget(key.removesuffix("participant.json"))
@@ -242,13 +244,21 @@ class ActivityLog:
                 watched = self._watched.get(name)
                 if watched is None:
                     self._watched[name] = WatchedServer(task, data, tasks.log(name), anew)
-                elif watched.folder != task.folder:  # a warm server has been assigned
+                elif task.folder and watched.folder != task.folder:  # a warm server has been assigned
                     self._tell(watched)
-                    self._watched[name] = WatchedServer(task, data, tasks.log(name), anew=False)
+                    watched.assign(task.folder)
             for name, watched in list(self._watched.items()):
                 self._tell(watched)
                 if name not in there:
                     del self._watched[name]
+
+    def _reserved(self, warm_server: str, folder: str) -> None:
+        """A participant or session gets this warm server: by the next look their game may be over."""
+        with self._looking:
+            watched = self._watched.get(warm_server)
+            if watched is not None and watched.folder != folder:
+                self._tell(watched)
+                watched.assign(folder)
 
     def _catch_up(self, folder: str) -> None:
         """Show first what the participant's server has written, so that the lines are in order."""

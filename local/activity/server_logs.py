@@ -23,15 +23,19 @@ class WatchedServer:
     """
 
     def __init__(self, task: Task, data: Path, log: Path, anew: bool) -> None:
-        self.folder = task.folder
-        self.user_id = task.folder.rpartition("/")[2]
         self._data = data
-        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (task.folder,)  # of those who play
-        self._known = self._keys()
         self._log = log
         self._read = 0 if anew else _size(log)
         self._rest = b""
         self._errors = Errors(log)
+        self.assign(task.folder)
+
+    def assign(self, folder: str) -> None:
+        """From now on it is the server of this participant or session: what is answered by now is not of its game."""
+        self.folder = folder
+        self.user_id = folder.rpartition("/")[2]
+        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # of those who play
+        self._known = self._keys()
         self._said: set[str] = set()
 
     def answers(self) -> list[tuple[str, bytes]]:

@@ -2,7 +2,9 @@
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 from rich.console import Console
@@ -10,6 +12,7 @@ from rich.console import Console
 from local.activity.log import ActivityLog
 from local.activity.server_logs import WatchedServer
 from local.backend.task_record import Task, folder_of
+from local.backend.tasks import ProcessTasks
 from protocol.keys import answer_key, session_key
 from protocol.session import Member, Session
 
@@ -67,6 +70,36 @@ def test_the_terminal_names_who_has_played(tmp_path: Path, owner: str) -> None:
     log._tell(server)
     assert "P1" in text.getvalue()
     assert "played step 3" in text.getvalue()
+
+
+class Running:
+    """Stands for the processes' tasks."""
+
+    def __init__(self, *tasks: Task) -> None:
+        self.tasks = tasks
+
+    def playing(self) -> tuple[Task, ...]:
+        return self.tasks
+
+    def log(self, name: str) -> Path:
+        return Path("/nowhere") / name
+
+
+def test_a_game_on_a_warm_server_that_is_over_by_the_next_look_is_told(tmp_path: Path) -> None:
+    text = io.StringIO()
+    log = ActivityLog(Console(file=text, width=200))
+    warm = Task("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
+    given = replace(warm, folder=folder_of("study", "P1"))
+    answer(tmp_path, "P1", "1")
+    record = {"projectId": "study", "userId": "P1", "attempt": 1, "state": "starting", "nonce": "n", "spare": "warm-1"}
+    log._look(cast(ProcessTasks, Running(warm)), tmp_path)
+    log.wrote("_servers/s.json", json.dumps(record).encode())
+    log._look(cast(ProcessTasks, Running(warm)), tmp_path)  # its document is not there yet
+    answer(tmp_path, "P1", "3")
+    log._look(cast(ProcessTasks, Running(given)), tmp_path)
+    log.close()
+    assert text.getvalue().count("played step 3") == 1
+    assert "step 1" not in text.getvalue()
 
 
 def test_the_terminal_says_who_plays_with_whom_and_who_found_no_others(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,12 @@ def usual_umask() -> Iterator[None]:
 
 
 def open_to_others(*folders: Path) -> list[str]:
-    paths = [path for folder in folders for path in (folder, *folder.rglob("*"))]
-    return [f"{path} {path.stat().st_mode:o}" for path in paths if path.stat().st_mode & 0o077]
+    found = []
+    for path in (path for folder in folders for path in (folder, *folder.rglob("*"))):
+        with suppress(FileNotFoundError):  # a message that has been delivered meanwhile
+            mode = path.stat().st_mode
+            found += [f"{path} {mode:o}"] if mode & 0o077 else []
+    return found
 
 
 def test_every_file_of_a_study_is_its_owners_alone(local: Make) -> None:
