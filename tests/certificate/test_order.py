@@ -667,6 +667,19 @@ def test_authorities_that_do_not_want_to_or_make_no_sense(tmp_path, answers, tro
     assert state.claim == ""
 
 
+@pytest.mark.parametrize(("times", "trouble"), [(7, FailureReason.CAA), (8, FailureReason.UNREACHABLE)])
+def test_a_nonce_may_be_refused_seven_times_in_a_row(tmp_path, times, trouble):
+    refusals = [problem("badNonce", "again", 400)] * times
+
+    def answers(path, here):
+        refused = path == "/newOrder" and refusals
+        return refusals.pop() if refused else acme(problem("caa", "it was heard", 403))(path, here)
+
+    with authority(answers) as directory, pytest.raises(OrderFailed) as failed:
+        alone(tmp_path).obtain(RenewalRequest(DOMAIN, directory))
+    assert failed.value.reason is trouble
+
+
 def test_nobody_is_there(tmp_path):
     with authority(acme((200, {}, b""))) as directory:
         pass
