@@ -468,6 +468,27 @@ def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() -> None:
     assert policy.closed.wait(10)
 
 
+def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
+    told = []
+
+    class Ended:
+        def is_closed(self) -> bool:
+            return False  # it is when the policy tells its answer
+
+        def call_soon_threadsafe(self, tell: Any) -> None:
+            told.append(tell)
+            raise RuntimeError("Event loop is closed")
+
+    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+        thread._loop = Ended()  # type: ignore[assignment]
+        thread.ask(1, 1, {}, None)
+        await until(lambda: told)
+
+    policy, answers = played(script)
+    assert policy.closed.wait(10)
+    assert answers == []
+
+
 def test_a_policy_that_raises_or_ends_python_is_an_answer_too() -> None:
     def end() -> None:
         raise SystemExit(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import queue
 import sys
@@ -47,8 +48,9 @@ class _Notifier:
     def notify(self) -> None:
         if sys.platform == "linux":
             os.eventfd_write(self._eventfd, 1)
-        elif not self.loop.is_closed():
-            self.loop.call_soon_threadsafe(self._callback)
+        else:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self.loop.call_soon_threadsafe(self._callback)
 
     def _readable(self) -> None:
         if sys.platform == "linux":

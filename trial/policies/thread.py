@@ -76,7 +76,7 @@ class PolicyThread:
             if not self._closed:
                 self._done(ask_id, action, error)
 
-        if not self._loop.is_closed():
+        with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(tell)
 
     def _run(self) -> None:
