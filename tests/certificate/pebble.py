@@ -194,7 +194,7 @@ def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
             dns_management=f"http://127.0.0.1:{dns_management}",
             log=log,
         )
-        for port in (dns_management, acme, management):
+        for port in (dns, dns_management, acme, management):  # its name server listens by TCP, too
             _wait_for(port, processes, folder)
         yield pebble
 
