@@ -103,14 +103,14 @@
   // People count characters, of which an emoji is one that takes twelve bytes.
   function tooLong(size) {
     const texts = fields().filter((field) => typeof field.value === "string");
-    if (!texts.length) return "Your answers are too long to be sent. Please tell whoever invited you.";
+    if (!texts.length) return TEXT.tooLong;
     const longest = texts.reduce((a, b) => (b.value.length > a.value.length ? b : a));
     const characters = [...longest.value].length;
     const less = Math.ceil((size - MOST) / (sizeOf([["", longest.value]]) / characters));
     const name = nameForPeople(longest);
-    const which = name ? `the answer to “${name}”` : "the longest answer";
-    const much = less < characters ? ` by about ${roundUp(less).toLocaleString("en")} characters` : "";
-    return `Your answers are too long to be sent. Please shorten ${which}${much}. Nothing is lost.`;
+    const much = less < characters ? roundUp(less).toLocaleString(TEXT.language) : "";
+    if (!name) return much ? TEXT.shortenLongestBy(much) : TEXT.shortenLongest;
+    return much ? TEXT.shortenBy(name, much) : TEXT.shorten(name);
   }
 
   function roundUp(number) {
@@ -133,16 +133,16 @@
     if (navigator.onLine === false && !warnedOffline) {
       event.preventDefault();
       warnedOffline = true;
-      idle("You seem to be offline. Your answers are kept on this device; press the button again when you are back.", true);
+      idle(TEXT.offline, true);
       return;
     }
     keepDraft();
     sending = true;
-    say("Sending…");
+    say(TEXT.sending);
     event.submitter?.setAttribute("aria-disabled", "true");
     timers = [
-      setTimeout(() => say("Still sending… Please check your connection.", true), SLOW),
-      setTimeout(() => idle("Still no reply. Your answers are kept; you can press the button again.", true), GIVE_UP),
+      setTimeout(() => say(TEXT.stillSending, true), SLOW),
+      setTimeout(() => idle(TEXT.noReply, true), GIVE_UP),
     ];
   }
 
@@ -164,7 +164,7 @@
     firstInvalid = event.target;
     const name = nameForPeople(firstInvalid);
     const empty = firstInvalid.validity.valueMissing;
-    if (name) say(empty ? `An answer is missing: “${name}”` : `Please look at this answer again: “${name}”`, true);
+    if (name) say(empty ? TEXT.missing(name) : TEXT.lookAgain(name), true);
     setTimeout(() => { firstInvalid = null; });
   }
 
@@ -195,13 +195,13 @@
     button.addEventListener("click", async () => {
       try {
         await navigator.clipboard.writeText(code.textContent.trim());
-        say("Copied");
-        setTimeout(say, 3_000, "Copy");
+        say(TEXT.copied);
+        setTimeout(say, 3_000, TEXT.copy);
       } catch {
         select(); // then the participant copies it
       }
     });
-    say("Copy");
+    say(TEXT.copy);
     code.after(button);
   }
 

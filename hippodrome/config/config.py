@@ -72,6 +72,7 @@ class Config:
             "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
+            "texts": self.project.own_texts,
             "gamePages": {each.key: each.variants for each in self.game_pages},
             "trial": self.trial.registered(),
         }

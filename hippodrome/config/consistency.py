@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from hippodrome.config import fargate, sessions
+from hippodrome.config import fargate, sessions, texts
 from hippodrome.config.diagnostics import Keys, Mistake
 from hippodrome.config.each_value import Checked, check_values
 from hippodrome.config.project_keys import STEPS
@@ -32,6 +32,7 @@ def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
         _plain_clients,
         _environment_size,
         sessions.mistakes,
+        texts.mistakes,
     )
     checked.mistakes += [mistake for find in checks for mistake in find(checked)]
     return checked

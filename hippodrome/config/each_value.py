@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from hippodrome.config.diagnostics import Keys, Mistake
-from hippodrome.config.project_keys import NAMES, STEPS, TRIAL_SECTIONS, Root
+from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, Root
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
@@ -109,7 +109,7 @@ def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, 
     """Notes the errors in our words, and removes the values that they are about."""
     for error in errors:
         path: Keys = error["loc"]
-        if path[:2] == STEPS:
+        if path[:2] in (STEPS, TEXTS):
             path = path[:3]  # pydantic adds a mark where a key, not its value, is wrong
         if error["type"] == "extra_forbidden":
             _note_unknown(checked, path)
@@ -142,5 +142,13 @@ def message_of(error: ErrorDetails, path: Keys) -> str:
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])
     known = NAMES.get(path)
-    example = "1: consent" if path == STEPS else f"{min(known)}: …" if known else "key: value"
+    example = (
+        "1: consent"
+        if path == STEPS
+        else 'start: "Los"'
+        if path == TEXTS
+        else f"{min(known)}: …"
+        if known
+        else "key: value"
+    )
     return f'must be a section: indented lines such as "{example}" below it, not {show(error["input"])}'

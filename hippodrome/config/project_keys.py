@@ -8,6 +8,7 @@ them too.
 
 from __future__ import annotations
 
+import difflib
 import re
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
 from hippodrome.model.matching import MATCHED_BY, MATCHINGS, SEATS
 from hippodrome.model.step_order import FINAL
+from hippodrome.model.texts import ENGLISH
 from protocol import values
 from protocol.session import MOST_PLAYERS
 from protocol.trial import Trial
@@ -27,6 +29,7 @@ from protocol.trial_sections import Scene, Ui
 from protocol.values import Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
+LONGEST_TEXT = 500  # characters
 
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
 _DOMAIN = re.compile(rf"({_LABEL}\.)+(?![0-9]+$){_LABEL}", re.IGNORECASE)
@@ -179,6 +182,20 @@ def who_with_whom(value: object) -> str | dict[str, str]:
     return {str(how): str(values.text("the name of a field of an earlier page", 64)(given))}
 
 
+def text_name(value: object) -> str:
+    """The name of one of our texts (`hippodrome/model/texts.py`)."""
+    if isinstance(value, str) and value in ENGLISH:
+        return value
+    near = difflib.get_close_matches(str(value), ENGLISH, n=1)
+    raise ValueError(f"unknown text; {f'did you mean {near[0]}?' if near else 'docs/texts.md lists all'}")
+
+
+def own_text(value: object) -> str:
+    """A study's own words for a text. Empty: the English ones."""
+    return "" if value in (None, "") else str(_OWN_TEXT(value))
+
+
+_OWN_TEXT = values.text('text, in quotes: "…"', LONGEST_TEXT)
 _MATCHING: dict[str, object] = {
     "anyOf": [
         {"enum": list(MATCHINGS)},
@@ -297,10 +314,27 @@ class Project(Model):
     after_patience: Annotated[str, one_of("unmatched", "policies")] = "unmatched"
     """Then: on to the next step as unmatched, or a game with policies in the empty places (trial.substitute)."""
 
+    texts: dict[Annotated[str, Rule(text_name)], Annotated[str, Rule(own_text)]] = Field(
+        default={},
+        json_schema_extra={
+            "properties": {
+                name: {"type": ["string", "null"], "description": text, "maxLength": LONGEST_TEXT}
+                for name, text in ENGLISH.items()
+            },
+            "additionalProperties": False,
+        },
+    )
+    """The study's own words for what Hippodrome says to participants (docs/texts.md). Default: English."""
+
     @property
     def has_sessions(self) -> bool:
         """Whether several participants share a server."""
         return self.players > 1
+
+    @property
+    def own_texts(self) -> dict[str, str]:
+        """The texts for which the study has words of its own."""
+        return {name: text for name, text in self.texts.items() if text}
 
 
 class Root(Model):
@@ -325,3 +359,4 @@ NAMES: dict[Keys, frozenset[str]] = {
 }
 """The keys of each section, as they stand in the file."""
 STEPS: Keys = ("project", "steps")
+TEXTS: Keys = ("project", "texts")

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hippodrome.config import sessions
+from hippodrome.config import sessions, texts
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import Source, read_source
@@ -189,5 +189,6 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     arrows = [
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
     ]  # without ui all are on
-    found = [*remarks(config), *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
+    left = texts.left_in_english(config)
+    found = [*remarks(config), *left, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
     return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

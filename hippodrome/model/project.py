@@ -107,6 +107,7 @@ class Project(Record, frozen=True):
     seats: str = "lot"  # who plays which player: see `matching.py`
     patience: float = 300  # seconds in the lobby
     after_patience: str = "unmatched"  # or `policies`
+    texts: Mapping[str, str] = msgspec.field(default_factory=dict)  # the study's own words, by the names in `texts.py`
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it

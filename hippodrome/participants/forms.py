@@ -9,6 +9,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from hippodrome.http import Request
+from hippodrome.model.texts import ENGLISH
 
 MAX_BODY = 256 * 1024  # bytes
 MAX_FIELDS = 2_000
@@ -21,12 +22,14 @@ STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-actio
 
 
 class BadForm(Exception):
-    """The form is refused. `status` is the HTTP status, `text` the reason, for the participant."""
+    """The form is refused. `status` is the HTTP status, `text` the reason.
 
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-        self.text = text
+    `name` is that of the text (`hippodrome/model/texts.py`) if the form of a page can be refused so; else it is empty.
+    """
+
+    def __init__(self, status: int, text: str = "", name: str = "") -> None:
+        self.status, self.text, self.name = status, text or ENGLISH[name], name
+        super().__init__(self.text)
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,9 @@ class Form:
 def read(request: Request) -> Form:
     """Return the form in a request. Raises `BadForm`."""
     if request.body is None:
-        raise BadForm(400, "What your browser sent could not be read.")
+        raise BadForm(400, name="formUnread")
     if len(request.body) > MAX_BODY:
-        raise BadForm(413, "Your answers are too long to be sent: 256 KB is the most. Please shorten them.")
+        raise BadForm(413, name="formTooLong")
     if request.content_type == FORM:
         fields = _urlencoded(request.body)
     elif request.content_type == JSON:

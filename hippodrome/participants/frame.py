@@ -16,7 +16,9 @@ from string import Template
 from typing import Any, NamedTuple
 
 from hippodrome.model.project import Project, Step
+from hippodrome.model.texts import IN_ENGLISH, Texts
 from hippodrome.participants import scripts
+from hippodrome.participants.texts import in_script, in_template
 
 WEB = Path(__file__).resolve().parents[2] / "web"
 _SOURCE = re.compile(r"(?:https?|wss?)://[A-Za-z0-9.*\[\]:_-]+")  # what may stand in a policy
@@ -36,11 +38,11 @@ class Html(str):
 
 
 def message_page(
-    title: str, text: str, *, link: str | None = None, link_text: str | None = None, lang: str = "en"
+    title: str, text: str, *, link: str | None = None, link_text: str | None = None, lang: str = IN_ENGLISH.language
 ) -> Page:
     """A page with one sentence, such as an error."""
     nonce = secrets.token_urlsafe(16)
-    go = fill("link", link=link, text=link_text or "Go on") if link else Html()
+    go = fill("link", link=link, text=link_text or IN_ENGLISH["goOn"]) if link else Html()
     page = fill(
         "frame.html",
         lang=lang,
@@ -91,28 +93,31 @@ def frame(
 
     `sheet` is a style sheet of `web/` that only some pages need, besides that of every page.
     """
+    texts = Texts(project.texts)
     name = project.name or project.id
     at, steps = project.index(step.key) or 0, len(project.steps)
-    progress = fill("progress", step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
+    progress = fill("progress", texts, step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
     return fill(
         "frame.html",
-        lang=lang or "en",
-        title=f"{title or name} · step {at + 1} of {steps}" if steps > 1 else title or name,
+        lang=lang or texts.language,
+        title=texts.say("titleStep", title=title or name, step=at + 1, steps=steps) if steps > 1 else title or name,
         head=head,
         style=Html(style(body) + (_sheet(sheet) if sheet else "")),
         body=body,
         data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
         header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),
         main=main,
-        footer=fill("footer", researcher=project.researcher) if project.researcher else Html(),
+        footer=fill("footer", texts, researcher=project.researcher) if project.researcher else Html(),
         script=script,
     )
 
 
-def script(name: str, nonce: str, *, module: bool = False, also: tuple[str, ...] = ()) -> Html:
+def script(
+    name: str, nonce: str, *, module: bool = False, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH
+) -> Html:
     """A script of `web/`, with the page's nonce. `also` are modules beside it that are to stand before it."""
     kind = ' type="module"' if module else ""
-    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name, also)}</script>\n')
+    return Html(f'<script{kind} nonce="{nonce}">\n{_code(name, also, texts)}</script>\n')
 
 
 def script_json(data: Any) -> Html:
@@ -157,8 +162,8 @@ def allowed_sources(given: list[str]) -> list[str]:
 
 _PARTS = {
     "header": '<header>\n<div><$tag class="study">$name</$tag>$progress</div>\n</header>',
-    "progress": '<label class="progress">Step $step of $steps <progress max="$all" value="$done"></progress></label>',
-    "footer": "<footer><p>A study by $researcher</p></footer>",
+    "progress": '<label class="progress">TEXT.step <progress max="$all" value="$done"></progress></label>',
+    "footer": "<footer><p>TEXT.studyBy</p></footer>",
     "data": ' data-project="$project" data-user="$user" data-step="$step"',
     "problem": '<p class="problem" role="alert">$text</p>\n',
     "named": """<input type="hidden" name="hippodrome-step" value="$step">
@@ -169,7 +174,7 @@ $named$content
 <div class="send">$button<p class="status" role="status" aria-live="polite"></p></div>
 </form>""",
     "button": '<button type="submit">$text</button>',
-    "answered": """<p class="saved" role="status">Your answers are saved.</p>
+    "answered": """<p class="saved" role="status">TEXT.saved</p>
 <fieldset class="page answered" disabled>
 $content
 </fieldset>""",
@@ -177,30 +182,29 @@ $content
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
     "link": '<p><a class="button" href="$link">$text</a></p>\n',
     "reading": """
-<section id="reading" tabindex="-1" style="outline:0" aria-label="To read" hidden>
+<section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>
 <p class="result" id="reading-score"></p>
 $texts
 <p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
 </section>""",
     "text": '<div class="page" id="text-$key" hidden>\n$content\n</div>',
-    "alone": """<h1>Your game is getting ready</h1>
-<p>We are starting a computer for you alone. You need not do anything: the game appears on this page by itself.</p>""",
-    "together": """<h1>Your game is being prepared</h1>
-<p><span id="company"></span> We are starting a computer for your game.
-You need not do anything: the game appears on this page by itself.</p>""",
+    "alone": """<h1>TEXT.gettingReady</h1>
+<p>TEXT.startingAlone</p>""",
+    "together": """<h1>TEXT.preparedHeading</h1>
+<p><span id="company"></span> TEXT.startingTogether</p>""",
     "stages": """<ol class="stages">
-<li id="stage-queued"$queued_now>Your request has been received</li>
-<li id="stage-starting"$starting_now>A computer is starting for you</li>
-<li id="stage-naming"$naming_now>The connection is being set up</li>
-<li id="stage-ready"$ready_now>Ready to play</li>
+<li id="stage-queued"$queued_now>TEXT.stageQueued</li>
+<li id="stage-starting"$starting_now>TEXT.stageStarting</li>
+<li id="stage-naming"$naming_now>TEXT.stageNaming</li>
+<li id="stage-ready"$ready_now>TEXT.stageReady</li>
 </ol>""",
 }
 
 
-def fill(name: str, /, **values: Any) -> Html:
-    """Fill in a template; values that are not `Html` are escaped."""
+def fill(name: str, texts: Texts = IN_ENGLISH, /, **values: Any) -> Html:
+    """Fill in a template of a study with these texts; values that are not `Html` are escaped."""
     safe = {key: value if isinstance(value, Html) else html.escape(str(value)) for key, value in values.items()}
-    return Html(_template(name).substitute(safe))
+    return Html(_template(name, texts).substitute(safe))
 
 
 _SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
@@ -221,14 +225,21 @@ def _sheet(name: str) -> str:
 
 
 @lru_cache(maxsize=16)
-def _code(name: str, also: tuple[str, ...] = ()) -> str:
-    """A script of `web/` with the modules that it imports, and with others."""
+def _joined(name: str, also: tuple[str, ...]) -> str:
+    """A script of `web/` with the modules that it imports, and with others. It names its texts."""
     return _plain(name, scripts.join(WEB / name, also))
 
 
-@cache
-def _template(name: str) -> Template:
-    return Template(_PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8"))
+@lru_cache(maxsize=32)
+def _code(name: str, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH) -> str:
+    """The same with the texts of a study."""
+    return in_script(_joined(name, also), texts)
+
+
+@lru_cache(maxsize=256)
+def _template(name: str, texts: Texts) -> Template:
+    template = _PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8")
+    return Template(in_template(template, texts))
 
 
 _CODE_OR_TEXT = re.compile(

@@ -16,6 +16,7 @@ from hippodrome.limits.slots import Slots
 from hippodrome.log import logger
 from hippodrome.model import ids, participant
 from hippodrome.model.project import Project, Step
+from hippodrome.model.texts import ENGLISH, IN_ENGLISH, Texts
 from hippodrome.participants import forms, previews
 from hippodrome.participants.answers import Answers
 from hippodrome.participants.events import publish_events
@@ -36,10 +37,6 @@ RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
 LEAVE = "leave"
 """The action in the form that the lobby's page sends when it is closed."""
-FULL = (
-    "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
-    "Now and then a place becomes free: you are welcome to come back later with the same link."
-)
 LINK = "…/next?projectId=your-project&userId=…"
 
 
@@ -77,9 +74,10 @@ class Journey:
 
     def _dispatch(self, request: Request, project: Project) -> Response:
         """Identify the participant and call the method for this request."""
-        user_id = _user_id(request)
+        texts = Texts(project.texts)
+        user_id = _user_id(request, texts)
         if project.signed_links:
-            user_id = _verify_invitation(request, project, user_id)
+            user_id = _verify_invitation(request, project, user_id, texts)
         if user_id is None:
             if request.wants_json:  # a program would be shown a page, and would not learn its id
                 raise PageError(400, "Who are you?", "The address lacks userId.", PROJECT_NOT_FOUND)
@@ -95,7 +93,7 @@ class Journey:
     def _project(self, request: Request) -> Project:
         """The live project that the link names."""
         if request.query is None:
-            raise PageError(400, "This link is broken", "Please copy the whole link again from your invitation.")
+            raise PageError.of(IN_ENGLISH, 400, "brokenLink")
         if not request.has_query("projectId"):
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
             status = 404 if request.query else 200
@@ -130,7 +128,7 @@ class Journey:
         """First visit. The message is published before the record is written: a crash may repeat it, never lose it."""
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
-            raise PageError(200, "This study is full", FULL)
+            raise PageError.of(Texts(project.texts), 200, "studyFull")
         publish_events(self._platform, project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
         record = participant.new_participant(project, user_id, link, self._platform.now())
@@ -143,8 +141,12 @@ class Journey:
         try:
             form = forms.read(request)
         except forms.BadForm as bad:
-            then = "Please answer the page again." if request.wants_json else "Nothing is lost: go back."
-            raise PageError(bad.status, "Your answers were not saved", f"{bad.text} {then}") from None
+            if request.wants_json:
+                said = f"{bad.text} Please answer the page again."
+                raise PageError(bad.status, ENGLISH["notSaved"], said) from None
+            texts = Texts(project.texts)
+            why = texts[bad.name] if bad.name else bad.text
+            raise PageError.of(texts, bad.status, "notSaved", why=why) from None
         if form.action == LEAVE and project.has_sessions:
             return self._leave(project, user_id, form)
         step = self._step_of(form, project, user_id)
@@ -194,33 +196,32 @@ class Journey:
             if found is None and (alone := self._shared_game.state_alone(project, user_id, step)):
                 return alone
             if found is None:
-                raise PageError(403, "This page is out of date", "Please open your study link again.")
+                raise PageError.of(Texts(project.texts), 403, "outdated")
             standing = found
         return self._shared_game.state(project, user_id, step, standing)
 
 
-def _user_id(request: Request) -> str | None:
+def _user_id(request: Request, texts: Texts) -> str | None:
     """The participant's id in the link: `userId` or a recruiter's field; None if it has none. Raises `PageError`."""
     given = next((name for name in ("userId", *RECRUITER_IDS) if request.has_query(name)), None)
     if given is None:
         if request.method == "POST":
-            raise PageError(400, "Who are you?", "The link lacks its userId. Please open your study link again.")
+            raise PageError.of(texts, 400, "whoAreYou")
         return None
     user_id = request.query_value(given)
     if user_id is None or not ids.is_user_id(user_id):
-        text = f"Its {given} should be 1 to 64 letters, digits, dashes or underscores."
-        raise PageError(400, "This link is broken", f"{text} Please copy the whole link again from your invitation.")
+        text = f"{texts.say('brokenId', field=given)} {texts['brokenLinkText']}"
+        raise PageError(400, texts["brokenLink"], text, lang=texts.language)
     return user_id
 
 
-def _verify_invitation(request: Request, project: Project, user_id: str | None) -> str:
+def _verify_invitation(request: Request, project: Project, user_id: str | None, texts: Texts) -> str:
     """Return the participant's id if the link's signature is valid. Raises `PageError`."""
     signature = request.query_value("signature")
     if user_id is None or signature is None:
-        text = "It needs the link of your own invitation. Please copy the whole link again from there."
-        raise PageError(403, "This study is by invitation", text, REFUSED)
+        raise PageError.of(texts, 403, "byInvitation", REFUSED)
     if not ids.secrets_equal(signature, ids.link_signature(project.secret, project.id, user_id)):
-        raise PageError(403, "This link is broken", "Please copy the whole link again from your invitation.", REFUSED)
+        raise PageError.of(texts, 403, "brokenLink", REFUSED)
     return user_id
 
 
@@ -228,8 +229,6 @@ def _preview_response(request: Request, project: Project, kind: PreviewKind) -> 
     """The response to a preview: nothing of the study, and no id."""
     if kind is PreviewKind.PREFETCH:  # unless it is 2xx, browsers ask again when the link is opened
         return Response(403, "", {"Cache-Control": "no-store"})
-    if kind is PreviewKind.HIT:
-        text = "This is a preview. Once you have accepted the task, the study opens here."
-    else:
-        text = "Open the link in a browser to take part."
-    return PageError(200, project.name or "A study", text).response(request)
+    texts = Texts(project.texts)
+    text = texts["preview" if kind is PreviewKind.HIT else "openInBrowser"]
+    return PageError(200, project.name or texts["aStudy"], text, lang=texts.language).response(request)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from hippodrome import http
 from hippodrome.http import Request, Response
+from hippodrome.model.texts import IN_ENGLISH, Texts
 from hippodrome.participants import frame
 
 
@@ -29,12 +30,20 @@ class PageError(Exception):
     """Respond with this title and text, to a program as JSON. `status` is the HTTP status.
 
     If HIPPO has an answer of its own in this case, programs get its status and its text. A front end gets 200 where it
-    acts on no other status.
+    acts on no other status. `lang` is the language of title and text.
     """
 
-    def __init__(self, status: int, title: str, text: str, hippo: HippoAnswer | None = None) -> None:
+    def __init__(
+        self, status: int, title: str, text: str, hippo: HippoAnswer | None = None, lang: str = IN_ENGLISH.language
+    ) -> None:
         super().__init__(title)
-        self.status, self.title, self.text, self.hippo = status, title, text, hippo
+        self.status, self.title, self.text, self.hippo, self.lang = status, title, text, hippo, lang
+
+    @classmethod
+    def of(cls, texts: Texts, status: int, name: str, hippo: HippoAnswer | None = None, **values: object) -> PageError:
+        """In the words of a study: its text of this name is the title, that of `{name}Text` the text."""
+        title, text = texts[name], texts.say(f"{name}Text", **values)
+        return cls(status, title, text, hippo, texts.language)
 
     def response(self, request: Request) -> Response:
         """The page, or JSON for a program."""
@@ -42,7 +51,7 @@ class PageError(Exception):
             answer = self.hippo or HippoAnswer(self.status)
             status = answer.status if answer.status in ACTED_ON or not request.is_front_end else 200
             return program_message(status, self.title, self.text, answer.page)
-        page = frame.message_page(self.title, self.text)
+        page = frame.message_page(self.title, self.text, lang=self.lang)
         return http.html(self.status, page.html, page.headers)
 
 

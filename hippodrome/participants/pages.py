@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.model.project import Project, Step
+from hippodrome.model.texts import Texts
 from hippodrome.participants import fragments, game_modules
 from hippodrome.participants.fragments import Fragment
 from hippodrome.participants.frame import (
@@ -69,6 +70,7 @@ class GameView:
 def step_page(view: StepView) -> Page:
     """A step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
+    texts = Texts(view.project.texts)
     prepared = _prepared(view)
     content = Html(prepared.render(view.values, nonce))
     problem = fill("problem", text=view.problem) if view.problem else Html()
@@ -79,10 +81,10 @@ def step_page(view: StepView) -> Page:
             action=view.action,
             named=_step_fields(view),
             content=content,
-            button=Html() if prepared.has_submit else fill("button", text="Send" if view.final else "Continue"),
+            button=Html() if prepared.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
         )
     elif view.answered and prepared.has_fields:
-        main = fill("answered", content=content)
+        main = fill("answered", texts, content=content)
     else:
         main = Html(f'<div class="page">\n{content}\n</div>')
     text = frame(
@@ -91,7 +93,7 @@ def step_page(view: StepView) -> Page:
         view.user_id,
         nonce,
         main=Html(problem + main),
-        script=script("step.js", nonce),
+        script=script("step.js", nonce, texts=texts),
         title=prepared.title,
         lang=prepared.lang,
         heading=not prepared.has_heading,
@@ -112,6 +114,7 @@ def fragment(view: StepView) -> str:
 def game_page(view: GameView) -> Page:
     """The page of a game step: waiting and playing. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
+    texts = Texts(view.project.texts)
     state = str(view.state.get("state", "queued"))
     over = is_over(view.state)
     data: dict[str, Any] = {
@@ -121,7 +124,9 @@ def game_page(view: GameView) -> Page:
         "project": view.project.id,
         "step": view.step.key,
     }
-    over_title, over_text = _over_texts(view.state) if over else ("", "")
+    if said := texts.of_server():
+        data["said"] = said
+    over_title, over_text = _over_texts(view.state, texts) if over else ("", "")
     moved = bool(view.state.get("replaces"))
     together = view.project.has_sessions
     if together:
@@ -130,23 +135,24 @@ def game_page(view: GameView) -> Page:
         data |= {"names": names} if (names := trial.get("playerNames")) else {}
     main = fill(
         "game.html",
-        stages=_stages(state),
+        texts,
+        stages=_stages(state, texts),
         waiting=Html(" hidden") if over else Html(),
-        lobby=_lobby(view) if together else Html(),
-        prepared=fill("together" if together else "alone"),
+        lobby=_lobby(view, texts) if together else Html(),
+        prepared=fill("together" if together else "alone", texts),
         first=Html(" hidden") if moved else Html(),
         moved=Html() if moved else Html(" hidden"),
         over=Html() if over else Html(" hidden"),
         over_title=over_title,
         over_text=over_text,
-        button=_button(state),
+        button=_button(state, texts),
         again=Html() if view.state.get("again") else Html(" hidden"),
         gone=Html(" hidden") if view.state.get("again") else Html(),
         action=view.action,
         step=view.step.key,
         ticket=view.ticket,
         data=script_json(data),
-        reading=_reading(view, nonce),
+        reading=_reading(view, nonce, texts),
     )
     text = frame(
         view.project,
@@ -154,7 +160,7 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project)),
+        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project), texts=texts),
         head=Html() if over or in_lobby(view.state) else _REFRESH,
         sheet="sessions.css" if together else "",
         body="game",
@@ -177,7 +183,9 @@ def game_message(view: GameView) -> str:
 
     The form asks for another server if the participant may have one.
     """
-    title, text = _over_texts(view.state, "the button below") if is_over(view.state) else _MOVED
+    texts = Texts(view.project.texts)
+    moved = texts["movedProgramTitle"], texts["movedProgram"]
+    title, text = _over_texts(view.state, texts, below=True) if is_over(view.state) else moved
     if is_over(view.state) and view.state.get("again"):
         return form_message(title, text, step=view.step.key, ticket=view.ticket, also=fill("restart"))
     return form_message(title, text)
@@ -193,69 +201,60 @@ def _step_fields(view: StepView) -> Html:
 
 _REFRESH = Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n')
 """Asks again in a browser without JavaScript. Not in the lobby: who asks there can be matched, and could not play."""
-_MOVED = (
-    "The connection to your game was lost",
-    "Your game goes on on another computer, which takes about a minute to start. Press the button to wait for it.",
-)
-_OVER = {"ended": "The game has ended", "failed": "The game could not be started"}
-_TITLES = {"lost": "The game could not go on", "full": "The study is full just now"}
+_TITLES = {"lost": "lostTitle", "full": "fullTitle"}
 _TRANSIENT = ("no capacity", "full")  # waiting may help
 _TO_REPORT = ("lost", "refused")  # the researcher or the administrator has to act, if it stays so
-_REASONS = {  # the values of `hippodrome.model.server.Reason`
-    "stopped": "The computer for your game was switched off by those who hold the study.",
-    "deadline": "The time for it was over.",
-    "ended": "The game was not played for a while, or the time for it was over, so its computer switched itself off.",
-    "lost": "The computers that we tried for your game failed, or it could not begin on them. This is not your fault.",
-    "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
-    "no capacity": "There is no free computer for your game at the moment. This is not your fault.",
-    "full": "All places for this game are taken at the moment. This is not your fault.",
+_REASONS = {  # the values of `hippodrome.model.server.Reason`, and the texts for them
+    "stopped": "stopped",
+    "deadline": "deadline",
+    "ended": "idle",
+    "lost": "failed",
+    "refused": "refused",
+    "no capacity": "noCapacity",
+    "full": "full",
 }
 
 
-def _over_texts(state: Mapping[str, Any], button: str | None = None) -> tuple[str, str]:
+def _over_texts(state: Mapping[str, Any], texts: Texts, *, below: bool = False) -> tuple[str, str]:
     """The title and the text for a server that has ended: what happened, what is kept, what to do.
 
-    `button` is what to call the button that asks for another server; by default the text on it.
+    `below`: the button that asks for another server is another's, and stands below.
     """
-    reason, named = str(state.get("reason")), f"“{_button(str(state['state']))}”"
-    title = _TITLES.get(reason) or _OVER[str(state["state"])]
-    sentences = [_REASONS.get(reason, "Its computer is not there any more.")]
-    sentences.append("What you have answered and played before is kept.")
+    reason, ending = str(state.get("reason")), str(state["state"])
+    title = texts[_TITLES.get(reason, f"{ending}Title")]
+    sentences = [texts[_REASONS.get(reason, "computerGone")], texts["kept"]]
     if state.get("again"):
-        sentences.append(
-            "Please try again in a few minutes, here or by opening your link later."
-            if reason in _TRANSIENT
-            else f"With {button or named} you go on."
-        )
+        go_on = texts["goOnBelow"] if below else texts.say("goOnWith", button=_button(ending, texts))
+        sentences.append(texts["tryLater"] if reason in _TRANSIENT else go_on)
         if reason in _TO_REPORT:
-            sentences.append("If this happens again, please tell whoever invited you to this study.")
+            sentences.append(texts["tellIfAgain"])
     return title, " ".join(sentences)
 
 
-def _button(state: str) -> str:
+def _button(state: str, texts: Texts) -> str:
     """The text of the button that requests another server."""
-    return "Try again" if state == "failed" else "Start again"
+    return texts["tryAgain" if state == "failed" else "startAgain"]
 
 
-def _stages(state: str) -> Html:
+def _stages(state: str, texts: Texts) -> Html:
     """The stages of waiting; the present one is marked."""
     now = STAGES.index(state) if state in STAGES else 0
     marks = {
         f"{name}_now": Html(' aria-current="step"') if at == now else Html(' class="past"') if at < now else Html()
         for at, name in enumerate(STAGES)
     }
-    return fill("stages", **marks)
+    return fill("stages", texts, **marks)
 
 
-def _lobby(view: GameView) -> Html:
+def _lobby(view: GameView, texts: Texts) -> Html:
     """Where participants wait for each other (`web/game/lobby.js` fills it in). Hidden once they are matched."""
     players = _players(view)
     two = players == 2
     return fill(
         "lobby.html",
         lobby=Html() if in_lobby(view.state) else Html(" hidden"),
-        title="Waiting for another participant" if two else "Waiting for other participants",
-        text="Two people play this game together." if two else f"{players} people play this game together.",
+        title=texts["lobbyTitleOther" if two else "lobbyTitleOthers"],
+        text=texts["lobbyOther"] if two else texts.say("lobbyOthers", players=players),
     )
 
 
@@ -273,10 +272,10 @@ def _prepare(project: Project, source: str, files: str | None) -> Fragment:
     return fragments.prepare(source, files or f"/steps/{project.id}/", hosts)
 
 
-def _reading(view: GameView, nonce: str) -> Html:
+def _reading(view: GameView, nonce: str, texts: Texts) -> Html:
     """The researcher's pages that the game page shows. They stand last: no id in them hides one of the page's own."""
     shown = [
         fill("text", key=key, content=Html(_prepare(view.project, source, view.files).render(values, nonce)))
         for key, (source, values) in view.texts.items()
     ]
-    return fill("reading", texts=Html("\n".join(shown))) if shown else Html()
+    return fill("reading", texts, texts=Html("\n".join(shown))) if shown else Html()

@@ -20,7 +20,9 @@ import pytest
 from websockets.sync.server import serve
 
 from hippodrome.model.project import Project, Step
+from hippodrome.model.texts import IN_ENGLISH
 from hippodrome.participants import frame, game_modules, pages
+from hippodrome.participants.texts import in_script
 from tests.browser.conftest import PATIENCE, SHOTS, hold_timers
 from tests.trial.conftest import Running, grid_agent
 
@@ -950,7 +952,8 @@ def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, ta
 
     def answer(route: Any) -> None:
         loaded.append(urlsplit(route.request.url).path)
-        route.fulfill(content_type="text/javascript", path=frame.WEB / loaded[-1][1:])
+        code = (frame.WEB / loaded[-1][1:]).read_text(encoding="utf-8")
+        route.fulfill(content_type="text/javascript", body=in_script(code, IN_ENGLISH))
 
     tab.route(f"{world.url}game/*.js", answer)
     world.joined = False

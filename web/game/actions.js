@@ -50,7 +50,7 @@ export function start() {
 export function command(name) {
   if (name === "toggle" && game.state !== "playing") return start();
   if (name === "toggle") return game.offered?.has("pause") && send({ command: "pause" });
-  if (name === "stop" && !window.confirm("End the game now? You cannot go on with it afterwards.")) return;
+  if (name === "stop" && !window.confirm(TEXT.endConfirm)) return;
   if (name === "faster" || name === "slower") return send({ changeFrameRate: name });
   send({ command: name });
 }

@@ -7,14 +7,14 @@ import { game } from "./state.js";
 export function showBreak(said, begins) {
   if (begins) releaseAll(); // these keys were meant for the game that is over
   if (typeof said.nextIn === "number") game.nextAt = performance.now() + 1000 * said.nextIn;
-  overlays.break.title = `Game ${game.episode} of ${game.maxEpisodes} is over`;
+  overlays.break.title = TEXT.gameOver(game.episode, game.maxEpisodes);
   if (begins) showOverlay("break");
-  setText(find("overlay-score"), `Your score: ${points(game.episodeScore)}`);
+  setText(find("overlay-score"), TEXT.yourScore(points(game.episodeScore)));
   countDown();
 }
 
 export function countDown() {
   if (game.state !== "break" || !game.nextAt) return;
   const seconds = Math.max(1, Math.ceil((game.nextAt - performance.now()) / 1000));
-  setText(find("overlay-hint"), `The next game begins in ${duration(seconds)}.`);
+  setText(find("overlay-hint"), TEXT.nextGameIn(duration(seconds)));
 }

@@ -19,7 +19,7 @@ export function buildControls(said) {
   const actions = own ? [] : singleActions(said.actionSpace);
   const space = own?.space ?? actions.includes("fire");
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
-  const buttonOf = (name) => actionButton(name, said.labels?.[name] ?? nice(name), DIRECTIONS[name]?.sign);
+  const buttonOf = (name) => actionButton(name, said.labels?.[name] ?? DIRECTIONS[name]?.label ?? nice(name), DIRECTIONS[name]?.sign);
   const others = actions.filter((name) => !(name in DIRECTIONS));
   game.directions = own?.arrows ?? directions.length > 0;
   game.offered = shown;
@@ -57,10 +57,14 @@ export function nice(name) {
 
 function commandsOf(shown, { words }) {
   return commandButtons(shown, [
-    ["toggle", "Start", shown.has("start") ? "start" : "pause"],
-    ["reset", "Begin again"],
-    ...["good", "bad", "trainOnline", "trainOffline", ...list(words).map(String)].map((word) => [word, nice(word)]),
-    ["stop", "End the game"],
+    ["toggle", TEXT.start, shown.has("start") ? "start" : "pause"],
+    ["reset", TEXT.reset],
+    ["good", TEXT.good],
+    ["bad", TEXT.bad],
+    ["trainOnline", TEXT.trainOnline],
+    ["trainOffline", TEXT.trainOffline],
+    ...list(words).map((word) => [String(word), nice(String(word))]),
+    ["stop", TEXT.end],
   ]);
 }
 

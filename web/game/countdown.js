@@ -6,12 +6,12 @@ import { game } from "./state.js";
 
 const SOON = 10; // seconds that are left when that is said
 
-const timeLeft = make("span", { id: "left", title: "Time left", hidden: true });
+const timeLeft = make("span", { id: "left", title: TEXT.timeLeft, hidden: true });
 let startsAt = null; // when the first picture begins to move
 let endsAt = null; // when the time is over, if the game goes on as it does
 let saidSoon = false;
 
-overlays.freeze = { title: "Get ready", band: true };
+overlays.freeze = { title: TEXT.getReady, band: true };
 // One line at the top: the picture below is what there is to be seen.
 hooks.overlay.push((name) => {
   find("overlay").style.cssText = name === "freeze" ? "inset: 0 0 auto; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
@@ -24,7 +24,7 @@ hooks.said.push((message) => {
   const freezes = message.state === "playing" && message.startsIn > 0;
   if (freezes && startsAt === null) {
     showOverlay("freeze");
-    setText(find("announce"), `Get ready. The game begins in ${duration(Math.ceil(message.startsIn))}.`);
+    setText(find("announce"), TEXT.getReadyIn(duration(Math.ceil(message.startsIn))));
   } else if (!freezes && startsAt !== null && game.state === "playing") showOverlay("playing");
   startsAt = freezes ? now + 1000 * message.startsIn : null;
   const timed = typeof message.timeLeft === "number";
@@ -53,6 +53,6 @@ setInterval(() => {
   showLeft(seconds);
   if (seconds <= SOON && !saidSoon) {
     saidSoon = true;
-    setText(find("announce"), `${SOON} seconds left`);
+    setText(find("announce"), TEXT.secondsLeft(SOON));
   }
 }, 200);

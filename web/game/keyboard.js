@@ -4,13 +4,13 @@ import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 
 export const DIRECTIONS = {
-  up: { sign: "↑", codes: ["ArrowUp", "KeyW"] },
-  left: { sign: "←", codes: ["ArrowLeft", "KeyA"] },
-  right: { sign: "→", codes: ["ArrowRight", "KeyD"] },
-  down: { sign: "↓", codes: ["ArrowDown", "KeyS"] },
+  up: { sign: "↑", label: TEXT.up, codes: ["ArrowUp", "KeyW"] },
+  left: { sign: "←", label: TEXT.left, codes: ["ArrowLeft", "KeyA"] },
+  right: { sign: "→", label: TEXT.right, codes: ["ArrowRight", "KeyD"] },
+  down: { sign: "↓", label: TEXT.down, codes: ["ArrowDown", "KeyS"] },
 };
 
-const COMMANDS = { reset: ["R", "begin again"], good: ["G", "good"], bad: ["B", "bad"] }; // key, and words for the legend
+const COMMANDS = { reset: ["R", TEXT.keyReset], good: ["G", TEXT.keyGood], bad: ["B", TEXT.keyBad] }; // key, and words for the legend
 
 let keys = new Map(); // event.code -> `{ action }` or `{ command }`
 
@@ -32,12 +32,12 @@ function keyOf(name, others) {
 
 export function showLegend(directions, others, shown, space, lines = []) {
   const arrows = ["left", "up", "right", "down"].filter((name) => directions.includes(name));
-  if (arrows.length) lines.push([arrows.map((name) => DIRECTIONS[name].sign), "move"]);
+  if (arrows.length) lines.push([arrows.map((name) => DIRECTIONS[name].sign), TEXT.keyMove]);
   for (const name of others) {
     const code = keyOf(name, others);
-    if (!code.startsWith("Unreachable")) lines.push([[code.replace("Digit", "")], name]);
+    if (!code.startsWith("Unreachable")) lines.push([[code === "Space" ? TEXT.space : code.replace("Digit", "")], name]);
   }
-  lines.push([[space ? "P" : "Space"], shown.has("pause") ? "start and pause" : "start"]);
+  lines.push([[space ? "P" : TEXT.space], shown.has("pause") ? TEXT.keyToggle : TEXT.keyStart]);
   for (const name in COMMANDS) if (shown.has(name)) lines.push(COMMANDS[name]);
   find("legend").replaceChildren(...lines.map(([names, what]) => {
     const boxes = [...names].map((name) => make("kbd", { textContent: name }));

@@ -57,7 +57,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
     arrows: pad.length > 0,
     space: bound.has(called(" ")),
     groups: [
-      groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : nice(ARROWS[key])))),
+      groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : DIRECTIONS[ARROWS[key]].label))),
       groupOf("others", actions.filter(standsAlone).slice(0, MOST_BUTTONS).map((action) => {
         const key = keyOf(action);
         return actionButton(key === undefined ? action : called(key), label(action));
@@ -78,5 +78,5 @@ function padButton(key, label) {
 }
 
 function signs({ parts }) {
-  return parts.map((key) => DIRECTIONS[ARROWS[key]]?.sign ?? { " ": "Space" }[key] ?? (key.length > 1 ? key : key.toUpperCase())).join(" + ");
+  return parts.map((key) => DIRECTIONS[ARROWS[key]]?.sign ?? { " ": TEXT.space }[key] ?? (key.length > 1 ? key : key.toUpperCase())).join(" + ");
 }

@@ -6,7 +6,7 @@ import { loadPage, pageAnswers, pause } from "./requests.js";
 // `result` is the server's last message; it lacks the score if the game was not played.
 export async function leave({ score, episodes } = {}) {
   const scored = typeof score === "number";
-  const text = scored ? `Your ${episodes > 1 ? `total score in ${episodes} games` : "score"}: ${points(score)}` : "";
+  const text = !scored ? "" : episodes > 1 ? TEXT.totalScore(episodes, points(score)) : TEXT.yourScore(points(score));
   setText(find("leave-score"), text);
   find("leave-score").hidden = !scored;
   const seen = (scored || overlays.over.note ? lastPicture(text) : Promise.resolve()).then(() => showSection("leave"));
@@ -16,7 +16,7 @@ export async function leave({ score, episodes } = {}) {
       await seen;
       if (answers) await loadPage();
     } catch {
-      setText(find("leave-text"), "Your game is saved. There is no connection at the moment – trying again…");
+      setText(find("leave-text"), TEXT.savedOffline);
     }
     await pause(2_000);
   }

@@ -29,7 +29,7 @@ async function waitForOthers() {
     if (state.state === "lobby") {
       // The clock of a participant who was away begins anew.
       if (state.seconds < lobby.state.seconds - CLOCKS_DIFFER) {
-        setText(find("lobby-note"), "You were away for a while, so your waiting time has begun again.");
+        setText(find("lobby-note"), TEXT.lobbyAway);
         tellAloud(find("lobby-note").textContent);
       }
       lobby.state = state;
@@ -51,18 +51,18 @@ async function proceed(state) {
   data.state = state;
   find("lobby").hidden = true;
   showCompany();
-  find("announce").textContent = "Your game is being prepared.";
+  find("announce").textContent = TEXT.prepared;
 }
 
 // Who plays in the game that is being prepared, and the title meanwhile.
 function showCompany() {
   const others = (data.state.members ?? 1) - 1;
   const empty = data.players - others - 1;
-  const people = others === 1 ? "another participant" : `${others} other participants`;
-  const computers = empty === 1 ? "a computer player" : `${empty} computer players`;
+  const people = others === 1 ? TEXT.oneOther : TEXT.someOthers(others);
+  const computers = empty === 1 ? TEXT.oneComputer : TEXT.someComputers(empty);
   const known = data.state.members ? [others && people, empty && computers].filter(Boolean) : [];
-  setText(find("company"), known.length ? "You play with " + known.join(" and ") + "." : "");
-  data.title = "Your game is being prepared – " + studyTitle;
+  setText(find("company"), known[1] ? TEXT.playWithBoth(known[0], known[1]) : known.length ? TEXT.playWith(known[0]) : "");
+  data.title = TEXT.preparedTitle(studyTitle);
   document.title = studyTitle;
 }
 
@@ -76,20 +76,19 @@ function showLobby() {
   setText(find("lobby-here"), text);
   if (lobby.said && lobby.said !== text) tellAloud(text);
   lobby.said = text;
-  document.title = `${proposed && there === players ? "Found" : `${there} of ${players}`} – ${studyTitle}`;
+  document.title = `${proposed && there === players ? TEXT.found : TEXT.countOf(there, players)} – ${studyTitle}`;
   showTime();
 }
 
-const textOfFew = (players, there) => there === 1 ? `You are the first of ${players}` : `${there} of ${players} are here, you included`;
+const textOfFew = (players, there) => there === 1 ? TEXT.firstOf(players) : TEXT.hereWithYou(there, players);
 
 // What is said of a session that is about to begin. With `policies` it may have empty places, even all but one.
 function textOfSession(players, there, then) {
-  const moment = "One moment, please…";
-  if (there === players) return `Found: ${players === 2 ? "another participant is here" : "enough participants are here"}. ${moment}`;
+  if (there === players) return `${players === 2 ? TEXT.foundOther : TEXT.foundEnough} ${TEXT.moment}`;
   if (then !== "policies") return textOfFew(players, there);
   const one = players - there === 1;
-  if (there === 1) return "Nobody else has come: you play with " + (one ? "a computer player" : "computer players") + `. ${moment}`;
-  return `${textOfFew(players, there)}: ${one ? "a computer player takes the empty place" : "computer players take the empty places"}. ${moment}`;
+  if (there === 1) return `${one ? TEXT.aloneWithOne : TEXT.aloneWithSome} ${TEXT.moment}`;
+  return `${textOfFew(players, there)}: ${one ? TEXT.takesPlace : TEXT.takePlaces} ${TEXT.moment}`;
 }
 
 // How long it is until the participant no longer waits, and what happens then.
@@ -99,13 +98,13 @@ function showTime() {
   const left = Math.max(0, Math.ceil(patience - waited));
   const alone = players === 2;
   const next = {
-    unmatched: "you go on to the next part of the study without this game",
-    policies: alone ? "you play with a computer player instead" : "the game begins with those who are here, and computer players take the empty places",
+    unmatched: TEXT.goWithout,
+    policies: alone ? TEXT.playComputer : TEXT.beginWithFew,
   }[then];
-  setText(find("lobby-clock"), `You have waited for ${duration(waited)}.`);
+  setText(find("lobby-clock"), TEXT.waited(duration(waited)));
   if (proposed) setText(find("lobby-then"), "");
-  else if (left) setText(find("lobby-then"), `If ${alone ? "nobody else comes" : "not enough people come"} in the next ${duration(left)}, ${next}.`);
-  else setText(find("lobby-then"), `${alone ? "Nobody else has come" : "Not enough people have come"}, so ${next}. One moment, please…`);
+  else if (left) setText(find("lobby-then"), alone ? TEXT.ifNobody(duration(left), next) : TEXT.ifFew(duration(left), next));
+  else setText(find("lobby-then"), `${alone ? TEXT.nobodyCame(next) : TEXT.fewCame(next)} ${TEXT.moment}`);
   if (SOON_OVER.includes(left) && !proposed) tellAloud(find("lobby-then").textContent);
 }
 

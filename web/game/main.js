@@ -16,7 +16,7 @@ import { showStatus } from "./status.js";
 import { clearDrafts } from "./storage.js";
 import { isOver, noteRestart, pollDelay, restartedFor, showClock, showWaiting } from "./waiting.js";
 
-const HANGS = "The connection hangs. Please stay on this page.";
+const HANGS = TEXT.hangs;
 const SILENT = 4_500; // ms without a message in a game; the server was asked meanwhile
 const LONG = 20_000; // ms of trouble until more is said
 const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may have been lost, and a reload repeats it
@@ -64,7 +64,7 @@ async function playOn(server) {
   if (find("play").hidden) {
     showSection("play");
     showOverlay("loading");
-    document.title = `Ready – ${title}`;
+    document.title = TEXT.readyTitle(title);
     find("screen").focus({ preventScroll: true });
   }
   game.state = "loading";
@@ -76,6 +76,7 @@ async function playOn(server) {
 }
 
 function hear(said) {
+  if (said.error) said.error = data.said?.[said.error] ?? said.error; // the study's words for it
   if (said.error) showMessage(String(said.error));
   if (Array.isArray(said.UI)) buildControls(said);
   if (said.state) showStatus(said);
@@ -99,7 +100,7 @@ function lookWhetherItHangs() {
   const silent = watch(isRunning());
   if (silent > SILENT && isRunning()) setText(find("trouble"), HANGS);
   else if (find("trouble").textContent === HANGS) hideMessage();
-  if (game.state === "loading" && silent > LONG) setText(find("overlay-hint"), "This takes longer than usual. Please stay on this page.");
+  if (game.state === "loading" && silent > LONG) setText(find("overlay-hint"), TEXT.takesLonger);
 }
 
 clearDrafts();

@@ -4,22 +4,15 @@ import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
 
 export const overlays = {
-  loading: { title: "Loading the game…" },
-  ready: { title: "Ready?", button: "Start", hint: "or press an arrow key" },
-  paused: { title: "Paused", button: "Go on", hint: "or press an arrow key" },
-  break: { title: "This game is over", button: "Go on now", band: true, note: "The next one begins in a moment." },
-  lost: { title: "Connection lost – trying again…", note: "Your game is kept. Please stay on this page." },
-  unreachable: {
-    title: "Your game cannot be reached – trying again…",
-    note: "Your game is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.",
-  },
-  elsewhere: {
-    title: "The game was opened in another tab or on another device",
-    button: "Play here instead",
-    note: "If you have closed it there, go on here.",
-  },
-  ended: { title: "Saving your game…", band: true },
-  over: { title: "The game is over", button: "Go on", band: true, shown: 4_000 }, // ms, unless the participant goes on
+  loading: { title: TEXT.loading },
+  ready: { title: TEXT.ready, button: TEXT.start, hint: TEXT.orArrow },
+  paused: { title: TEXT.paused, button: TEXT.goOn, hint: TEXT.orArrow },
+  break: { title: TEXT.thisGameOver, button: TEXT.goOnNow, band: true, note: TEXT.nextSoon },
+  lost: { title: TEXT.lost, note: TEXT.lostNote },
+  unreachable: { title: TEXT.unreachable, note: TEXT.unreachableNote },
+  elsewhere: { title: TEXT.elsewhere, button: TEXT.playHere, note: TEXT.elsewhereNote },
+  ended: { title: TEXT.saving, band: true },
+  over: { title: TEXT.over, button: TEXT.goOn, band: true, shown: 4_000 }, // ms, unless the participant goes on
 };
 
 // Shows the overlay of that name; none for other names, such as "playing".
@@ -29,13 +22,13 @@ export function showOverlay(name) {
   find("overlay").classList.toggle("band", Boolean(overlay.band)); // the last picture stays to be seen
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
   find("mode").dataset.state = name;
-  setText(find("mode"), { playing: "Playing", paused: "Paused" }[name] ?? "");
+  setText(find("mode"), { playing: TEXT.playing, paused: TEXT.paused }[name] ?? "");
   for (const button of document.querySelectorAll("[data-command=toggle]")) {
-    button.textContent = { playing: "Pause", paused: "Go on" }[name] ?? "Start";
+    button.textContent = { playing: TEXT.pause, paused: TEXT.goOn }[name] ?? TEXT.start;
     button.style.visibility = game.offered?.has(name === "playing" ? "pause" : "start") ? "" : "hidden";
   }
-  const score = name === "break" ? `. Your score: ${points(game.episodeScore)}.` : "";
-  setText(find("announce"), `${overlay.title ?? "Playing"}${score}`);
+  const score = name === "break" ? `. ${TEXT.yourScore(points(game.episodeScore))}.` : "";
+  setText(find("announce"), `${overlay.title ?? TEXT.playing}${score}`);
   setText(find("overlay-score"), "");
   setText(find("overlay-title"), overlay.title ?? "");
   const hint = matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? overlay.hint : "";

@@ -25,8 +25,8 @@ export function make(tag, properties, ...children) {
 // How numbers are shown
 
 export function duration(seconds) {
-  if (seconds < 90) return seconds === 1 ? "1 second" : `${seconds} seconds`;
-  return `${Math.floor(seconds / 60)} min ${seconds % 60} s`;
+  if (seconds < 90) return seconds === 1 ? TEXT.second : TEXT.seconds(seconds);
+  return TEXT.minutes(Math.floor(seconds / 60), seconds % 60);
 }
 
 // Up to 1,000 with two decimals: all that is said in the line above the picture has to stand in it on a phone.

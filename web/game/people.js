@@ -10,12 +10,11 @@ import { game } from "./state.js";
 const GLANCE = 3_000; // ms for which a participant may look at another page in the game
 const MOST_NAMES = 4; // of more players the page shows how many are there
 const READ = 600_000; // ms for which the reason of an early end is shown, unless the participant goes on
-const STATES = { here: "", reads: "reading", awaited: "not here yet", away: "away", policy: "computer" };
+const STATES = { here: "", reads: TEXT.reads, awaited: TEXT.awaited, away: TEXT.away, policy: TEXT.computer };
 const COVERS = ["gathering", "held", "begins"];
 
 const pair = data.players === 2;
-const theOther = "the other participant";
-const theOthers = pair ? theOther : theOther + "s";
+const waitsForAll = pair ? TEXT.waitingForOther : TEXT.waitingForOthers;
 const presence = { people: {}, you: "", beginsAt: null, heldUntil: null, shown: "", reason: "" };
 const peopleLine = make("span", { id: "people" });
 const toGoOn = make("p", { id: "reading-wait", role: "status" });
@@ -23,15 +22,15 @@ const toGoOn = make("p", { id: "reading-wait", role: "status" });
 document.querySelector(".hud").append(peopleLine);
 find("reading-button")?.after(toGoOn);
 
-overlays.gathering = { title: `Waiting for ${theOthers}` };
+overlays.gathering = { title: waitsForAll };
 Object.assign(overlays, { held: {}, begins: {} });
-overlays.lost.note = nice(theOthers) + " can see that you are away, and the game waits for a short while. Please stay on this page.";
-overlays.unreachable.note = "What you have played is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study.";
+overlays.lost.note = pair ? TEXT.otherSees : TEXT.othersSee;
+overlays.unreachable.note = TEXT.unreachableTogether;
 // By outcome, what is said of an early end if the server has not said it.
 const ENDINGS = {
-  left: "You were away for too long, so the game has ended. What you have played is kept. Please go on.",
-  partnerLeft: `${pair ? nice(theOther) : "A participant"} is not there any more, so the game has ended. This is not your fault. Please go on.`,
-  ping: "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
+  left: TEXT.youLeft,
+  partnerLeft: pair ? TEXT.otherLeft : TEXT.someLeft,
+  ping: TEXT.tooSlow,
 };
 
 hooks.overlay.push((name) => {
@@ -63,11 +62,11 @@ const missing = () => Object.keys(presence.people).filter((name) => name !== pre
 
 // Where the game says who is there
 
-const playerName = (name) => data.names?.[name] ?? nice(isNaN(name) ? name : `player ${name}`);
+const playerName = (name) => data.names?.[name] ?? (isNaN(name) ? nice(name) : TEXT.player(name));
 
 function showPeople({ people, you }) {
   const stop = document.querySelector("[data-command=stop]");
-  if (stop) stop.textContent = "End the game for everybody";
+  if (stop) stop.textContent = TEXT.endForAll;
   const before = presence.people;
   Object.assign(presence, { people, you: you ?? presence.you });
   const names = Object.keys(people).slice(0, 64);
@@ -75,24 +74,24 @@ function showPeople({ people, you }) {
   const shown = names.length > MOST_NAMES ? names.filter((name) => name === presence.you) : names;
   const parts = shown.map((name) => {
     const text = playerName(name), more = STATES[people[name]];
-    const textContent = name === presence.you ? `You: ${text}` : more ? `${text} (${more})` : text;
+    const textContent = name === presence.you ? TEXT.you(text) : more ? `${text} (${more})` : text;
     return make("b", { className: people[name], textContent });
   });
-  if (shown.length < names.length) parts.push(make("b", { className: "here", textContent: `${there} of ${names.length} are here` }));
+  if (shown.length < names.length) parts.push(make("b", { className: "here", textContent: TEXT.areHere(there, names.length) }));
   peopleLine.replaceChildren(...parts);
   for (const name of names) if (name !== presence.you && before[name]) tellOf(name, before[name], people[name]);
 }
 
 function tellOf(name, before, now) {
-  const who = pair ? theOther : playerName(name);
-  if (now === "policy" && before !== "policy") showMessage("A computer player has taken the place of " + who + ".");
-  if (now === "here" && ["away", "policy"].includes(before)) showMessage(`${pair ? nice(who) : who} is back.`);
+  const who = playerName(name);
+  if (now === "policy" && before !== "policy") showMessage(pair ? TEXT.otherReplaced : TEXT.replaced(who));
+  if (now === "here" && ["away", "policy"].includes(before)) showMessage(pair ? TEXT.otherBack : TEXT.back(who));
 }
 
 // Turn by turn: whose turn it is, if it is another's
 function sayWhoseTurn({ state, toAct, turnOf }) {
   const names = Array.isArray(turnOf) ? turnOf.slice(0, MOST_NAMES).map((name) => playerName(String(name))) : [];
-  if (state === "playing" && !toAct && names.length) setText(find("turn"), names.join(", ") + ": their turn");
+  if (state === "playing" && !toAct && names.length) setText(find("turn"), TEXT.theirTurn(names.join(", ")));
 }
 
 // What covers the picture
@@ -100,10 +99,10 @@ function sayWhoseTurn({ state, toAct, turnOf }) {
 function coverPicture() {
   const name = coverName();
   if (game.state === "break" || (find("play").hidden && name !== "begins")) return showWhoReads();
-  const title = missing().length ? `Waiting for ${pair ? theOther : missing().map(playerName).join(", ")}` : "You were away for a moment";
+  const title = !missing().length ? TEXT.youWereAway : pair ? waitsForAll : TEXT.waitingForNames(missing().map(playerName).join(", "));
   if (name === presence.shown && (name !== "held" || title === overlays.held.title)) return countSeconds();
   if (name === "held") releaseAll();
-  overlays.begins.title = game.state === "paused" ? "The game goes on" : "The game begins";
+  overlays.begins.title = game.state === "paused" ? TEXT.goesOn : TEXT.begins;
   overlays.held.title = title;
   showOverlay(name);
   countSeconds();
@@ -120,13 +119,11 @@ function coverName() {
 function countSeconds() {
   if (find("play").hidden) return showWhoReads();
   if (presence.shown === "begins") showCountdown();
-  const begins = game.state === "paused" ? "goes on" : "begins";
-  if (presence.shown === "gathering" || (presence.shown === "held" && !missing().length)) return setText(find("overlay-hint"), `The game ${begins} as soon as everybody is here.`);
+  if (presence.shown === "gathering" || (presence.shown === "held" && !missing().length)) return setText(find("overlay-hint"), game.state === "paused" ? TEXT.goesOnWithAll : TEXT.beginsWithAll);
   if (presence.shown !== "held") return;
   const left = duration(secondsUntil(presence.heldUntil));
-  const next = data.absentEnds ? "the game ends for everybody" : "a computer player takes their place";
   const read = missing().every((name) => presence.people[name] === "reads");
-  setText(find("overlay-hint"), read ? `They have not gone on yet. The game begins in ${left} at the latest.` : `If they are not here in ${left}, ${next}.`);
+  setText(find("overlay-hint"), read ? TEXT.theyRead(left) : data.absentEnds ? TEXT.absentEnds(left) : TEXT.absentReplaced(left));
 }
 
 // Images that still come say so where the title is.
@@ -137,9 +134,9 @@ function showCountdown() {
 
 // No participant has to press Start: its button and its key are there for the pause, if that is offered.
 function offerNoStart() {
-  const line = [...find("legend").children].find((each) => [" start", " start and pause"].includes(each.lastChild.textContent));
-  if (line?.lastChild.textContent === " start") line.remove();
-  else if (line) line.lastChild.textContent = " pause and go on";
+  const line = [...find("legend").children].find((each) => [` ${TEXT.keyStart}`, ` ${TEXT.keyToggle}`].includes(each.lastChild.textContent));
+  if (line?.lastChild.textContent === ` ${TEXT.keyStart}`) line.remove();
+  else if (line) line.lastChild.textContent = ` ${TEXT.keyPause}`;
   for (const button of document.querySelectorAll("[data-command=toggle]")) button.hidden = !["playing", "paused"].includes(presence.shown) || !game.offered.has("pause");
 }
 
@@ -150,9 +147,9 @@ function tellThatRead() {
 }
 
 function showWhoReads() {
-  const waited = presence.heldUntil === null ? "" : ` within ${duration(secondsUntil(presence.heldUntil))}`;
-  if (presence.people[presence.you] !== "reads") setText(toGoOn, missing().length ? "Waiting for " + theOthers + "…" : "");
-  else setText(toGoOn, waited && nice(theOthers) + (pair ? " waits" : " wait") + " for you. Please go on" + waited + ".");
+  const left = duration(secondsUntil(presence.heldUntil));
+  if (presence.people[presence.you] !== "reads") setText(toGoOn, missing().length ? `${waitsForAll}…` : "");
+  else setText(toGoOn, presence.heldUntil === null ? "" : pair ? TEXT.otherWaits(left) : TEXT.othersWait(left));
 }
 
 // The end
@@ -160,8 +157,8 @@ function showWhoReads() {
 function noteEnd(said) {
   if (!Object.hasOwn(ENDINGS, said.outcome)) return;
   if (!said.episodes) delete said.score; // nothing was played
-  Object.assign(overlays.over, { title: "The game has ended", note: String(presence.reason || ENDINGS[said.outcome]), band: false, shown: READ });
-  setText(find("leave-title"), "Thank you!");
+  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[said.outcome]), band: false, shown: READ });
+  setText(find("leave-title"), TEXT.thanks);
   setTimeout(() => setText(find("announce"), overlays.over.note), 500); // after what the page says of every end
 }
 

@@ -8,14 +8,14 @@ import { game } from "./state.js";
 hooks.rates = (shown, said) => {
   if (!said.allowFrameRateChange) return null;
   const buttons = commandButtons(shown, [
-    ["slower", "Slower", "fpsDown"],
-    ["faster", "Faster", "fpsUp"],
+    ["slower", TEXT.slower, "fpsDown"],
+    ["faster", TEXT.faster, "fpsUp"],
   ]);
   const box = make("div", { className: "rates" });
   if (shown.has("fpsSet")) {
     const slider = make("input", { type: "range", id: "rate", min: said.minFrameRate, max: said.maxFrameRate });
     slider.addEventListener("change", () => send({ changeFrameRate: Number(slider.value) }));
-    box.append(make("label", { htmlFor: "rate", textContent: "Speed" }), slider, make("output", { htmlFor: "rate" }));
+    box.append(make("label", { htmlFor: "rate", textContent: TEXT.speed }), slider, make("output", { htmlFor: "rate" }));
   }
   if (buttons) box.append(buttons);
   return box.childElementCount ? box : null;
@@ -27,5 +27,5 @@ function showRate() {
   const slider = find("rate");
   if (!slider) return;
   slider.value = game.frameRate;
-  slider.nextElementSibling.value = `${game.frameRate} per second`;
+  slider.nextElementSibling.value = TEXT.perSecond(game.frameRate);
 }

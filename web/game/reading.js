@@ -10,7 +10,7 @@ const LAST_PICTURE = 2_500; // ms for which the last picture and the score are s
 
 const texts = { instructions: find("text-instructions"), between: find("text-betweenEpisodes") };
 const noted = `read-${data.step}`;
-const again = make("button", { type: "button", id: "instructions-button", textContent: "Instructions", hidden: true });
+const again = make("button", { type: "button", id: "instructions-button", textContent: TEXT.instructions, hidden: true });
 
 let reading = ""; // which of the texts
 let opening; // the timer of the page between two games
@@ -35,7 +35,7 @@ function closeText() {
 }
 
 function openBetween() {
-  openText("between", "Next game", `Game ${game.episode} of ${game.maxEpisodes} is over. Your score: ${points(game.episodeScore)}`);
+  openText("between", TEXT.nextGame, `${TEXT.gameOver(game.episode, game.maxEpisodes)}. ${TEXT.yourScore(points(game.episodeScore))}`);
 }
 
 const unread = () => Boolean(texts.instructions) && !recall(noted);
@@ -43,7 +43,7 @@ const unread = () => Boolean(texts.instructions) && !recall(noted);
 hooks.waits = () => {
   const between = game.state === "break" && texts.between && reading !== "between";
   if (between) openBetween();
-  else if (game.state === "ready" && unread()) openText("instructions", "Go to the game");
+  else if (game.state === "ready" && unread()) openText("instructions", TEXT.toGame);
   else return false;
   return true;
 };
@@ -51,14 +51,14 @@ hooks.waits = () => {
 hooks.overlay.push((name) => {
   clearTimeout(opening);
   again.hidden = !texts.instructions || !["ready", "paused"].includes(name);
-  if (name === "ready" && unread()) openText("instructions", "Go to the game");
+  if (name === "ready" && unread()) openText("instructions", TEXT.toGame);
   else if (name === "break" && texts.between) opening = setTimeout(openBetween, LAST_PICTURE);
   else if (reading && name !== "lost" && name !== "unreachable") closeText();
 });
 
-if (texts.between) Object.assign(overlays.break, { button: "Go on", note: "" });
+if (texts.between) Object.assign(overlays.break, { button: TEXT.goOn, note: "" });
 find("overlay").append(again);
-again.addEventListener("click", () => openText("instructions", "Back to the game"));
+again.addEventListener("click", () => openText("instructions", TEXT.backToGame));
 find("reading-button").addEventListener("click", () => {
   if (reading === "between" && game.state === "break") return start();
   if (reading === "instructions") remember(noted, true);

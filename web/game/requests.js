@@ -25,7 +25,7 @@ export async function pollUntilAnswered() {
       setText(find("wait-status"), "");
       return state;
     } catch {
-      setText(find("wait-status"), "No connection – trying again…");
+      setText(find("wait-status"), TEXT.noConnection);
       await pause(Math.min(4_000, 1_000 * 2 ** tries));
     }
   }

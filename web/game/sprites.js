@@ -18,7 +18,7 @@ let asked = 0; // numbers below this were asked for on this connection, unless t
 let underWay = 0;
 let pixelsLeft = 64 * 2 ** 20; // pixels of all images, of which a browser needs four bytes each
 const bar = make("progress", { max: 1, value: 0, hidden: true });
-bar.setAttribute("aria-label", "Pictures of the game");
+bar.setAttribute("aria-label", TEXT.pictures);
 find("overlay-hint").after(bar);
 
 export const spriteOf = (name) => loaded.get(table.find((each) => each.name === name)?.hash);
@@ -92,7 +92,7 @@ function tell() {
     const whole = table.reduce((sum, each) => sum + each.bytes, 0);
     const there = table.reduce((sum, each, number) => sum + (loaded.has(each.hash) ? each.bytes : arrived.get(number)?.length ?? 0), 0);
     bar.value = there / whole;
-    setText(find("overlay-title"), "Loading the pictures…");
+    setText(find("overlay-title"), TEXT.loadingPictures);
     setText(find("overlay-hint"), "");
     find("overlay-button").hidden = true;
     bar.hidden = false;

@@ -9,9 +9,9 @@ export function showStatus(said) {
   Object.assign(game, said);
   const several = game.maxEpisodes > 1;
   setText(find("score"), points(game.episodeScore ?? game.score));
-  setText(find("total"), `Total ${points(game.score)}`);
+  setText(find("total"), TEXT.total(points(game.score)));
   find("total").hidden = !several || game.episodeScore === undefined;
-  setText(find("episode"), several ? `Game ${game.episode} of ${game.maxEpisodes}` : "");
+  setText(find("episode"), several ? TEXT.gameOf(game.episode, game.maxEpisodes) : "");
   if (game.state === "break") showBreak(said, before !== "break");
   else if (before !== game.state) showOverlay(game.state);
 }

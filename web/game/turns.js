@@ -3,7 +3,7 @@ import { hooks } from "./hooks.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
-const MINE = "Your turn";
+const MINE = TEXT.yourTurn;
 const turn = make("span", { id: "turn" });
 let turnEndsAt = null;
 let wasMine = false;
@@ -31,11 +31,11 @@ hooks.said.push((message) => {
 const isMine = () => game.state === "playing" && Boolean(game.toAct);
 
 function showTurn() {
-  const others = game.players?.length > 2 ? "The others’ turn" : "The other player’s turn";
-  const left = turnEndsAt === null ? "" : ` (${Math.max(0, Math.ceil((turnEndsAt - performance.now()) / 1000))} s)`;
+  const others = game.players?.length > 2 ? TEXT.othersTurn : TEXT.otherTurn;
+  const left = Math.max(0, Math.ceil((turnEndsAt - performance.now()) / 1000));
   turn.classList.toggle("mine", isMine());
   if (game.state !== "playing") setText(turn, "");
-  else if (isMine()) setText(turn, MINE + left);
+  else if (isMine()) setText(turn, turnEndsAt === null ? MINE : TEXT.yourTurnLeft(left));
   else setText(turn, game.players ? others : "");
 }
 

@@ -38,12 +38,12 @@ export function showWaiting(state) {
 
 export function showClock() {
   const seconds = Math.max(0, Math.round((performance.now() - waiting.since) / 1000));
-  find("elapsed").textContent = `Waiting for ${duration(seconds)}.`;
+  find("elapsed").textContent = TEXT.waiting(duration(seconds));
   if (!waiting.typical) return;
   const long = seconds > 2 * waiting.typical + 10;
   find("typical").textContent = long
-    ? "This takes longer than usual. Please stay on this page."
-    : `Usually it takes about ${duration(waiting.typical)}.`;
+    ? TEXT.takesLonger
+    : TEXT.usually(duration(waiting.typical));
 }
 
 // "Try again": the server's record stays closed for a moment after it.

@@ -11,6 +11,7 @@ from hippodrome.log import logger
 from hippodrome.model import ids
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Step
+from hippodrome.model.texts import Texts
 from hippodrome.participants.page_error import CONTENT_NOT_FOUND, PageError
 from hippodrome.participants.sandbox import FragmentError, records_mentioned
 from hippodrome.participants.steps.services import StepServices
@@ -33,8 +34,7 @@ def source_of(services: StepServices, visit: Visit, page: Step) -> PageSource:
     text = services.project_cache.page(project, file)
     if text is None:
         logger.error("step page missing", extra={"project": project.id, "file": file})
-        said = "It was not uploaded. Please tell whoever invited you."
-        raise PageError(500, "This page is missing", said, CONTENT_NOT_FOUND)
+        raise PageError.of(Texts(project.texts), 500, "pageMissing", CONTENT_NOT_FOUND)
     return PageSource(file, text, _values(services, visit, page, text))
 
 
@@ -46,7 +46,7 @@ def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
     except FragmentError as error:
         files = ", ".join(source.file for source in sources)
         logger.error("step page broken", extra={"project": visit.project.id, "file": files, "line": error.line})
-        raise PageError(500, "This page is broken", "It could not be shown. Please tell whoever invited you.") from None
+        raise PageError.of(Texts(visit.project.texts), 500, "pageBroken") from None
 
 
 def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapping[str, Any]:

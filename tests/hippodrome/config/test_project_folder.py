@@ -116,6 +116,7 @@ def test_what_is_not_given_has_its_default(folder: Path) -> None:
         "seats": "lot",
         "afterPatience": "unmatched",
         "gamePages": {},
+        "texts": {},
         "trial": {
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,

@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
+from hippodrome.model.texts import IN_ENGLISH
 from hippodrome.participants import frame, pages, scripts
 from hippodrome.participants.frame import Page
 from hippodrome.participants.pages import GameView, StepView
 from hippodrome.participants.sandbox import FragmentError, records_mentioned
+from hippodrome.participants.texts import in_script
 from hippodrome.participants.waiting import FAILURES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -566,7 +568,7 @@ def texts(script: str) -> list[str]:
 
 @pytest.mark.parametrize(("name", "page"), [("step.js", step("<p>x</p>")), ("game/main.js", game())])
 def test_a_page_carries_its_script_and_the_style_without_their_comments(name: str, page: Page) -> None:
-    script = code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name)))
+    script = in_script(code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name))), IN_ENGLISH)
     carried = re.findall(r'<script(?: type="module")? nonce="[^"]+">\n(.*?)</script>', page.html, re.DOTALL)[-1]
     assert re.sub(r"\s", "", carried) == re.sub(r"\s", "", script)
     assert texts(carried) == texts(script)

@@ -1,0 +1,73 @@
+"""A study's own words for what Hippodrome says to participants: mistakes in them, and what is left in English."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from hippodrome.config.config import Config
+from hippodrome.config.diagnostics import Keys, Mistake, Remark
+from hippodrome.config.each_value import Checked
+from hippodrome.config.project_keys import TEXTS
+from hippodrome.model.texts import ENGLISH, LANGUAGE, places, texts_of
+from protocol.values import show
+
+_BRACES = re.compile(r"\{[^{}]*\}")
+_LANGUAGE = re.compile(r"[A-Za-z]{2,3}(-[A-Za-z0-9]{2,8}){0,3}")
+_PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
+_SHOWN = 3  # names of texts in a remark
+
+
+def mistakes(checked: Checked) -> Iterator[Mistake]:
+    """What is wrong with texts that are well formed by themselves: places that nothing fills, and no language."""
+    for name, text in checked.root.project.own_texts.items():
+        if name == LANGUAGE and not _LANGUAGE.fullmatch(text):
+            yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
+        elif wrong := [place for place in _BRACES.findall(text) if place[1:-1] not in places(ENGLISH[name])]:
+            yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")
+
+
+def _known(name: str) -> str:
+    known = [f"{{{place}}}" for place in places(ENGLISH[name])]
+    if not known:
+        return "this text has no places"
+    *first, last = known
+    return f"there {'are' if first else 'is'} {' and '.join(filter(None, [', '.join(first), last]))}"
+
+
+def left_in_english(config: Config) -> Iterator[Remark]:
+    """What to say of a study in another language: texts of ours that its participants may read in English.
+
+    Its `texts` say which language it is in, or its pages do.
+    """
+    own = config.project.own_texts
+    needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions)
+    yield from _left(own, _languages(file for step in config.steps for file in step.files), needed)
+
+
+def _languages(files: Iterable[Path]) -> Iterator[str]:
+    """What step pages say of their language."""
+    for file in files:
+        found = _PAGE_LANGUAGE.search(file.read_text(encoding="utf-8", errors="replace"))
+        if found:
+            yield found[1]
+
+
+def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
+    named = own.get(LANGUAGE)
+    foreign = [each for each in (named, *languages) if each and not _is_english(each)]
+    if not foreign or (named and _is_english(named)):
+        return
+    missing = [name for name in needed if name not in own]
+    if missing:
+        language = foreign[0]
+        path: Keys = TEXTS if own else ("project",)
+        shown = ", ".join(missing[:_SHOWN]) + (" …" if len(missing) > _SHOWN else "")
+        which = f"{len(missing)} texts of ours stay" if len(missing) > 1 else "one text of ours stays"
+        said = f"the study is in another language ({language}), and {which} English: {shown}"
+        yield Remark(path, f"{said}; see docs/texts.md")
+
+
+def _is_english(language: str) -> bool:
+    return language.lower().split("-")[0] == "en"

@@ -1,0 +1,78 @@
+"""Puts a study's texts (`hippodrome/model/texts.py`) into the scripts and templates of `web/`, which name them.
+
+An English page carries neither the names nor a table: that would cost more than a tenth of the game page's script. In a
+script, `TEXT.start` becomes `"Start"`, and `TEXT.seconds(left)` becomes `` `${left} seconds` ``. So what stands between
+the brackets may be worked out never or twice, as the text has the place: it must do nothing else than give a value.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+
+from hippodrome.model.texts import ENGLISH, PLACE, Texts, places
+
+NAMED = re.compile(r"\bTEXT\.([A-Za-z]+)")
+
+
+def in_script(code: str, texts: Texts) -> str:
+    """The script with the texts where it names them."""
+    return _filled(code, texts.all())
+
+
+def in_template(template: str, texts: Texts) -> str:
+    """The HTML template with the texts, escaped, where it names them. `{step}` in a text becomes `$step`."""
+    known = texts.all()
+    return NAMED.sub(lambda found: _in_html(known[found[1]], places(ENGLISH[found[1]])), template)
+
+
+def _in_html(text: str, named: tuple[str, ...]) -> str:
+    safe = html.escape(text, quote=False).replace('"', "&quot;").replace("$", "$$")
+    return PLACE.sub(lambda place: f"${place[0]}" if place[1] in named else place[0], safe)
+
+
+def _filled(code: str, texts: dict[str, str]) -> str:
+    done, at = "", 0
+    while found := NAMED.search(code, at):
+        done += code[at : found.start()]
+        name, at = found[1], found.end()
+        values: dict[str, str] = {}
+        if named := places(ENGLISH[name]):
+            given, at = _arguments(code, at)
+            values = dict(zip(named, (_filled(each, texts) for each in given), strict=True))
+        if done.endswith("${") and code.startswith("}", at):  # alone in a place of a template: a part of its text
+            done, at = done[:-2] + _in_template(texts[name], values), at + 1
+        else:
+            done += f"`{_in_template(texts[name], values)}`" if values else _literal(texts[name])
+    return done + code[at:]
+
+
+def _literal(text: str) -> str:
+    """The text as a script writes it. `<` could end the script, and two signs end a line for some browsers."""
+    written = json.dumps(text, ensure_ascii=False).replace("<", "\\u003c")
+    return written.replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _in_template(text: str, values: dict[str, str]) -> str:
+    """The text as a part of a template literal, with code in its places."""
+    inner = _literal(text)[1:-1].replace('\\"', '"').replace("`", "\\`").replace("${", "\\${")
+    return PLACE.sub(lambda place: "${" + values[place[1]] + "}" if place[1] in values else place[0], inner)
+
+
+_TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|`[^`$]*`|[(\[{]|[)\]}]|,|[^"`(\[{)\]},]+')
+
+
+def _arguments(code: str, at: int) -> tuple[list[str], int]:
+    """What stands between the brackets that open at `at`, and where they are closed."""
+    given, depth = [""], 0
+    while token := _TOKEN.match(code, at):
+        at = token.end()
+        depth += (token[0] in "([{") - (token[0] in ")]}")
+        if depth == 0:
+            return given, at
+        if depth == 1 and token[0] == ",":
+            given.append("")
+        elif depth > 1 or token[0] != "(":
+            given[-1] += token[0] if given[-1] else token[0].lstrip()
+    raise ValueError(f"brackets without an end: {code[at : at + 40]}")

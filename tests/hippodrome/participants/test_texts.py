@@ -1,0 +1,155 @@
+"""What participants read of ours: one table, and a study's own words in its place."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hippodrome.model.texts import ENGLISH, GROUPS, IN_ENGLISH, SAID, Texts, places
+from hippodrome.participants import frame, game_modules, scripts
+from hippodrome.participants.texts import NAMED, in_script, in_template
+from trial.core import session, trial
+
+ROOT = Path(__file__).resolve().parents[3]
+WEB = ROOT / "web"
+SOURCES = [*sorted(WEB.rglob("*.js")), *sorted(WEB.rglob("*.html"))]
+PYTHON = sorted((ROOT / "hippodrome" / "participants").rglob("*.py"))
+ALL_MODULES = (*game_modules.MODULES, *game_modules.TOGETHER)
+NO_TEXTS = re.compile(r"new Error\([^)]*\)|replaceSync\(`[^`]*`\)")
+WORD = re.compile(r"\b[A-Z][a-z]+\b")
+NO_WORDS = {
+    "ArrowUp",
+    "ArrowLeft",
+    "ArrowRight",
+    "ArrowDown",
+    "Digit",
+    "Key",
+    "Space",
+    "Unreachable",
+    "Arial",
+    "Accept",
+}
+"""Names of keys, as browsers call them, of a font and of a header."""
+
+
+@pytest.mark.parametrize("file", SOURCES, ids=lambda path: path.name)
+def test_whatever_scripts_and_templates_name_is_in_the_table(file: Path) -> None:
+    assert set(NAMED.findall(file.read_text())) <= ENGLISH.keys()
+
+
+def test_each_text_is_used() -> None:
+    named = {name for file in SOURCES for name in NAMED.findall(file.read_text())}
+    python = "".join(file.read_text() for file in PYTHON)
+    named |= set(NAMED.findall(python)) | set(re.findall(r"[\"'](\w+)[\"']", python))
+    named |= {f"{name}Text" for name in named} | {"endedTitle", "failedTitle"} | set(SAID)
+    assert ENGLISH.keys() - named == {"language"} - named
+
+
+@pytest.mark.parametrize("file", sorted(WEB.rglob("*.js")), ids=lambda path: path.name)
+def test_scripts_have_no_text_of_their_own(file: Path) -> None:
+    code = re.sub(r"(?m)^\s*//.*|\s// .*", "", file.read_text())
+    literals = [found["text"] for found in frame._CODE_OR_TEXT.finditer(NO_TEXTS.sub("", code)) if found["text"]]
+    words = {word for text in literals for word in WORD.findall(re.sub(r"\$\{[^}]*\}", "", text))}
+    assert words - NO_WORDS == set()
+
+
+def test_templates_have_no_text_of_their_own() -> None:
+    templates = [(WEB / name).read_text() for name in ("frame.html", "game.html", "lobby.html")]
+    for template in [*templates, *(part for name, part in frame._PARTS.items() if name != "data")]:
+        read = " ".join([re.sub(r"<[^>]*>", " ", template), *re.findall(r'aria-label="([^"]*)"', template)])
+        assert re.findall(r"[A-Za-z]{2,}", re.sub(r"TEXT\.\w+|\$\w+", " ", read)) == []
+
+
+@pytest.mark.parametrize(("name", "also"), [("game/main.js", ALL_MODULES), ("step.js", ())])
+def test_each_text_is_given_what_it_leaves_open(name: str, also: tuple[str, ...]) -> None:
+    assert not NAMED.search(in_script(scripts.join(WEB / name, also), IN_ENGLISH))  # ValueError if it is not
+
+
+def test_what_servers_say_is_in_the_table() -> None:
+    said = {
+        *(getattr(session, name) for name in ("PARTNER_LEFT", "PARTNER_STOPPED", "PARTNER_MISSING", "LEFT", "PING")),
+        *(getattr(trial, name) for name in ("EPISODE_FAILED", "EPISODE_BEGINS_AGAIN", "TRIAL_FAILED")),
+    }
+    assert set(SAID.values()) == said
+
+
+def test_the_page_for_researchers_lists_all_texts() -> None:
+    _, *sections = (ROOT / "docs" / "texts.md").read_text(encoding="utf-8").split("\n## ")
+    listed = {part.split("\n")[0]: re.findall(r"^\| `(\w+)` \| (.*) \|$", part, re.MULTILINE) for part in sections}
+    assert listed == {group: list(texts.items()) for group, texts in GROUPS.items()}
+
+
+def test_the_german_texts_are_complete() -> None:
+    given = yaml.safe_load((ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8"))["project"]["texts"]
+    assert list(given) == list(ENGLISH)
+    assert given["language"] == "de"
+    for name, text in given.items():
+        assert set(places(text)) == set(places(ENGLISH[name])), name
+    assert {name for name, text in given.items() if text == ENGLISH[name]} == {"start", "pause", "minutes"}
+
+
+# A study's own words
+
+
+def test_a_study_has_its_own_words_and_english_ones_where_it_has_none() -> None:
+    texts = Texts({"start": "Los", "seconds": "{seconds} Sekunden", "unknown": "x"})
+    assert texts["start"] == "Los"
+    assert texts["pause"] == "Pause"
+    assert texts.say("seconds", seconds=5) == "5 Sekunden"
+    assert texts.say("minutes", minutes=1) == "1 min {seconds} s"
+    assert texts.language == "en"
+    assert texts == Texts({"seconds": "{seconds} Sekunden", "start": "Los"}) != IN_ENGLISH
+    assert hash(texts) == hash(Texts({"seconds": "{seconds} Sekunden", "start": "Los"}))
+
+
+def test_the_page_gets_the_words_for_what_servers_say_only_if_they_are_others() -> None:
+    assert IN_ENGLISH.of_server() == Texts({"start": "Los"}).of_server() == {}
+    assert Texts({"saidPing": "Zu langsam."}).of_server() == {ENGLISH["saidPing"]: "Zu langsam."}
+
+
+@pytest.mark.parametrize(
+    ("code", "own", "filled"),
+    [
+        ("say(TEXT.start);", {}, 'say("Start");'),
+        ("say(TEXT.seconds(left));", {}, "say(`${left} seconds`);"),
+        ("say(TEXT.gameOver(f(a, [b, c]), { d }));", {}, "say(`Game ${f(a, [b, c])} of ${{ d }} is over`);"),
+        ('say(TEXT.theirTurn(names.join(", ")));', {}, 'say(`${names.join(", ")}: their turn`);'),
+        ("say(`${TEXT.start}: ${TEXT.seconds(a)}!`);", {}, "say(`Start: ${a} seconds!`);"),
+        ("say(TEXT.ifNobody(TEXT.seconds(a), TEXT.goWithout));", {"goWithout": "b", "ifNobody": "{next}"}, 'say(`${"b"}`);'),
+        ("say(TEXT.gameOf(a, b));", {"gameOf": "{games}: {game}, {game}"}, "say(`${b}: ${a}, ${a}`);"),
+        ("say(TEXT.gameOf(a, b));", {"gameOf": "Spiel"}, "say(`Spiel`);"),
+    ],
+)  # fmt: skip
+def test_texts_stand_where_a_script_names_them(code: str, own: dict[str, str], filled: str) -> None:
+    assert in_script(code, Texts(own)) == filled
+
+
+EVIL = "\"`\\ ${alert(1)} </script><!-- \u2028 {game} // '$game"
+
+
+def test_no_text_is_code() -> None:
+    script = in_script(
+        "say(TEXT.start); say(TEXT.gameOf(a, b)); say(`x${TEXT.start}`);", Texts({"start": EVIL, "gameOf": EVIL})
+    )
+    plain = json.dumps(EVIL, ensure_ascii=False).replace("<", "\\u003c").replace("\u2028", "\\u2028")
+    inner = plain[1:-1].replace('\\"', '"').replace("`", "\\`").replace("${", "\\${")
+    assert script == f"say({plain}); say(`{inner.replace('{game}', '${a}')}`); say(`x{inner}`);"
+    assert "</" not in script
+    assert "\u2028" not in script
+
+
+def test_no_text_is_html() -> None:
+    own = Texts({"tell": '<b title="x">&$user ${x} {step}', "step": "{step} $user {x}"})
+    assert in_template("TEXT.tell", own) == "&lt;b title=&quot;x&quot;&gt;&amp;$$user $${x} {step}"
+    assert in_template("TEXT.step", own) == "${step} $$user {x}"
+    assert frame.fill("progress", own, step=1, steps=2, done=0, all=1).startswith(
+        '<label class="progress">1 $user {x} '
+    )
+
+
+def test_a_text_names_what_it_leaves_open_once() -> None:
+    assert places("{a} {b} {a} {} {C} {b") == ("a", "b")
