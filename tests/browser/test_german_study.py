@@ -1,0 +1,188 @@
+"""A study in German in two real browsers, one wide and one a phone: no word of ours is English, and everything fits."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import yaml
+
+from bots.links import with_user
+from hippodrome.model.texts import ENGLISH, PLACE
+from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from testing.held_study import HeldStudy
+from tests.browser.conftest import SHOTS
+from tests.browser.test_pages_browser import FLAWS
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+
+GERMAN: dict[str, str] = yaml.safe_load((ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8"))["project"][
+    "texts"
+]
+PAGES = {
+    "consent": "<h1>Möchten Sie teilnehmen?</h1><label><input type=checkbox name=ja value=ja required> Ja, ich möchte.</label>",
+    "rules": "<h1>Die Regeln</h1><p>Stellen Sie sich zu zweit auf die goldenen Platten.</p>",
+    "survey": "<h1>Wie war es?</h1><label for=a>Anmerkungen</label><textarea id=a name=a></textarea>",
+    "debrief": "<h1>Danke!</h1><p>Ihr Code:</p><p class=code>{{ completion_code }}</p>",
+}
+PATTERNS = [
+    re.compile(".+".join(map(re.escape, PLACE.split(text)[::2])))
+    for name, text in ENGLISH.items()
+    if text != GERMAN[name] and name not in ("language", "notSavedText")
+]
+READ = """() => {
+    const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    const found = [document.title];
+    while (walker.nextNode()) {
+        if (!walker.currentNode.parentElement.closest("script, style, #scene-hud")) found.push(walker.currentNode.data);
+    }
+    for (const each of document.querySelectorAll("[aria-label], [title]")) {
+        found.push(each.getAttribute("aria-label") ?? "", each.title);
+    }
+    return found.map((text) => text.trim().replace(/\\s+/g, " ")).filter(Boolean);
+}"""
+
+
+class Person:
+    """A participant in a browser of their own, whose connection to the game can be cut."""
+
+    def __init__(self, chromium: Any, study: StudyProcess, name: str, width: int) -> None:
+        narrow = width < 600
+        size = {"width": width, "height": 740 if narrow else 800}
+        self.context = chromium.new_context(viewport=size, has_touch=narrow, is_mobile=narrow)
+        self.context.set_default_timeout(60_000)
+        self.page = self.context.new_page()
+        self.complaints: list[str] = []
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.width, self._cut, self._sockets = width, False, []
+        self.page.route_web_socket(re.compile("^ws"), self._connect)
+        self.page.goto(with_user(study.link, name))
+
+    def _connect(self, socket: Any) -> None:
+        if self._cut:
+            socket.close(code=4000)
+        else:
+            self._sockets.append(socket)
+            socket.connect_to_server()
+
+    def cut(self) -> None:
+        """Nothing reaches the game any more."""
+        self._cut = True
+        self._sockets[-1].close(code=4000)
+
+    def mend(self) -> None:
+        self._cut = False
+
+    def sees(self, selector: str, text: str) -> None:
+        says = "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)"
+        self.page.wait_for_function(says, arg=[selector, text])
+
+    def plays(self) -> None:
+        self.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+
+    def reads_german(self, name: str) -> None:
+        """No text of ours is English, here or hidden, and nothing is wider than the page."""
+        self.page.screenshot(path=SHOTS / f"{self.width}-german-{name}.png")
+        texts = self.page.evaluate(READ)
+        assert [text for text in texts if any(english.fullmatch(text) for english in PATTERNS)] == []
+        assert self.page.evaluate("document.documentElement.lang") == "de"
+        assert self.page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+        assert self.page.evaluate(FLAWS) == []
+
+    def goes_on(self) -> None:
+        for box in self.page.get_by_role("checkbox").all():
+            box.check()
+        self.page.get_by_role("button", name="Weiter").click()
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
+    """The example for two, with pages and texts in German."""
+    folder = tmp_path_factory.mktemp("german")
+    copy_of(ROOT / "examples" / "two-players", folder / "project")
+    (folder / "project" / "steps").unlink()
+    (folder / "project" / "steps").mkdir()
+    for name, page in PAGES.items():
+        (folder / "project" / "steps" / f"{name}.html").write_text(page, encoding="utf-8")
+    config = folder / "project" / "config.yml"
+    tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+    tree["project"] |= {"texts": GERMAN, "name": "Laternen für zwei"}
+    tree["trial"] |= {
+        "maxEpisodes": 2,
+        "episodeSeconds": 14,
+        "betweenEpisodes": 4,
+        "absent": 5,
+        "countdown": 2,
+        "playerNames": {"red": "Rot", "blue": "Blau"},
+    }
+    config.write_text(json.dumps(tree), encoding="utf-8")
+    held = HeldStudy(folder / "project", folder / "data")
+    held.start()
+    yield held
+    held.clear()
+
+
+@pytest.fixture
+def come(chromium: Any, study: StudyProcess) -> Iterator[Callable[[str, int], Person]]:
+    """A participant at the first page: `come("ada", 1280)`."""
+    people: list[Person] = []
+    SHOTS.mkdir(exist_ok=True)
+
+    def arrive(name: str, width: int) -> Person:
+        people.append(Person(chromium, study, name, width))
+        return people[-1]
+
+    yield arrive
+    for person in people:
+        person.context.close()
+    assert [person.complaints for person in people] == [[] for _ in people]
+
+
+def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, int], Person]) -> None:
+    phone, wide = come("bo", 360), come("ada", 1280)
+    for person in (phone, wide):
+        person.reads_german("consent")
+        person.goes_on()
+        person.page.wait_for_selector("body[data-step='2']")
+        person.goes_on()
+        if person is phone:
+            phone.sees("#lobby-here", "1 von 2 ist da: Sie")
+            phone.sees("#lobby-then", "geht es für Sie ohne dieses Spiel mit dem nächsten Teil der Studie weiter")
+            phone.reads_german("lobby")
+    for person in (wide, phone):
+        person.plays()
+        person.reads_german("game")
+    phone.cut()
+    phone.sees("#overlay-title", GERMAN["lost"])
+    phone.reads_german("lost")
+    wide.sees("#overlay-title", "Warten auf die andere Person")
+    wide.sees("#overlay-hint", "übernimmt ein Computerspieler den Platz")
+    wide.reads_german("waits")
+    wide.sees("#trouble", "Ein Computerspieler hat den Platz der anderen Person übernommen.")
+    wide.reads_german("replaced")
+    phone.mend()
+    wide.sees("#trouble", "Die andere Person ist wieder da.")
+    for person in (wide, phone):
+        person.sees("#overlay-title", "Spiel 1 von 2 ist vorbei")
+        person.reads_german("break")
+    for person in (wide, phone):
+        person.sees("#overlay-title", "Das Spiel ist vorbei")
+        person.sees("#overlay-score", "Ihre Punkte in 2 Spielen: ")
+        person.reads_german("over")
+        person.page.click("#overlay-button")
+    for person in (wide, phone):
+        person.page.wait_for_selector("body[data-step='4']")
+        person.reads_german("survey")
+        person.goes_on()
+        person.sees(".copy", "Kopieren")
+        person.reads_german("end")
+
+
+def test_one_who_is_alone_reads_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
+    phone = come("cy", 360)
+    phone.page.goto(f"{study.link}&userId=a%20b")
+    phone.sees("h1", "Dieser Link ist nicht vollständig")
+    phone.reads_german("broken-link")
