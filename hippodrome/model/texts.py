@@ -358,16 +358,16 @@ class Texts:
     __slots__ = ("_own",)
 
     def __init__(self, own: Mapping[str, str]) -> None:
-        self._own = frozenset((name, text) for name, text in own.items() if name in ENGLISH)
+        self._own = {name: text for name, text in own.items() if text and name in ENGLISH}
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Texts) and self._own == other._own
 
     def __hash__(self) -> int:
-        return hash(self._own)
+        return hash(frozenset(self._own.items()))
 
     def __getitem__(self, name: str) -> str:
-        return next((text for own, text in self._own if own == name), ENGLISH[name])
+        return self._own.get(name, ENGLISH[name])
 
     @property
     def language(self) -> str:
@@ -376,7 +376,7 @@ class Texts:
 
     def all(self) -> dict[str, str]:
         """All texts by their names."""
-        return {**ENGLISH, **dict(self._own)}
+        return {**ENGLISH, **self._own}
 
     def say(self, name: str, **values: Any) -> str:
         """The text with these values in its places. A place that has no value stays as it is."""

@@ -46,6 +46,14 @@ READ = """() => {
 }"""
 
 
+NOTE_WHAT_IS_SAID = """() => {
+    const trouble = document.getElementById("trouble");
+    window.said = [];
+    new MutationObserver(() => window.said.push(trouble.textContent)).observe(trouble, { childList: true });
+}"""
+"""Messages of the server's, which the page may show for a moment only."""
+
+
 class Person:
     """A participant in a browser of their own, whose connection to the game can be cut."""
 
@@ -181,7 +189,25 @@ def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, in
         person.reads_german("end")
 
 
-def test_one_who_is_alone_reads_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
+def test_one_who_ends_the_game_is_asked_in_german_and_the_other_is_told_so(come: Callable[[str, int], Person]) -> None:
+    phone, wide = come("ed", 360), come("fi", 1280)
+    for person in (phone, wide):
+        for step in ("2", "3"):
+            person.goes_on()
+            person.page.wait_for_selector(f"body[data-step='{step}']")
+    for person in (phone, wide):
+        person.plays()
+    wide.page.evaluate(NOTE_WHAT_IS_SAID)
+    asked: list[str] = []
+    phone.page.on("dialog", lambda dialog: (asked.append(dialog.message), dialog.accept()))
+    phone.page.get_by_role("button", name="Spiel für alle beenden").tap()
+    wide.page.wait_for_function("text => window.said.includes(text)", arg=GERMAN["saidPartnerStopped"])
+    wide.sees("#overlay-title", GERMAN["hasEnded"])
+    wide.reads_german("stopped")
+    assert asked == [GERMAN["endConfirm"]]
+
+
+def test_one_with_a_broken_link_reads_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
     phone = come("cy", 360)
     phone.page.goto(f"{study.link}&userId=a%20b")
     phone.sees("h1", "Dieser Link ist nicht vollständig")
