@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from hippodrome.model.project import GAME_PAGES, Project
+from hippodrome.model.texts import Texts
 
 
 def _has_scene(trial: Mapping[str, Any]) -> bool:
@@ -35,6 +36,8 @@ MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
 }
 """By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""
 
+OWN_WORDS = ("words.js",)
+"""The module of a study with other words for what its servers say."""
 TOGETHER = ("people.js", "lobby.js")
 """The modules of a game that several participants play together. `lobby.js` is last: what stands behind it waits."""
 
@@ -42,4 +45,5 @@ TOGETHER = ("people.js", "lobby.js")
 def of(project: Project) -> tuple[str, ...]:
     """The names of the modules that a project needs besides those of every project."""
     own = tuple(name for name, needed in MODULES.items() if needed(project.trial))
+    own += OWN_WORDS if Texts(project.texts).of_server() else ()
     return own + TOGETHER if project.has_sessions else own

@@ -977,6 +977,7 @@ def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, ta
     tab.wait_for_selector("#overlay-title:text('The game is over')")
     modules = {path.name for path in (frame.WEB / "game").glob("*.js")} - {
         *game_modules.MODULES,
+        *game_modules.OWN_WORDS,
         *game_modules.TOGETHER,
     }
     assert set(loaded) == {f"/game/{name}" for name in modules}

@@ -59,11 +59,8 @@ function commandsOf(shown, { words }) {
   return commandButtons(shown, [
     ["toggle", TEXT.start, shown.has("start") ? "start" : "pause"],
     ["reset", TEXT.reset],
-    ["good", TEXT.good],
-    ["bad", TEXT.bad],
-    ["trainOnline", TEXT.trainOnline],
-    ["trainOffline", TEXT.trainOffline],
-    ...list(words).map((word) => [String(word), nice(String(word))]),
+    ...Object.entries({ good: TEXT.good, bad: TEXT.bad, trainOnline: TEXT.trainOnline, trainOffline: TEXT.trainOffline }),
+    ...list(words).map(String).map((word) => [word, nice(word)]),
     ["stop", TEXT.end],
   ]);
 }

@@ -76,7 +76,6 @@ async function playOn(server) {
 }
 
 function hear(said) {
-  if (said.error) said.error = data.said?.[said.error] ?? said.error; // the study's words for it
   if (said.error) showMessage(String(said.error));
   if (Array.isArray(said.UI)) buildControls(said);
   if (said.state) showStatus(said);

@@ -65,7 +65,7 @@ def test_what_a_module_imports_is_exported(module: Path) -> None:
 
 
 def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() -> None:
-    joined = scripts.join(GAME / "main.js", (*game_modules.MODULES, *game_modules.TOGETHER))
+    joined = scripts.join(GAME / "main.js", (*game_modules.MODULES, *game_modules.OWN_WORDS, *game_modules.TOGETHER))
     places = {module.name: joined.index(f"\n{code_of(module)}") for module in MODULES}
     assert len(set(places.values())) == len(MODULES)
     for module in MODULES:
@@ -75,7 +75,7 @@ def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() 
 def test_a_module_of_some_projects_is_in_no_other_script() -> None:
     joined = scripts.join(GAME / "main.js")
     assert [module.name for module in MODULES if f"\n{code_of(module)}" not in joined] == sorted(
-        (*game_modules.MODULES, *game_modules.TOGETHER)
+        (*game_modules.MODULES, *game_modules.OWN_WORDS, *game_modules.TOGETHER)
     )
 
 
