@@ -3,8 +3,10 @@ import { hooks } from "./hooks.js";
 import { showMessage } from "./overlay.js";
 import { data } from "./page.js";
 
-hooks.said.unshift((said) => {
+function sayOwnWords(said) {
   if (!Object.hasOwn(data.said, said.error ?? "")) return;
   said.error = data.said[said.error]; // for what comes after this
   showMessage(said.error);
-});
+}
+
+hooks.said.unshift(sayOwnWords);
