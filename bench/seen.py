@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import random
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,9 +113,11 @@ def server(agent_dir: Path, *, store: Path | None = None, **trial: Any) -> Itera
 
 
 def cpu_seconds(pid: int) -> float:
-    """Processor time a process has used, user and system."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    """Processor time a process has used, user and system: its clock, numbered as clock_getcpuclockid(3) does on Linux.
+
+    `/proc/PID/stat` counts in hundredths of a second, in which a server sends dozens of pictures.
+    """
+    return time.clock_gettime((~pid << 3) | 2)
 
 
 @contextlib.contextmanager
