@@ -63,9 +63,16 @@ def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
 
 
 @contextlib.asynccontextmanager
-async def member(server: Any, user_id: str, *, port: int = 0, **change: Any) -> AsyncIterator[Client]:
-    """A member's client that has been let in, by another `port` perhaps."""
+async def member(
+    server: Any, user_id: str, *, port: int = 0, forms: bool = False, **change: Any
+) -> AsyncIterator[Client]:
+    """A member's client that has been let in, by another `port` perhaps.
+
+    The session is formed before, or when the client is connected: the server's idle time begins then.
+    """
     async with client_of(f"ws://127.0.0.1:{port or server.port}/") as client:
+        if forms:
+            form(server.store)
         await client.hello(**hello_of(user_id, **change))
         try:
             await client.until(lambda: client.controls or client.done)

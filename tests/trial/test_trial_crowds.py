@@ -154,7 +154,7 @@ def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client,
 
 def test_who_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
     chain = put(tmp_path / "store" / "ssl", 1)
-    server = launch(HELLO_SECONDS="1", **KEYS)
+    server = launch(HELLO_SECONDS="3", **KEYS)
     crowd = [
         connect(server.port, first) for first in (SILENT, b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n") for _ in range(20)
     ]

@@ -559,10 +559,9 @@ def test_the_next_server_finds_who_has_answered_an_earlier_game_step(launch, ope
 
 def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(launch, open_client):
     server = launch_session(launch, IDLE_SECONDS="1", GRACE_SECONDS="1")
-    form(server.store)
 
     async def run():
-        async with member(server, "anna"):
+        async with member(server, "anna", forms=True):
             async with member(server, "bert"):
                 pass
             await asyncio.sleep(2)
@@ -575,10 +574,9 @@ def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(l
 
 def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_them_for_gather_seconds(launch):
     server = launch_session(launch, trial={"gather": 300}, IDLE_SECONDS="1", GRACE_SECONDS="1")
-    form(server.store)
 
     async def run():
-        async with member(server, "anna") as anna:
+        async with member(server, "anna", forms=True) as anna:
             assert anna.controls["people"] == {"left": "here", "right": "awaited"}
 
     asyncio.run(run())

@@ -448,7 +448,7 @@ def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
 
 
 def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_warm_server, open_client):
-    server = launch_warm_server(HELLO_SECONDS="1")
+    server = launch_warm_server(HELLO_SECONDS="3")
     path = server.store / f"study/spares/{WARM_SERVER}.json"
     path.parent.mkdir(parents=True)
     os.mkfifo(path)  # whoever opens it waits for somebody who writes
@@ -456,7 +456,7 @@ def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_warm_server, op
     async def come():
         began = time.monotonic()
         await refused(server, open_client, 1013)
-        assert 0.9 < time.monotonic() - began < 5
+        assert 2.9 < time.monotonic() - began < 7
 
     try:
         asyncio.run(come())

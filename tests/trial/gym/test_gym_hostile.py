@@ -228,6 +228,7 @@ def test_too_much_memory_of_several_processes(asking: Client) -> None:
 
 
 def test_a_process_that_an_environment_left_ends_with_the_connection(server: GymServer, asking: Client) -> None:
+    wait_for(lambda: len(below(server)) == 1)  # what an earlier test has left is on its way out
     stepped(asking, "Odd/Forking-v0")
     assert len(below(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
 
