@@ -63,7 +63,9 @@ def test_a_participant_plays(
     study, narrow, name = hold(example), width < 600, f"ada-{width}"
     context = chromium.new_context(viewport={"width": width, "height": height}, has_touch=narrow, is_mobile=narrow)
     context.set_default_timeout(45_000)
-    page, complaints = context.new_page(), []
+    page, complaints, pictures = context.new_page(), [], []
+    hear = lambda data: pictures.append(data) if isinstance(data, bytes) else None  # noqa: E731
+    page.on("websocket", lambda socket: socket.on("framereceived", hear))
     page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     come_to_the_game(page, with_user(study.link, name))
@@ -71,7 +73,9 @@ def test_a_participant_plays(
     page.wait_for_function(STATE, arg="playing")
     for key, button, milliseconds in presses:
         press(page, key, button, narrow=narrow, milliseconds=milliseconds)
-        page.wait_for_timeout(150)
+        before = len(pictures)
+        while len(pictures) < before + 3:  # the steps of this press are over, before the next may take its place
+            page.wait_for_timeout(20)
     shown = Image.open(io.BytesIO(page.locator("canvas").last.screenshot()))
     assert len(shown.getcolors(maxcolors=10_000_000)) > 20, "pictures are drawn"
     SHOTS.mkdir(exist_ok=True)
