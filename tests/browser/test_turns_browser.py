@@ -55,3 +55,13 @@ def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) ->
     assert len(in_turns.commands("action")) == before
     tab.keyboard.press("ArrowUp")
     in_turns.wait_for({"action": "up", "held": True})
+
+
+def test_a_page_for_turns_says_nothing_of_turns_to_who_still_plays_in_real_time(world: World, tab: Any) -> None:
+    """The study was registered anew; the server runs what was registered before."""
+    world.trial = {"pace": "turns"}
+    world.controls = {"player": "left", "players": ["left", "right"]}
+    play(world, tab)
+    tell(world, state="playing")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    assert tab.inner_text("#turn") == ""

@@ -34,7 +34,8 @@ function showTurn() {
   const others = game.players?.length > 2 ? TEXT.othersTurn : TEXT.otherTurn;
   const left = Math.max(0, Math.ceil((turnEndsAt - performance.now()) / 1000));
   turn.classList.toggle("mine", isMine());
-  if (game.state !== "playing") setText(turn, "");
+  // A server that was started before turns were registered plays in real time.
+  if (game.state !== "playing" || game.pace !== "turns") setText(turn, "");
   else if (isMine()) setText(turn, turnEndsAt === null ? MINE : TEXT.yourTurnLeft(left));
   else setText(turn, game.players ? others : "");
 }
