@@ -105,6 +105,7 @@ def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
         "patience": 300,
         "seats": "lot",
         "after_patience": "unmatched",
+        "texts": {},
         "trial": {},
         "task_definition": None,
         "page_folder": "steps",
