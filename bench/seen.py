@@ -188,13 +188,14 @@ def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], press
 
 
 def until(page: Any, what: str, count: int) -> None:
-    """Wait until the page has noted so many. Raises Playwright's Error after PATIENCE."""
+    """Wait until the page has noted so many. Raises Playwright's Error, with what the page shows, after PATIENCE."""
     page.evaluate(
         """([what, count, patience]) => new Promise((done, fail) => {
             const end = performance.now() + patience;
+            const missing = () => new Error(`fewer than ${count} ${what}: ${document.body.innerText}`);
             const look = () => {
                 if (benchSeen[what].length >= count) done();
-                else if (performance.now() > end) fail(new Error(`fewer than ${count} ${what}`));
+                else if (performance.now() > end) fail(missing());
                 else setTimeout(look, 10);
             };
             look();

@@ -251,8 +251,9 @@ _AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|\*|[+-](?= [^-+])|[=?
 
 
 def _dense(code: str) -> str:
-    """Code without most spaces and line ends: each of our statements ends with a semicolon or a block."""
-    return re.sub(r"([;{},(\[])\n", r"\1", _AROUND.sub(r"\1", code))
+    """Code without most spaces and line ends: each statement ends with a semicolon or a block; none is empty."""
+    code = re.sub(r",\n(?=[}\])])", "", _AROUND.sub(r"\1", code))
+    return re.sub(r";(?=})", "", re.sub(r"([;{},(\[])\n", r"\1", code))
 
 
 def _plain(name: str, text: str) -> str:
@@ -262,7 +263,7 @@ def _plain(name: str, text: str) -> str:
     """
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
-        text = re.sub(r" ?([{};]) ?|([:,]) ", r"\1\2", text)  # no quoted text of ours has these
+        text = re.sub(r" ?([{};>~]) ?|([:,]) ", r"\1\2", text)  # no quoted text of ours has these
     if name.endswith(".js"):
         text = re.sub(r"[ \t]// .*$", "", text, flags=re.MULTILINE)
     if name.endswith((".css", ".js")):

@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -84,6 +84,8 @@ class World:
     """Where the trial stands: what its server answers to a page that has heard nothing for some time."""
     started: dict[str, Any] = field(default_factory=lambda: PLAYING)
     """What the trial server answers to `start`."""
+    before_pictures: Callable[[], object] = lambda: None
+    """What the trial server waits for between its first message and the first picture."""
     url: str = ""
     game_url: str = ""
 
@@ -129,6 +131,7 @@ class World:
             self.heard.append(message)
             if "token" in message:
                 connection.send(json.dumps(controls))
+                self.before_pictures()
                 connection.send(pack(1, RED * 4))
                 connection.send(pack(2, BLUE * 4, RED * 4))
             elif message.get("command") == "requestUI":
@@ -407,6 +410,34 @@ def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> Non
     assert tab.evaluate("window.same") is True
     assert tab.title().startswith("Ready")
     assert world.heard[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
+
+
+def test_the_button_to_start_shows_once_the_first_picture_has_put_it_in_its_place(world: World, tab: Any) -> None:
+    """A tap on a button that moves meanwhile would be lost."""
+    pictures = threading.Event()
+    world.before_pictures = lambda: pictures.wait(PATIENCE / 1000)
+    tab.add_init_script("addEventListener('animationstart', (event) => event.target.getAnimations()[0].pause())")
+    world.step = 2
+    world.ready()
+    tab.goto(world.url)
+    tab.wait_for_selector("#overlay-title:text('Ready')")
+    assert not tab.is_visible("#overlay-button")
+    pictures.set()
+    tab.wait_for_selector("#overlay-button:visible")
+    assert tab.evaluate("document.getElementById('screen').width") == 2
+
+
+def test_the_button_to_start_shows_also_if_no_picture_comes(world: World, tab: Any) -> None:
+    pictures = threading.Event()
+    world.before_pictures = lambda: pictures.wait(PATIENCE / 1000)
+    world.step = 2
+    world.ready()
+    tab.goto(world.url)
+    tab.wait_for_selector("#overlay-button:visible")
+    tab.click("#overlay-button")
+    assert tab.evaluate("document.getElementById('screen').width") == 160
+    pictures.set()
+    world.wait_for({"command": "start"})
 
 
 def test_the_title_says_ready_until_the_game_has_begun(world: World, tab: Any) -> None:

@@ -125,7 +125,8 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
         ('// "a\nsay("a = b", `${c} , d`); // "e\n', 'say("a = b",`${c} , d`);'),
         ("a + +b - -c;\n", "a + +b - -c;"),
         ("a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`, 1);\n", "a(`b ${c > 1 ? `d = ${e} = f` : 2} = g`,1);"),
-        ("{\n  a;\n}\nb()\n", "{a;}b()\n"),
+        ("{\n  a;\n}\nb()\n", "{a}b()\n"),
+        ("f({ a, b: [\n  1,\n] }, /a{2,}/,\n);\n", "f({a,b:[1]},/a{2,}/);"),
     ],
 )
 def test_a_page_carries_a_script_without_comments_spaces_and_line_ends_but_texts_as_they_are(
