@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Iterable
+import time
+from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,17 @@ TRIAL: dict[str, Any] = {
     "countdown": 0,
     "ui": {"up": True, "down": True, "start": True, "pause": True, "stop": True},
 }
+ENV = {
+    "PROJECT_ID": "study",
+    "SERVER": "pair-1",
+    "TOKEN": TOKEN,
+    "GAME_STEPS": "3",
+    "STORE": "x",
+    "TLS": "off",
+    "TRIAL": "{}",
+    "SESSION": SID,
+}
+"""The environment of a session's server."""
 
 
 def document(
@@ -79,6 +92,43 @@ async def member(
         except ConnectionClosed as closed:
             raise AssertionError(f"{client.errors}; the server said:\n{server.said()}") from closed
         yield client
+
+
+async def refused(server: Any, open_client: Any, code: int = 4401, **hello: Any) -> str:
+    """Connect with this hello; the server closes the connection with this code. Return what it says."""
+    async with open_client(server.address) as client:
+        await client.hello(**{"userId": None, "token": None, **hello})
+        assert await client.closed() == code, client.errors
+        assert not client.controls
+        assert not client.frames
+        last: str = client.errors[-1]
+        return last
+
+
+async def both_play(server: Any, frames: int = 5) -> tuple[Client, Client]:
+    """Both members play until they have so many pictures; then one stops the game."""
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await anna.say(command="start")
+        try:
+            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in (anna, bert)))
+        except ConnectionClosed as closed:
+            raise AssertionError(f"{anna.errors}, {bert.errors}; the server said:\n{server.said()}") from closed
+        await anna.say(command="stop")
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+        return anna, bert
+
+
+async def both_see(frames: int, *clients: Client) -> None:
+    """Whoever did not take their pictures would be away after some seconds, and the game would be held."""
+    await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in clients))
+
+
+def wait_for(true: Callable[[], object], seconds: float = 15) -> None:
+    """Wait until something is true of a server that runs."""
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def answer(store: Path, user_id: str, step: str = "3") -> dict[str, Any]:

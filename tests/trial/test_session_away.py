@@ -1,4 +1,4 @@
-"""Two members on a real server: a page that sleeps and wakes, a connection that is lost, a policy in the place."""
+"""Two members on a real server: a page that sleeps and wakes, acknowledgements that are forged, a policy in a place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.trial.sessions import answer, form, launch_session, member, recording
 pytestmark = pytest.mark.timeout(90)
 
 
-async def both_play(anna: Any, bert: Any) -> None:
+async def until_both_play(anna: Any, bert: Any) -> None:
     for client in (anna, bert):
         await client.until(lambda client=client: client.state.get("state") == "playing")
 
@@ -28,16 +28,17 @@ def test_a_page_that_sleeps_is_away_and_is_back_by_its_acknowledgement_alone(lau
 
     async def run() -> None:
         async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await both_play(anna, bert)
+            await until_both_play(anna, bert)
             await anna.until(lambda: len(anna.frames) > 5)
             anna.acks = False
             await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "away"), 20)
             assert bert.state["state"] == "paused"
+            held = len(bert.frames)
             await anna.until(lambda: people(anna).get("left") == "away")
             await anna.say(ack=anna.frames[-1][1])
             anna.acks = True
             await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "here"), 20)
-            await bert.until(lambda: bert.state["state"] == "playing")
+            await bert.until(lambda: bert.state["state"] == "playing" and len(bert.frames) > held + 5)
 
     asyncio.run(run())
 
@@ -50,7 +51,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
     async def run() -> None:
         async with member(server, "bert") as bert:
             async with member(server, "anna") as anna:
-                await both_play(anna, bert)
+                await until_both_play(anna, bert)
             await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "policy"), 20)
             await bert.until(lambda: bert.state["state"] == "playing")
             seen = len(bert.frames)
@@ -82,3 +83,31 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
     assert last["pressedAt"] <= lines[-1]["ns"]
     outcomes = {user: answer(server.store, user)["answers"]["outcome"] for user in ("anna", "bert")}
     assert outcomes == {"anna": "stopped", "bert": "partnerLeft"}
+
+
+@pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
+def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
+    """Acknowledgements pace a member's own pictures alone."""
+    server = launch_session(launch, trial={"startingFrameRate": 20})
+    form(server.store)
+
+    async def forge(bert):
+        while forged != "none":
+            newest = bert.frames[-1][1] if bert.frames else 0
+            await bert.say(ack=newest + (1000 if forged == "of what was not sent" else 0))
+            await asyncio.sleep(0.02)
+
+    async def run():
+        async with member(server, "anna") as anna, member(server, "bert") as bert:
+            bert.acks = False
+            tasks = [asyncio.create_task(forge(bert)), asyncio.create_task(bert.watch(60))]
+            await anna.until(lambda: len(anna.frames) > 10)
+            first = len(anna.frames)
+            while len(anna.frames) < first + 80:  # four seconds, after which a page that sleeps is away
+                await anna.take()
+                assert anna.state["people"] == {"left": "here", "right": "here"}
+            for task in tasks:
+                task.cancel()
+
+    asyncio.run(run())
+    assert "Traceback" not in server.said()

@@ -1,0 +1,316 @@
+"""What a session's server stores: each member's answers, the session's recordings, and what a lost server has left."""
+
+import asyncio
+import json
+
+import pytest
+
+from protocol.session import Member, Session
+from tests.trial.sessions import (
+    ENV,
+    MEMBERS,
+    SID,
+    TRIAL,
+    answer,
+    both_play,
+    both_see,
+    document,
+    form,
+    hello_of,
+    launch_session,
+    member,
+    put,
+    recordings,
+    refused,
+    wait_for,
+)
+from tests.trial.two_players import two_players
+from trial.core.session import PARTNER_STOPPED
+from trial.recordings.recorder import Recorder
+from trial.recordings.spool import Spool
+from trial.recordings.store import FolderStore
+from trial.server import assignment
+from trial.settings import Settings
+
+# ---- two game steps
+
+
+def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client):
+    server = launch_session(launch, GAME_STEPS="3,5")
+    form(server.store)
+
+    async def run():
+        await both_play(server)
+        async with member(server, "anna", step="5") as anna, member(server, "bert", step="5") as bert:
+            assert "another step's game" in await refused(server, open_client, 4404, **hello_of("bert", step="3"))
+            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
+            await bert.say(command="stop")
+            assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert all(answer(server.store, each, step)["answers"]["session"] == SID for each in MEMBERS for step in "35")
+
+
+def test_no_member_opens_a_later_game_step_before_their_own_answer_to_the_one_before(launch, open_client):
+    """Else a member whose client names another step would keep all the others out of theirs."""
+    server = launch_session(launch, GAME_STEPS="3,5")
+    form(server.store)
+
+    async def run():
+        early = hello_of("bert", step="5")
+        assert "an earlier game step" in await refused(server, open_client, 4404, **early)
+        await both_play(server)
+        async with member(server, "bert", step="5"):
+            pass
+
+    asyncio.run(run())
+
+
+def test_the_next_server_finds_who_has_answered_an_earlier_game_step(launch, open_client):
+    server = launch_session(launch, GAME_STEPS="3,5", SERVER="pair-2")
+    form(server.store)
+    put(server.store, "study/users/anna/answers/3.json", b'{"answers": {}}')
+
+    async def run():
+        assert "an earlier game step" in await refused(server, open_client, 4404, **hello_of("bert", step="5"))
+        async with member(server, "anna", step="5"):
+            pass
+
+    asyncio.run(run())
+
+
+# ---- what it leaves behind
+
+
+def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launch):
+    server = launch_session(launch, trial={"seed": 3})
+    form(server.store, document(group=1))
+    asyncio.run(both_play(server))
+    assert server.wait() == 0
+    anna, bert = (answer(server.store, each) for each in MEMBERS)
+    for found in (anna, bert):
+        assert (found["step"], found["page"], found["group"], found["schema"]) == ("3", "game", 1, 1)
+        assert found["answers"]["session"] == SID
+    assert (anna["answers"]["outcome"], bert["answers"]["outcome"]) == ("stopped", "partnerLeft")
+    assert anna["answers"]["player"] == "left"
+    assert bert["answers"]["player"] == "right"
+    assert bert["answers"]["score"] == bert["answers"]["scores"]["right"]
+    assert anna["answers"]["score"] == anna["answers"]["scores"]["left"]
+    (lines,) = recordings(server.store).values()
+    assert (lines[0]["sessionId"], lines[0]["session"], lines[0]["group"]) == (SID, "pair-1", 1)
+    assert "user" not in lines[0]
+
+
+def test_no_members_id_stands_in_a_line_of_a_recording_or_of_the_log(launch):
+    """If the researcher's code knows an id and fails with it, the error's words are recorded without the id."""
+    members, said = ("Participant-One", "Participant-Two"), "no Participant-Two here"
+    broken = two_players(act="pass").replace(
+        "self.t += 1", f"self.t += 1\n        if self.t == 3: raise ValueError('{said}')", 1
+    )
+    broken += f"\n\nclass Agent(Agent):\n    def on_join(self, session, player):\n        raise KeyError('{said}')\n"
+    server = launch_session(launch, agent=broken, trial={"maxEpisodes": 2})
+    form(server.store, document(members))
+
+    async def run():
+        async with member(server, members[0]) as one, member(server, members[1]) as two:
+            await one.say(command="start")
+            await two.until(lambda: two.errors)
+            await two.say(command="pause")
+            server.terminate()
+            await one.closed()
+
+    asyncio.run(run())
+    server.wait()
+    written = json.dumps(recordings(server.store))
+    assert "ValueError" in server.said()
+    for each in members:
+        assert each not in server.said()
+        assert each not in written
+    assert "(participant)" in server.said()
+    hidden = said.replace(members[1], "(participant)")
+    assert f"ValueError: {hidden}" in written
+    assert f"KeyError: '{hidden}'" in written
+
+
+def test_nothing_lies_in_a_members_folder_but_the_answer(launch):
+    server = launch_session(launch)
+    form(server.store)
+    asyncio.run(both_play(server))
+    server.wait()
+    found = {path.relative_to(server.store).as_posix() for path in server.store.rglob("*") if path.is_file()}
+    assert found == {
+        "study/users/anna/answers/3.json",
+        "study/users/bert/answers/3.json",
+        f"study/sessions/{SID}/session.json",
+        f"study/sessions/{SID}/trials/pair-1/3-episode-0001.jsonl.gz",
+    }
+
+
+def test_a_step_that_all_have_answered_is_not_played_again(launch):
+    server = launch_session(launch)
+    form(server.store)
+    asyncio.run(both_play(server))
+    assert server.wait() == 0
+    kept = {each: answer(server.store, each) for each in MEMBERS}
+    again = launch_session(launch, SERVER="pair-2", LINGER_SECONDS="4")  # the second one comes by then
+
+    async def run():
+        async with member(again, "anna") as anna, member(again, "bert") as bert:
+            assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+            assert anna.done["score"] == kept["anna"]["answers"]["score"]
+            assert bert.done["score"] == kept["bert"]["answers"]["score"]
+            assert not anna.frames
+
+    asyncio.run(run())
+    assert again.wait() == 0
+    assert {each: answer(server.store, each) for each in MEMBERS} == kept
+    assert not recordings(server.store, "pair-2")
+
+
+def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_next_one(launch):
+    """The server was lost between two answers: what is there stays, what is missing comes."""
+    server = launch_session(launch)
+    form(server.store)
+    asyncio.run(both_play(server))
+    assert server.wait() == 0
+    anna, bert = (answer(server.store, each) for each in MEMBERS)
+    (server.store / "study/users/bert/answers/3.json").unlink()
+    again = launch_session(launch, SERVER="pair-2")
+
+    async def run():
+        async with member(again, "bert") as client:
+            assert await client.closed() == 1000
+            assert client.done["score"] == bert["answers"]["score"]
+
+    asyncio.run(run())
+    assert again.wait() == 0
+    assert answer(server.store, "anna") == anna, "an answer that exists is not written again"
+    again_bert = answer(server.store, "bert")["answers"]
+    for key in ("score", "player", "session", "outcome", "frames"):
+        assert again_bert[key] == bert["answers"][key]
+
+
+def recorder_of(tmp_path, *members):
+    settings = Settings.from_env({**ENV, "STORE": str(tmp_path), "TRIAL": json.dumps(TRIAL)})
+    formed = assignment.formed(settings, Session(SID, len(members), members))
+    store = FolderStore(tmp_path)
+    return Recorder(formed, "3", "the-trial", store, Spool(formed, store)), store
+
+
+def save_answers(recorder, answers):
+    for each, said in answers.items():
+        asyncio.run(recorder.save_member(each, said))
+
+
+def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
+    recorder, _ = recorder_of(tmp_path, Member("anna", 0, 0), Member("bert", 1, 1))
+    given = {"anna": {"score": 1, "player": "left"}, "bert": {"score": 2, "player": "right"}}
+    save_answers(recorder, given)
+    found = {each: answer(tmp_path, each) for each in MEMBERS}
+    assert [found[each]["group"] for each in MEMBERS] == [0, 1]
+    assert {each: found[each]["answers"] for each in MEMBERS} == {
+        each: {**said, "session": SID} for each, said in given.items()
+    }
+    save_answers(recorder, {each: {"score": 9} for each in MEMBERS})
+    assert {each: answer(tmp_path, each) for each in MEMBERS} == found
+
+
+def test_a_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
+    recorder, _ = recorder_of(tmp_path, Member("anna", None, 0), Member("", None, 1), Member("bert", None, 2))
+    assert asyncio.run(recorder.members_answers()) == {}
+    bert = {"bert": {"score": 2, "session": SID}}
+    asyncio.run(recorder.save_member("bert", {"score": 2}))
+    assert asyncio.run(recorder.members_answers()) == bert
+    asyncio.run(recorder.save_member("anna", {"score": 1}))
+    assert asyncio.run(recorder.members_answers()) == bert | {"anna": {"score": 1, "session": SID}}
+
+
+# ---- a lost server
+
+
+def steps(lines):
+    return [line["step"] for line in lines if line["kind"] == "step"]
+
+
+def test_after_a_kill_the_next_server_goes_on_at_the_last_recorded_step_for_both(launch, tmp_path):
+    """A process that is killed leaves its recording in the spool, and the next process of that server stores it."""
+    first = launch_session(launch, trial={"seed": 3})
+    form(first.store)
+
+    async def killed():
+        async with member(first, "anna") as anna, member(first, "bert") as bert:
+            await anna.say(command="start")
+            await anna.say(action="up", lasts=None)
+            await both_see(40, anna, bert)
+            first.process.kill()
+            await asyncio.gather(anna.closed(), bert.closed())
+
+    asyncio.run(killed())
+    folder = first.store / f"study/sessions/{SID}/trials/pair-1"
+    (left,) = folder.glob("*.part")
+    left.rename(left.with_suffix(""))  # what the control plane of one machine does, and the next process of this name
+    (before,) = recordings(first.store).values()
+    assert len(steps(before)) >= 10
+    second = launch_session(launch, trial={"seed": 3}, SERVER="pair-2")
+    anna, bert = asyncio.run(both_play(second, 15))
+    assert second.wait() == 0
+    (after,) = recordings(second.store, "pair-2").values()
+    assert [line["kind"] for line in after[:2]] == ["header", "resume"]
+    assert steps(before) + steps(after) == list(range(1, len(steps(before)) + len(steps(after)) + 1))
+    total = [sum(line["players"][name]["reward"] for line in before + after if line["kind"] == "step") for name in PLAY]
+    assert [answer(first.store, each)["answers"]["score"] for each in MEMBERS] == total
+    assert (anna.errors, bert.errors) == ([], [PARTNER_STOPPED])
+
+
+PLAY = ("left", "right")
+
+
+def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_process_stores(launch):
+    first = launch_session(launch)
+    form(first.store)
+
+    async def killed():
+        async with member(first, "anna") as anna, member(first, "bert") as bert:
+            await anna.say(command="start")
+            await both_see(30, anna, bert)
+            first.process.kill()
+
+    asyncio.run(killed())
+    again = launch_session(launch)
+    folder = first.store / f"study/sessions/{SID}/trials/pair-1"
+    wait_for(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")))
+    (lines,) = recordings(again.store).values()
+    assert steps(lines)
+
+
+# ---- what the researcher's code sees
+
+
+REPORTING = """
+import os, json
+NAMES = ("USER_ID", "GROUP", "SESSION", "TOKEN")
+def told():
+    return {name: os.environ.get(name) for name in NAMES}
+_first = told()
+class Reporting(Agent):
+    def reset(self, seed=None):
+        seen, infos = super().reset(seed)
+        return seen, {"left": {"first": _first, "now": told()}, "right": {}}
+Agent = Reporting
+"""
+
+
+@pytest.mark.parametrize("group", [None, 2])
+def test_the_agent_sees_the_session_and_its_group_and_no_participants_id(launch, group):
+    agent = two_players() + REPORTING
+    server = launch_session(launch, agent=agent, trial={})
+    form(server.store, document(group=group))
+    asyncio.run(both_play(server))
+    server.wait()
+    (lines,) = recordings(server.store).values()
+    reset = next(line for line in lines if line["kind"] == "reset")
+    found = json.dumps(reset)
+    now = {"USER_ID": None, "GROUP": "" if group is None else str(group), "SESSION": SID, "TOKEN": None}
+    assert json.dumps(now, separators=(",", ":")) in found.replace(", ", ",").replace(": ", ":")
+    assert '"USER_ID": "' not in found

@@ -1,0 +1,315 @@
+"""The server of a session that is not formed yet: who has to wait, for how long, and what a warm one becomes."""
+
+import asyncio
+import contextlib
+import json
+import time
+
+import pytest
+from websockets.asyncio.client import connect
+
+from protocol.handover import Handover
+from protocol.keys import handover_key
+from protocol.session import Session
+from tests.trial.sessions import (
+    ENV,
+    MEMBERS,
+    SID,
+    TOKEN,
+    TRIAL,
+    answer,
+    both_play,
+    document,
+    form,
+    hello_of,
+    launch_session,
+    member,
+    put,
+    recordings,
+    refused,
+    wait_for,
+)
+from tests.trial.two_players import two_players
+from trial.server import assignment, handshake
+from trial.server.server import Server
+from trial.settings import Settings, SettingsError
+
+WARM = {"SESSION": "", "SPARE": "on", "SERVER": "warm-1"}
+
+
+# ---- before the session is formed
+
+
+def test_nobody_gets_in_before_the_session_is_formed(launch, open_client):
+    server = launch_session(launch)
+
+    async def everybody():
+        assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
+        await refused(server, open_client, 1013, **hello_of("stranger"))
+        await refused(server, open_client, token="wrong", userId="anna")
+
+    asyncio.run(everybody())
+    assert server.process.poll() is None
+    assert not server.store.exists(), "nothing is recorded"
+
+
+def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_formed(launch, open_client):
+    server = launch_session(launch)
+
+    async def run():
+        await refused(server, open_client, 1013, **hello_of("anna"))
+        form(server.store)
+        async with member(server, "anna") as client:
+            assert client.controls["player"] == "left"
+
+    asyncio.run(run())
+
+
+def test_the_server_looks_for_the_session_by_itself(launch):
+    server = launch_session(launch, SPARE_SECONDS="0.1")
+    form(server.store)
+    wait_for(lambda: "the members of the session are known now: 2 of 2" in server.said())
+
+
+def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
+    server = launch_session(launch, IDLE_SECONDS="0", GRACE_SECONDS="0", DEADLINE=str(time.time() + 3))
+    assert server.wait() == 0
+    assert "ending: deadline" in server.said()
+    assert "idle" not in server.said()
+
+
+def test_a_session_whose_members_never_come_ends_the_server(launch):
+    server = launch_session(launch, SPARE_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
+    form(server.store)
+    assert server.wait() == 0
+    assert "ending: idle" in server.said()
+
+
+def test_a_member_who_comes_while_the_server_still_looks_for_old_recordings_is_not_sent_away(
+    tmp_path, open_client, monkeypatch, capsys
+):
+    (tmp_path / "agent.py").write_text(two_players())
+    env = {**ENV, "STORE": str(tmp_path / "store"), "AGENT_DIR": str(tmp_path), "PORT": "0", "HOST": "127.0.0.1"}
+    server, looks = Server(Settings.from_env({**env, "TRIAL": json.dumps(TRIAL)})), asyncio.Event()
+    form(tmp_path / "store")
+
+    async def slowly(settings):
+        await looks.wait()
+        return []
+
+    monkeypatch.setattr(server, "_leftovers", slowly)
+    monkeypatch.setattr("trial.server.server.set_environment", lambda *told: None)  # it would be that of the tests
+
+    async def run():
+        serving = asyncio.create_task(server.run())
+        while not (said := capsys.readouterr().out):
+            await asyncio.sleep(0.01)
+        async with open_client(f"ws://127.0.0.1:{json.loads(said)['port']}/") as client:
+            await client.hello(**hello_of("anna"))
+            await client.watch(0.3)
+            looks.set()
+            await client.until(lambda: client.controls)
+        server.end("enough")
+        assert await serving == 0
+
+    monkeypatch.setattr("trial.server.server.exit_hard_after", lambda seconds: None)
+    asyncio.run(run())
+
+
+THIRD = """
+import sys
+
+
+class Third(Partner):
+    def __init__(self):
+        print("the third player's policy is made", file=sys.stderr, flush=True)
+
+
+class Trio(Agent):
+    possible_agents = ["left", "right", "third"]
+
+    def step(self, actions):
+        seen, rewards, *rest = super().step(actions)
+        return seen, {**rewards, "third": 0.0}, *rest
+
+
+Agent = Trio
+"""
+
+
+def test_policies_of_each_group_are_there_before_the_group_is_known(launch):
+    players = {"left": "human", "right": "human"}
+    groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
+    server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
+    wait_for(lambda: "the agent is ready" in server.said())
+    assert "the third player's policy is made" in server.said()
+    form(server.store, document(group=1))
+    asyncio.run(both_play(server))
+    assert server.wait() == 0
+    assert server.said().count("the third player's policy is made") == 1
+    (lines,) = recordings(server.store).values()
+    assert lines[0]["players"]["third"]["policy"] == "agent:Third"
+
+
+# ---- a document that is wrong
+
+
+BAD = {
+    "nothing": b"",
+    "no JSON": b"{",
+    "another session": document(sid="s.aaaaaaaaaaaaaaaaaaaa").to_json(),
+    "a later version": json.dumps({**json.loads(document().to_json()), "schema": 2}).encode(),
+    "nobody": Session(SID, 2, ()).to_json(),
+    "one seat twice": document().to_json().replace(b'"seat": 1', b'"seat": 0'),
+    "a seat that is none": document().to_json().replace(b'"seat": 1', b'"seat": 2'),
+    "one member twice": document(("anna", "anna")).to_json(),
+    "an id that is none": document(("anna", "../bert")).to_json(),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_document_that_is_no_session_of_this_server_lets_nobody_in(name):
+    settings = Settings.from_env(ENV)
+    with pytest.raises(ValueError, match="its document"):
+        assignment._read(settings, BAD[name])
+
+
+def test_a_bad_document_is_said_once_and_a_good_one_is_taken_later(launch, open_client):
+    server = launch_session(launch)
+    put(server.store, f"study/sessions/{SID}/session.json", BAD["one seat twice"])
+
+    async def run():
+        for _ in range(2):
+            await refused(server, open_client, 1013, **hello_of("anna"))
+        assert server.said().count("cannot see whose this server is") == 1
+        form(server.store)
+        async with member(server, "anna"):
+            pass
+
+    asyncio.run(run())
+    assert "anna" not in server.said()
+
+
+# ---- warm servers
+
+
+def test_a_warm_server_that_is_handed_to_a_session_is_that_sessions(launch, open_client):
+    server = launch_session(launch, **WARM)
+
+    async def run():
+        await refused(server, open_client, 1013, **hello_of("anna"))
+        put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
+        assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
+        await refused(server, open_client, userId="anna", token=TOKEN)
+        form(server.store)
+        await refused(server, open_client, **hello_of("carl"))
+        await both_play(server)
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert "this server is assigned to a session now" in server.said()
+    assert {answer(server.store, each)["answers"]["session"] for each in MEMBERS} == {SID}
+    assert recordings(server.store)
+
+
+def test_a_warm_server_that_is_handed_to_a_participant_takes_no_member_token(launch, open_client):
+    server = launch(trial={}, **{**WARM, "SESSION": "", "SPARE_SECONDS": "60", "USER_ID": ""})
+
+    async def run():
+        await refused(server, open_client, 1013, **hello_of("P1"))
+        put(server.store, handover_key("study", "warm-1"), Handover("P1", None, "a-1").to_json())
+        await refused(server, open_client, **hello_of("P1"))
+        async with open_client(server.address) as client:
+            await client.play()
+
+    asyncio.run(run())
+
+
+def test_an_idle_time_begins_when_the_session_is_formed_not_at_the_handover(launch):
+    server = launch_session(launch, **WARM, IDLE_SECONDS="1", GRACE_SECONDS="1")
+    time.sleep(0.5)
+    put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
+    asyncio.run(ask(server))
+    wait_for(lambda: "assigned to a session now" in server.said())
+    time.sleep(1.5)
+    assert server.process.poll() is None
+    form(server.store)
+    asyncio.run(ask(server))
+    assert server.wait() == 0
+    assert "ending: idle" in server.said()
+
+
+async def ask(server):
+    """Make the server look, as a member whose page shows their token."""
+    async with connect(server.address, subprotocols=["hippodrome.3"], proxy=None) as websocket:
+        await websocket.send(json.dumps(hello_of("anna")))
+        with contextlib.suppress(Exception):
+            await websocket.recv()
+
+
+# ---- how long it stays
+
+
+def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(launch):
+    server = launch_session(launch, IDLE_SECONDS="1", GRACE_SECONDS="1")
+
+    async def run():
+        async with member(server, "anna", forms=True):
+            async with member(server, "bert"):
+                pass
+            await asyncio.sleep(2)
+            assert server.process.poll() is None
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert "ending: idle" in server.said()
+
+
+def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_them_for_gather_seconds(launch):
+    server = launch_session(launch, trial={"gather": 300}, IDLE_SECONDS="1", GRACE_SECONDS="1")
+
+    async def run():
+        async with member(server, "anna", forms=True) as anna:
+            assert anna.controls["people"] == {"left": "here", "right": "awaited"}
+
+    asyncio.run(run())
+    assert server.wait() == 0
+    assert "ending: idle" in server.said()
+
+
+# ---- its environment
+
+
+def test_the_settings_of_a_session():
+    settings = Settings.from_env({**ENV, "USER_ID": "", "GROUP": "7", "PLAIN_ORIGINS": "https://a.example"})
+    assert (settings.session, settings.user_id, settings.group, settings.assigned) == (SID, "", None, False)
+    assert settings.plain_origins == frozenset()
+    assert settings.private == ()
+    formed = assignment.formed(settings, document(("anna", "", "carl"), players=4, group=2))
+    assert formed.assigned
+    assert (formed.players, formed.group) == (4, 2)
+    assert formed.seats == {"anna": 0, "carl": 2}
+    assert formed.private == ("anna", "carl")
+    assert formed.recordings_folder == f"study/sessions/{SID}/trials/pair-1"
+
+
+def test_a_handed_over_session_has_the_settings_of_a_session_that_was_started_for_it():
+    warm = Settings.from_env({**ENV, **WARM})
+    assert not warm.assigned
+    given = assignment.assigned(warm, Handover(SID, None, "pair-1"))
+    assert given == Settings.from_env(ENV)
+
+
+@pytest.mark.parametrize("bad", ["s.", "s.0123456789ABCDEF0123", "anna", SID + "0", f"{SID}/.."])
+def test_a_session_that_is_none_is_refused(bad):
+    with pytest.raises(SettingsError, match="SESSION"):
+        Settings.from_env({**ENV, "SESSION": bad})
+
+
+def test_without_a_session_nothing_of_it_is_there():
+    settings = Settings.from_env({**ENV, "SESSION": "", "USER_ID": "P1"})
+    assert (settings.session, settings.members, settings.seats, settings.players) == ("", (), {}, 1)
+    assert settings.assigned
+    assert settings.private == ("P1",)
+    assert settings.recordings_folder == "study/users/P1/trials/pair-1"
+    assert handshake.tokens_for(settings, "P1") == (TOKEN,)
