@@ -162,7 +162,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "trial/core/trial.py": ("trial/test_trial_decisions",),
     "trial/core/records.py": ("trial/test_trial_decisions",),
     "trial/core/recording.py": ("trial/test_trial_decisions",),
-    "trial/core/alone.py": ("trial/test_trial_decisions",),
+    "trial/core/participants.py": ("trial/test_trial_decisions",),
     "trial/core/beginning.py": ("trial/test_trial_decisions",),
     "trial/core/steps.py": ("trial/test_trial_decisions",),
     "trial/core/ending.py": ("trial/test_trial_decisions",),

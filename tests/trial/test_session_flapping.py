@@ -40,7 +40,7 @@ def test_the_others_play_on_with_a_policy_while_one_comes_and_goes(gone: float, 
 
 def test_a_page_that_stops_and_goes_on_all_the_time_is_no_better() -> None:
     driver = SessionDriver(absent=10).begin().wait(60)
-    session, since = driver.trial._session, driver.now
+    session, since = driver.trial._participants, driver.now
     assert session is not None
     while driver.now - since < 600 and not driver.trial.progress.over:
         session.stalls("left", driver.now)

@@ -69,7 +69,7 @@ def test_only_a_message_that_says_so_shows_a_hidden_page_again() -> None:
 
 def test_a_hidden_page_that_stops_answering_and_answers_again_is_still_hidden() -> None:
     driver = SessionDriver().begin().wait(1).say(1, hidden=True)
-    session = driver.trial._session
+    session = driver.trial._participants
     assert session is not None
     session.stalls("right", driver.now)
     session.answers_again("right", driver.now)

@@ -166,7 +166,7 @@ class Machine(RuleBasedStateMachine):
         self.keys.pop(number, None)
         how(number)
         if left:
-            self.allowed[number] = self.driver.trial._session.presence.time_left(self.player(number))
+            self.allowed[number] = self.driver.trial._participants.presence.time_left(self.player(number))
             assert 0 <= self.allowed[number] <= ABSENT
 
     @rule(number=NUMBERS, key=st.sampled_from(["up", "right"]))

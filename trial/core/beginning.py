@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from trial.core.alone import Alone
 from trial.core.effects import Call, Effect, RecordLine, ReplayCall, Replayed, ResetCall, ResetPolicy
 from trial.core.message_log import MessageLog
+from trial.core.participants import Participants
 from trial.core.policies import Observed
 from trial.core.progress import Progress
 from trial.core.recording import Recording
 from trial.core.seeds import policy_seed
-from trial.core.session import Session
 from trial.core.timing import Timing
 from trial.core.unfinished import UnfinishedEpisode
 from trial.settings import Settings
@@ -42,13 +41,13 @@ class Beginning:
         self.begun_again: int | None = None
         """This episode begins anew, because it could not be replayed."""
 
-    def begin(self, progress: Progress, session: Alone | Session) -> Call | None:
+    def begin(self, progress: Progress, participants: Participants) -> Call | None:
         """The call that begins the next episode; None: a recording is to be opened before."""
         self._timing.begin_episode()  # what pages are told before the reset is the new episode's time
         unfinished = self.unfinished
         self._seed = self._next_seed(progress) if unfinished is None or unfinished.seed is None else unfinished.seed
         if self._recording.is_open:
-            return self._reset(progress, session)
+            return self._reset(progress, participants)
         self._recording.ask(progress, self._seed)
         return None
 
@@ -56,7 +55,7 @@ class Beginning:
         first = self._settings.trial.seed
         return self._new_seed() if first is None else first + progress.episode - 1
 
-    def opened(self, progress: Progress, session: Alone | Session, ns: int) -> Call:
+    def opened(self, progress: Progress, participants: Participants, ns: int) -> Call:
         """The call that begins the episode now that its recording is open. `ns` is the time, for messages."""
         unfinished, self.unfinished = self.unfinished, None
         if unfinished is not None and unfinished.steps:
@@ -65,14 +64,14 @@ class Beginning:
             return ReplayCall(limit=self._settings.start_seconds, unfinished=unfinished, default_actions=default)
         if unfinished is not None:
             self.repeat_feedback(unfinished, ns)
-        return self._reset(progress, session)
+        return self._reset(progress, participants)
 
-    def begin_again(self, progress: Progress, session: Alone | Session) -> Call:
+    def begin_again(self, progress: Progress, participants: Participants) -> Call:
         """The call that begins an episode anew that could not be replayed."""
         self.begun_again = progress.episode
-        return self._reset(progress, session)
+        return self._reset(progress, participants)
 
-    def _reset(self, progress: Progress, session: Alone | Session) -> Call:
+    def _reset(self, progress: Progress, participants: Participants) -> Call:
         progress.choices.begins(self._seed)
         self._reset_policies(progress, {})
         return ResetCall(
@@ -80,7 +79,7 @@ class Beginning:
             episode=progress.episode,
             seed=self._seed,
             asked=frozenset(player.name for player in progress.choices.policies.asked),
-            fields=session.of_reset(),
+            fields=participants.of_reset(),
         )
 
     def _reset_policies(self, progress: Progress, observed: Mapping[str, Sequence[Observed]]) -> None:

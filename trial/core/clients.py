@@ -8,11 +8,10 @@ from typing import Any
 
 from protocol.trial import Trial
 from trial.core import messages
-from trial.core.alone import Alone
 from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
+from trial.core.participants import Participants
 from trial.core.progress import Progress
-from trial.core.session import Session
 from trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
@@ -87,14 +86,14 @@ class Clients:
             if words is not None:
                 self.send(client, messages.error(words))
 
-    def send_controls(self, client: Client, progress: Progress, session: Alone | Session, now: float) -> None:
+    def send_controls(self, client: Client, progress: Progress, participants: Participants, now: float) -> None:
         """Tell a client all of the game and of its controls."""
-        times = self._timing.told(progress, now, session.told(now))
+        times = self._timing.told(progress, now, participants.told(now))
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
-    def send_state(self, progress: Progress, session: Alone | Session, now: float) -> None:
+    def send_state(self, progress: Progress, participants: Participants, now: float) -> None:
         """Send the state to each client that was last sent another one, with the seconds that are left of all times."""
-        progress.told = session.state()
+        progress.told = participants.state()
         for client in self._by_human.values():
             player = client.player
             state = state_of(progress, player)
@@ -103,7 +102,7 @@ class Clients:
             client.sent = state
             times = None
             if self._timed or progress.on_break or progress.told is not None:
-                times = self._timing.told(progress, now, session.told(now))
+                times = self._timing.told(progress, now, participants.told(now))
             text = messages.state(
                 progress.state.value,
                 progress.episode,

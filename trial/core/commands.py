@@ -7,13 +7,12 @@ from collections.abc import Collection
 
 from protocol.trial import Trial
 from trial.core import messages
-from trial.core.alone import Alone
 from trial.core.clients import Client, Clients
 from trial.core.controls import ARROWS, KEY
 from trial.core.message_log import MessageLog
 from trial.core.messages import CommandRefused, Message
+from trial.core.participants import Alone, Participants
 from trial.core.progress import Progress
-from trial.core.session import Session
 from trial.core.timing import Timing
 
 ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
@@ -36,21 +35,21 @@ class Commands:
         """The server must end: commands do nothing any more."""
 
     def receive(
-        self, client: Client, message: Message, progress: Progress, session: Alone | Session, now: float
+        self, client: Client, message: Message, progress: Progress, participants: Participants, now: float
     ) -> None:
         """Record a client's message and do what it asks for. If that is refused, tell the client why."""
         try:
-            self._check(message, progress, session)
-            self._message_log.add(message, int(now * 1e9), session.name_of(client.player))
+            self._check(message, progress, participants)
+            self._message_log.add(message, int(now * 1e9), participants.name_of(client.player))
             if message.command == "requestUI":
-                self._clients.send_controls(client, progress, session, now)
-            self._carry_out(message, client.player, progress, session, now)
+                self._clients.send_controls(client, progress, participants, now)
+            self._carry_out(message, client.player, progress, participants, now)
         except CommandRefused as refused:
             self._clients.send(client, messages.error(str(refused)))
 
-    def _check(self, message: Message, progress: Progress, session: Alone | Session) -> None:
+    def _check(self, message: Message, progress: Progress, participants: Participants) -> None:
         """Raise CommandRefused if the project does not offer what is asked for. Then nothing of it is recorded."""
-        if message.hidden is not None and isinstance(session, Alone):
+        if message.hidden is not None and isinstance(participants, Alone):
             raise CommandRefused("unknown field 'hidden'")
         if message.frame_rate is not None and not self._config.allow_frame_rate_change:
             raise CommandRefused("the frame rate of this game is fixed")
@@ -61,11 +60,11 @@ class Commands:
             raise CommandRefused("the game is over, and no command has an effect any more")
 
     def _carry_out(
-        self, message: Message, player: str, progress: Progress, session: Alone | Session, now: float
+        self, message: Message, player: str, progress: Progress, participants: Participants, now: float
     ) -> None:
         """Do what the human who plays `player` asks for. Raises CommandRefused if it is not possible now."""
         if message.command is not None and not self.closed:
-            self._command(message.command, player, session, now)
+            self._command(message.command, player, participants, now)
         if message.frame_rate is not None:
             progress.change_frame_rate(message.frame_rate)
         if message.action is not None:
@@ -73,24 +72,24 @@ class Commands:
         if message.key is not None:
             progress.act(KEY + message.key, message.held, player=player)
 
-    def _command(self, command: str, player: str, session: Alone | Session, now: float) -> None:
+    def _command(self, command: str, player: str, participants: Participants, now: float) -> None:
         if command == "start":
-            session.start(player, now)
+            participants.start(player, now)
         elif command == "pause":
-            session.pause(now)
+            participants.pause(now)
         elif command in ("reset", "stop") and command not in self.waiting:
             self.waiting.append(command)
             if command == "stop":
-                session.stop(player)
+                participants.stop(player)
 
-    def carry_out_waiting(self, progress: Progress, session: Alone | Session, timing: Timing) -> None:
+    def carry_out_waiting(self, progress: Progress, participants: Participants, timing: Timing) -> None:
         """No step is being taken: do what has waited for that."""
         commands, self.waiting = self.waiting, []
         for command in commands:
             timing.skip()
             if command == "stop":
                 progress.stop()
-                session.stopped()
+                participants.stopped()
             else:
                 progress.reset()
 

@@ -6,13 +6,12 @@ import logging
 from collections.abc import Callable
 
 from trial.core import records
-from trial.core.alone import Alone
 from trial.core.effects import Effect, FeedbackCall, Log
 from trial.core.ended import Break, Episode
 from trial.core.message_log import MessageLog
+from trial.core.participants import Participants
 from trial.core.progress import Progress
 from trial.core.recording import Recording
-from trial.core.session import Session
 from trial.core.timing import Timing
 from trial.settings import Settings
 
@@ -53,19 +52,19 @@ class Ending:
             last=progress.over and len(progress.ended) == 1,
         )
 
-    def record(self, call: FeedbackCall, progress: Progress, session: Alone | Session) -> None:
+    def record(self, call: FeedbackCall, progress: Progress, participants: Participants) -> None:
         """Record the end of the first episode or break that is over, with the messages before this call."""
         over = progress.ended.pop(0)
         if isinstance(over, Episode):
             for player, late in progress.choices.policies.late().items():
                 self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
-        outcomes = session.outcomes() if progress.over and not progress.ended else None
+        outcomes = participants.outcomes() if progress.over and not progress.ended else None
         self._emit(records.end(over, self._message_log.messages[: call.messages], outcomes))
         self._message_log.recorded(call.messages, len(call.feedback))
         # The break after an episode belongs to its file.
         more = isinstance(progress.ended[0], Break) if progress.ended else progress.on_break
         if self._settings.trial.data_file == "episode" and not more:
-            self._close_recording(session)
+            self._close_recording(participants)
 
     def shut_down_break(self, progress: Progress) -> None:
         """If the server must end in a break, it ends the break."""
@@ -73,14 +72,14 @@ class Ending:
             self._break_shut_down = True
             progress.ended.append(Break(progress.episode, "shutdown"))
 
-    def write_last(self, progress: Progress, session: Alone | Session, *, broken: bool) -> None:
+    def write_last(self, progress: Progress, participants: Participants, *, broken: bool) -> None:
         """Write the last lines, and give the answer to the store; none if the game was `broken`, or is not over."""
         self.all_written = True
         if self.closing and not progress.over and not progress.on_break:
             self._emit(records.shutdown(progress, self._message_log.messages))
-        self._close_recording(session)
-        self._emit(session.answer(self._timing.seconds, played=progress.over and not broken))
+        self._close_recording(participants)
+        self._emit(participants.answer(self._timing.seconds, played=progress.over and not broken))
 
-    def _close_recording(self, session: Alone | Session) -> None:
-        session.write_lines()
+    def _close_recording(self, participants: Participants) -> None:
+        participants.write_lines()
         self._recording.close()

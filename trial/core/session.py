@@ -1,4 +1,4 @@
-"""A trial that several participants play: a session. It decides what `trial/core/alone.py` decides if one does.
+"""A trial that several participants play: a session. `Alone` (`trial/core/participants.py`) decides the same for one.
 
 `Presence` knows who is here, and for how long the others wait. This brings the trial's progress into line with it: the
 game begins and goes on with all members, is held while one is missing, and then ends for all, or goes on with

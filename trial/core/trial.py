@@ -27,7 +27,7 @@ This module decides what comes next and whom each event concerns. What the parts
   timing, episode_time                   when a step, a turn, a break or an episode is over
   commands                               what a client may ask for, what that does, and what a refused client is told
   agent_call                             the one call that the agent has
-  alone, session, presence               who is here, and what follows: of one participant, or of several
+  participants, session, presence        who is here, and what follows: of one participant, or of several
   beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
   recording, records, message_log        what is recorded and answered
   clients, messages                      what clients are told
@@ -45,7 +45,6 @@ from typing import Any, Literal
 
 from trial.core import messages, records
 from trial.core.agent_call import AgentCall
-from trial.core.alone import Alone
 from trial.core.beginning import Beginning
 from trial.core.clients import Client, Clients, state_of
 from trial.core.commands import Commands
@@ -63,6 +62,7 @@ from trial.core.effects import (
 from trial.core.ending import LAST_CALL_SECONDS, Ending
 from trial.core.flow_control import Window
 from trial.core.message_log import MessageLog
+from trial.core.participants import Alone, Participants
 from trial.core.players import Player, alone
 from trial.core.progress import Progress
 from trial.core.recording import Recording, words_of
@@ -125,7 +125,7 @@ class Trial:
         )
         self._steps = Steps(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
         self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
-        self._session: Alone | Session = Alone(self.progress, trial_id)
+        self._participants: Participants = Alone(self.progress, trial_id)
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._closing = False
@@ -195,7 +195,7 @@ class Trial:
         self.phase = Phase.PLAYING
         self.progress = Progress(self.config, players)
         if places:
-            self._session = Session(
+            self._participants = Session(
                 self.config,
                 self.progress,
                 places,
@@ -209,7 +209,7 @@ class Trial:
                 emit=self._emit,
             )
         else:
-            self._session = Alone(self.progress, self.id)
+            self._participants = Alone(self.progress, self.id)
         if recorded is not None:
             self.progress.resume(recorded.ended)
             self._beginning.unfinished = recorded.unfinished
@@ -227,23 +227,24 @@ class Trial:
         replaced = self._clients.replace(human)
         if replaced is not None:
             self._left(replaced)
-        session, player = self._session, self._session.place_of(human)
+        participants = self._participants
+        player = participants.place_of(human)
         client = self._clients.add(human, connection, window, player)
         self._note("connected", client)
         if self.finished:
             self._send_done(human, client)
             return self._take_effects()
-        session.come(player, now)
+        participants.come(player, now)
         self._tell_moved("on_return" if player in self._met else "on_join", player)
         self._met.add(player)
-        self._clients.send_controls(client, self.progress, session, now)
+        self._clients.send_controls(client, self.progress, participants, now)
         client.sent = state_of(self.progress, player)
-        words = session.sentence(player) or self._failed_words
+        words = participants.sentence(player) or self._failed_words
         if words is None and self._beginning.begun_again == self.progress.episode and not self.progress.steps:
             words = EPISODE_BEGINS_AGAIN
         if words is not None:
             self._clients.send(client, messages.error(words))
-        if session.has_answered(human):
+        if participants.has_answered(human):
             self._send_done(human, client)
         self._clients.show_again(client)
         return self.advance(now)
@@ -262,16 +263,16 @@ class Trial:
         self._now = now
         if self.phase is not Phase.PLAYING:
             return []
-        self._session.round_trip(self._session.place_of(human), seconds, now)
+        self._participants.round_trip(self._participants.place_of(human), seconds, now)
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
         """A client's message. One from a connection that was replaced changes nothing."""
         self._now = now
         client = self._clients.of(connection)
-        if client is None or not self._session.receive(client.player, message, client.window, now):
+        if client is None or not self._participants.receive(client.player, message, client.window, now):
             return []
-        self._commands.receive(client, message, self.progress, self._session, now)
+        self._commands.receive(client, message, self.progress, self._participants, now)
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
@@ -294,7 +295,7 @@ class Trial:
         if isinstance(call, StepCall):
             self._steps.taken(call, result, self.progress, now)
         elif isinstance(call, FeedbackCall):
-            self._ending.record(call, self.progress, self._session)
+            self._ending.record(call, self.progress, self._participants)
         elif isinstance(call, ReplayCall):
             self._replayed(call.unfinished, result)
         else:
@@ -312,12 +313,12 @@ class Trial:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
             self._emit(Log(logging.WARNING, text))
-            self._agent.make(self._beginning.begin_again(self.progress, self._session))
+            self._agent.make(self._beginning.begin_again(self.progress, self._participants))
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
             self._recording.agent_failed(error, records.number(self.progress.ended[0]), self.progress.steps)
             if hangs:
                 self._fail(fatal=True)
-            self._ending.record(call, self.progress, self._session)
+            self._ending.record(call, self.progress, self._participants)
         else:
             if isinstance(call, StepCall):
                 self._messages.heard(call.heard)  # the messages stay, for the line that ends the episode
@@ -351,7 +352,7 @@ class Trial:
         """The recording that was asked for is open."""
         self._now = now
         self._recording.opened()
-        self._agent.make(self._beginning.opened(self.progress, self._session, self._ns()))
+        self._agent.make(self._beginning.opened(self.progress, self._participants, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
@@ -369,7 +370,7 @@ class Trial:
             return []
         self.phase = Phase.FINISHED
         for human, client in self._clients.by_human():
-            if not self._session.has_answered(human):
+            if not self._participants.has_answered(human):
                 self._send_done(human, client)
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
         return [Log(logging.INFO, text), *self._take_effects()]
@@ -377,7 +378,7 @@ class Trial:
     def member_saved(self, human: str, now: float) -> list[Effect]:
         """The member's answer is stored: they go on, whatever the others do, or wait for."""
         self._now = now
-        self._session.saved(human)
+        self._participants.saved(human)
         for each, client in self._clients.by_human():
             if each == human and not self.finished:
                 self._send_done(human, client)
@@ -395,11 +396,11 @@ class Trial:
         if self._agent.call is not None:
             self.wake_at = self._agent.give_up_at
         elif self.phase is Phase.PLAYING and not self._closing:
-            wake_at = self._session.wake_at(now)
+            wake_at = self._participants.wake_at(now)
             if wake_at is not None:
                 self.wake_at = wake_at if self.wake_at is None else min(wake_at, self.wake_at)
         if not self.finished:
-            self._clients.send_state(self.progress, self._session, now)
+            self._clients.send_state(self.progress, self._participants, now)
         return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
@@ -424,9 +425,9 @@ class Trial:
     def _play(self) -> bool:
         progress = self.progress
         if not self._closing:
-            self._session.attend(self._now, self._timing.seconds)
+            self._participants.attend(self._now, self._timing.seconds)
             if self._commands.waiting:
-                self._commands.carry_out_waiting(progress, self._session, self._timing)
+                self._commands.carry_out_waiting(progress, self._participants, self._timing)
             if progress.ended:
                 return self._write_end()
         if progress.over or self._closing:
@@ -440,7 +441,7 @@ class Trial:
             self._agent.make(self._steps.take(progress, self._now))
             return False
         if due is Due.RESET:
-            call = self._beginning.begin(progress, self._session)
+            call = self._beginning.begin(progress, self._participants)
             if call is not None:
                 self._agent.make(call)
         elif due is Due.NOTHING:
@@ -457,7 +458,9 @@ class Trial:
 
     def _paused_by_stalled(self) -> bool:
         """Pause if a page has stopped answering; return whether one has."""
-        stalled = [each for each in self._clients.stalled(self._now) if self._session.stalls(each.player, self._now)]
+        stalled = [
+            each for each in self._clients.stalled(self._now) if self._participants.stalls(each.player, self._now)
+        ]
         for client in stalled:
             self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering", client)
@@ -469,14 +472,14 @@ class Trial:
         if (call.feedback or self.callbacks) and not self._agent.hangs:
             self._agent.make(call)
             return False
-        self._ending.record(call, self.progress, self._session)
+        self._ending.record(call, self.progress, self._participants)
         return True
 
     def _write_last_lines(self) -> bool:
         self._ending.shut_down_break(self.progress)
         if self.progress.ended:
             return self._write_end()
-        self._ending.write_last(self.progress, self._session, broken=self.broken)
+        self._ending.write_last(self.progress, self._participants, broken=self.broken)
         return False
 
     def _fail(self, *, fatal: bool) -> None:
@@ -490,7 +493,7 @@ class Trial:
 
     def _left(self, client: Client) -> None:
         self._note("disconnected", client)
-        self._session.go(client.player, self._now, closing=self._closing)
+        self._participants.go(client.player, self._now, closing=self._closing)
         self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
@@ -499,7 +502,7 @@ class Trial:
 
     def _note(self, event: str, client: Client) -> None:
         """Keep for the recording an event that no message reports."""
-        self._messages.note(event, self._ns(), self._session.name_of(client.player))
+        self._messages.note(event, self._ns(), self._participants.name_of(client.player))
 
     def _ns(self) -> int:
         return int(self._now * 1e9)
@@ -508,7 +511,7 @@ class Trial:
         """Tell a client that the trial is over, as the answer says: an earlier server's, or this one's."""
         answers = self._earlier_answers
         if answers is None:
-            answers = self._session.answer_of(human)
+            answers = self._participants.answer_of(human)
         elif self.settings.session:
             answers = answers.get(human)
         result = records.result(self.progress, client.player, answers, in_session=bool(self.settings.session))

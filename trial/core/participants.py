@@ -1,4 +1,7 @@
-"""A trial that one participant plays. It decides what `trial/core/session.py` decides if several do: same calls."""
+"""Who takes part in a trial, and what follows from it: one participant alone, or the members of a session.
+
+`Alone` is for one participant, `Session` (`trial/core/session.py`) for several. Both have the same calls.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from trial.core.effects import SaveAnswer
 from trial.core.flow_control import Window
 from trial.core.messages import Message
 from trial.core.progress import Progress
+from trial.core.session import Session
 
 
 class Alone:
@@ -113,3 +117,7 @@ class Alone:
     def answer_of(self, human: str) -> Mapping[str, Any] | None:
         """A member's own answer, once there is one."""
         return None
+
+
+Participants = Alone | Session
+"""Those of one trial, however many they are."""
