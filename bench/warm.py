@@ -87,10 +87,10 @@ def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends
     )
 
 
-def hour_of_arrivals(seconds: float = HOUR) -> list[float]:
+def hour_of_arrivals() -> list[float]:
     """When participants come who come one after the other."""
     chance, found = random.Random(SEED), [OPENS]
-    while found[-1] < OPENS + seconds:
+    while found[-1] < OPENS + HOUR:
         found.append(found[-1] + chance.uniform(*GAPS))
     return found
 

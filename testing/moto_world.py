@@ -76,12 +76,11 @@ class MotoWorld:
     def __init__(
         self,
         region: str = "us-east-1",
-        root_domain: str = "example.org",
         raw_delivery: bool = True,
         enforce: bool = True,
     ) -> None:
         self.region = region
-        self.root_domain = root_domain
+        self.root_domain = "example.org"
         self.raw_delivery = raw_delivery
         self.calls: list[Call] = []
         self.in_sync = True  # False: Route 53 answers PENDING to every GetChange

@@ -39,18 +39,18 @@ def save(
     return file
 
 
-def linear(file: Path, weights: Any, *, name: str = "obs", shape: Shape | None = None, output: str = "output") -> Path:
+def linear(file: Path, weights: Any, *, shape: Shape | None = None) -> Path:
     """`output = obs @ weights`: one column of weights for each action."""
     matrix = np.asarray(weights, np.float32)
     sizes = shape or ("batch", matrix.shape[0])
-    flat = helper.make_node("Reshape", [name, "rows"], ["flat"])
-    product = helper.make_node("MatMul", ["flat", "weights"], [output])
+    flat = helper.make_node("Reshape", ["obs", "rows"], ["flat"])
+    product = helper.make_node("MatMul", ["flat", "weights"], ["output"])
     rows = np.array([-1, matrix.shape[0]], np.int64)
     return save(
         file,
         [flat, product],
-        [(name, sizes)],
-        [(output, ("batch", matrix.shape[1]))],
+        [("obs", sizes)],
+        [("output", ("batch", matrix.shape[1]))],
         {"weights": matrix, "rows": rows},
     )
 

@@ -70,13 +70,13 @@ class Browser:
 class Program:
     """A front end of its own: it reads JSON, and posts a JSON object."""
 
-    def __init__(self, platform: FakePlatform, user: str = "alice") -> None:
-        self.platform, self.user = platform, user
+    def __init__(self, platform: FakePlatform) -> None:
+        self.platform = platform
         installed.use(platform)
 
     def ask(self, method: str = "GET", body: str | None = None, kind: str = JSON) -> Any:
         """What the JSON of the answer says. AssertionError unless it is 200."""
-        query = f"projectId=maze&userId={self.user}"
+        query = "projectId=maze&userId=alice"
         headers = {"accept": JSON, "content-type": kind}
         response = next_step.handler(http_event(method, query, body, headers=headers), None)
         assert response["statusCode"] == 200, response

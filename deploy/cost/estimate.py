@@ -216,13 +216,12 @@ class FixedResources:
         )
 
 
-def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> list[Line]:
+def month_lines(prices: Prices, fixed: FixedResources) -> list[Line]:
     """What a month without participants costs. The high end is without free tiers."""
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0
     sweeps = SWEEP_SECONDS * (fixed.sweeps * WORKER_GB)
-    images = IMAGE_GB * projects
     gb_second = prices.lambda_gb_second.usd
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
     least = max(0.0, polls - free["sqs"])
@@ -237,7 +236,7 @@ def month_lines(prices: Prices, fixed: FixedResources, projects: int = 1) -> lis
             Usd(least, least, polls) * prices.sqs_request.usd,
         ),
         Line("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
-        Line("Images (ECR)", f"{images.likely:,.1f} GB", images * prices.ecr_gb_month.usd),
+        Line("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ecr_gb_month.usd),
         Line("NAT gateway, load balancer, database", "none", Usd()),
     ]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,15 +15,14 @@ from trial.recordings import disk
 
 @reports_errors
 class FileDns:
-    """Implements `hippodrome.ports.Dns`. A change is in sync after `delay` seconds: at once, except in tests."""
+    """Implements `hippodrome.ports.Dns`. A change is in sync at once."""
 
-    def __init__(self, state: Path, delay: float = 0, retry: Retry | None = None, *, named: bool = False) -> None:
+    def __init__(self, state: Path, retry: Retry | None = None, *, named: bool = False) -> None:
         """`named`: browsers find servers by their names (`local/web/names.py`), not by their addresses."""
         self.retry = retry or Retry()
         self._file = state / "names.json"
         self._lock = state / "locks" / "names"
         disk.make_folder(self._lock.parent)
-        self._delay = delay
         self._named = named
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
@@ -37,11 +35,10 @@ class FileDns:
             zone.update({record.name: record.host for record in add})
             if json.dumps(zone) != before:
                 files.write_json(self._file, zone, surely=False)  # a power cut ends every server, too
-        return f"change-{time.time() + self._delay:.3f}" if self._delay else ""
+        return ""
 
     def in_sync(self, change: str) -> bool:
-        """Each id contains the time from which its change is in sync; an empty id is in sync."""
-        return not change or time.time() >= float(change.removeprefix("change-"))
+        return True
 
     def list(self) -> Iterator[DnsRecord]:
         for name, host in self._zone().items():

@@ -67,7 +67,6 @@ class LocalPlatform:
         handlers: Mapping[str, Handler] | None = None,
         command: Sequence[str] = PYTHON_TRIAL,
         stop_timeout: float = STOP_TIMEOUT,
-        name_delay: float = 0,
         written: Written | None = None,
         named_port: int | None = None,
         subdomain: str | None = None,
@@ -90,7 +89,7 @@ class LocalPlatform:
         )
         self.retry = Retry(say)
         self.documents = FolderDocuments(data, state, written, self.retry)
-        self.dns = FileDns(state, name_delay, self.retry, named=named_port is not None)
+        self.dns = FileDns(state, self.retry, named=named_port is not None)
         self.bus = FolderBus(state, self._handlers, say, self.retry)
         self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say, retry=self.retry)
         self.tasks = ProcessTasks(

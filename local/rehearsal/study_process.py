@@ -58,8 +58,8 @@ class Process(Protocol):
 class StudyProcess:
     """`python -m local` in a process of its own."""
 
-    def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
-        self.folder, self.data, self.port = folder.resolve(), data.resolve(), port
+    def __init__(self, folder: Path, data: Path, *, log: Path | None = None) -> None:
+        self.folder, self.data = folder.resolve(), data.resolve()
         self.log = log or data.resolve().parent / f"{data.name}.log"
         self.link = ""
         self._process: Process | None = None
@@ -75,7 +75,7 @@ class StudyProcess:
         with self.log.open("ab") as log:
             said = log.tell()
             self._process = self._begin(
-                [str(self.folder), "--port", str(self.port), "--data", str(self.data)],
+                [str(self.folder), "--port", "0", "--data", str(self.data)],
                 cwd=ROOT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
                 stdout=log,
@@ -254,9 +254,9 @@ class Leftovers:
         return lines
 
 
-def wait_until_gone(data: Path, users: Collection[str] | None = None, seconds: float = GONE_SECONDS) -> Leftovers:
+def wait_until_gone(data: Path, users: Collection[str] | None = None) -> Leftovers:
     """Give the last servers time to end; what is left."""
-    until = time.monotonic() + seconds
+    until = time.monotonic() + GONE_SECONDS
     while True:
         left = Leftovers(len(servers_of(data, users)), open_records(data, users))
         if not left.words() or time.monotonic() > until:

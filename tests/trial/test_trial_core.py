@@ -362,7 +362,8 @@ def test_a_connection_keeps_little_but_never_loses_its_last_words(code):
         for number in range(10_000):
             connection.send(str(number))
             connection.send_state(f"state {number}")
-            connection.send_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
+            connection.put_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
+            connection.send_now()
         connection.close(code, "done")
         connection.close(4410, "too late")
         await connection.run()
@@ -390,7 +391,8 @@ def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog
         paper.subprotocol = subprotocol
         connection = Connection(paper)
         width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
-        connection.send_picture(np.zeros((2, width, depth), np.uint8), 1)
+        connection.put_picture(np.zeros((2, width, depth), np.uint8), 1)
+        connection.send_now()
         await asyncio.wait_for(connection.run(), 5)
         return paper.sent
 

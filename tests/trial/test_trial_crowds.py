@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 from tests.trial.test_trial_tls import KEYS, put
-from trial.server.preauth_limit import MAX_UNAUTHENTICATED
+from trial.server.preauth_limit import MAX_UNAUTHENTICATED_SOCKETS
 
 SILENT = b""
 SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # and never the rest
@@ -85,7 +85,7 @@ def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_cli
             await client.play()
             before = memory(server)
             opened = len(os.listdir(f"/proc/{server.process.pid}/fd"))
-            limit = opened + MAX_UNAUTHENTICATED + 200  # fewer than there are connections
+            limit = opened + MAX_UNAUTHENTICATED_SOCKETS + 200  # fewer than there are connections
             resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE, (limit, limit))
             arriving = asyncio.create_task(
                 asyncio.to_thread(arrive, server.port, crowd, (SILENT, SLOW, UPGRADE + b"\r\n"))
@@ -101,7 +101,7 @@ def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_cli
         asyncio.run(play())
     finally:
         cut = end_of(crowd)
-    assert cut >= 1000 - MAX_UNAUTHENTICATED
+    assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
     assert "Traceback" not in server.said()
 
 
@@ -148,7 +148,7 @@ def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client,
         asyncio.run(play())
     finally:
         cut = end_of(crowd)
-    assert cut >= 1000 - MAX_UNAUTHENTICATED
+    assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
     assert "Traceback" not in server.said()
 
 

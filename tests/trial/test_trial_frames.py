@@ -333,7 +333,8 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
         for number, frame in enumerate(sequence):
             if number == len(sequence) - 1:
                 monkeypatch.undo()
-            connection.send_picture(frame, number)
+            connection.put_picture(frame, number)
+            connection.send_now()
             async with asyncio.timeout(10):
                 while len(paper.sent) <= number:
                     await asyncio.sleep(0.001)

@@ -23,7 +23,7 @@ from trial.wire.player_socket import PlayerSocket
 log = logging.getLogger("trial")
 
 LARGEST_MESSAGE = 4096
-MAX_UNAUTHENTICATED = 64
+MAX_UNAUTHENTICATED_WEBSOCKETS = 64
 """WebSockets that have not authenticated yet; one more closes the oldest. Of sockets see preauth_limit.py."""
 CLOSE_SECONDS = 2.0
 
@@ -94,7 +94,7 @@ class Listener:
 
     async def _connected(self, websocket: ServerConnection) -> None:
         self._unauthenticated[websocket] = None
-        if len(self._unauthenticated) > MAX_UNAUTHENTICATED:
+        if len(self._unauthenticated) > MAX_UNAUTHENTICATED_WEBSOCKETS:
             oldest = next(iter(self._unauthenticated))
             del self._unauthenticated[oldest]
             oldest.transport.abort()

@@ -7,7 +7,7 @@ import socket
 from asyncio.sslproto import SSLProtocol
 from typing import Any
 
-MAX_UNAUTHENTICATED = 300
+MAX_UNAUTHENTICATED_SOCKETS = 300
 """Unauthenticated connections, counted from the first packet on. One more shuts down the oldest."""
 
 # asyncio keeps a buffer of this size for every connection with TLS, and 256 KB as it comes: a thousand of them would
@@ -25,10 +25,9 @@ class PreauthLimitedSocket(socket.socket):
     Raises `PortNotPermitted` where the port is for privileged processes, and OSError.
     """
 
-    def __init__(self, host: str, port: int, limit: int = MAX_UNAUTHENTICATED) -> None:
+    def __init__(self, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # said, or asyncio does not set TCP_NODELAY
-        self._most = limit
         self._unauthenticated: dict[Any, socket.socket] = {}  # by the address they come from, oldest first
         self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -44,9 +43,9 @@ class PreauthLimitedSocket(socket.socket):
         connection, address = super().accept()
         self._unauthenticated.pop(address, None)
         self._unauthenticated[address] = connection
-        if len(self._unauthenticated) > self._most:
+        if len(self._unauthenticated) > MAX_UNAUTHENTICATED_SOCKETS:
             self._forget_closed()
-        while len(self._unauthenticated) > self._most:
+        while len(self._unauthenticated) > MAX_UNAUTHENTICATED_SOCKETS:
             oldest = self._unauthenticated.pop(next(iter(self._unauthenticated)))
             with contextlib.suppress(OSError):  # it is closed already
                 oldest.shutdown(socket.SHUT_RDWR)  # the event loop notices, and closes it

@@ -97,13 +97,11 @@ class Connection:
         self._state = text
         self._wake.set()
 
-    def send_picture(self, picture: Picture, picture_id: int) -> None:
-        """Send a picture. It replaces one that still waits. `picture` must not change afterwards."""
-        self.put_picture(picture, picture_id)
-        self._wake.set()
-
     def put_picture(self, picture: Picture, picture_id: int) -> None:
-        """As `send_picture`, but nothing is sent before `send_now` or another message."""
+        """A picture to be sent, by `send_now` or with the next message. It replaces one that still waits.
+
+        `picture` must not change afterwards.
+        """
         self._picture = (picture_id, picture)
 
     def send_now(self) -> None:

@@ -51,12 +51,10 @@ class Play:
         told: Callable[[str], None] = lambda _: None,
         *,
         minutes: float = WITHIN,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self._patient, self._of, self._bots, self._told = context, project, bots, told
         self._copy = Copy(context.account, context.installation, context.platform)
-        self.transcript = Transcript(clock)
+        self.transcript = Transcript()
         installation = context.installation
         self.transcript.hide(
             context.account.id,
@@ -71,9 +69,7 @@ class Play:
             site(context, self._copy.id),
             self.transcript,
             told,
-            until=clock() + minutes * 60,
-            clock=clock,
-            sleep=sleep,
+            until=time.monotonic() + minutes * 60,
         )
         self._walk: Walk | None = None
         self._timer: upkeep.Timer | None = None
