@@ -378,7 +378,7 @@ class Texts:
         """All texts by their names."""
         return {**ENGLISH, **self._own}
 
-    def say(self, name: str, **values: Any) -> str:
+    def say(self, name: str, /, **values: Any) -> str:
         """The text with these values in its places. A place that has no value stays as it is."""
         return PLACE.sub(lambda place: str(values.get(place[1], place[0])), self[name])
 

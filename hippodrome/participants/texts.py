@@ -56,7 +56,7 @@ def _literal(text: str) -> str:
 
 def _in_template(text: str, values: dict[str, str]) -> str:
     """The text as a part of a template literal, with code in its places."""
-    inner = _literal(text)[1:-1].replace('\\"', '"').replace("`", "\\`").replace("${", "\\${")
+    inner = _literal(text)[1:-1].replace('\\"', '"').replace("`", "\\`").replace("$", "\\$")
     return PLACE.sub(lambda place: "${" + values[place[1]] + "}" if place[1] in values else place[0], inner)
 
 

@@ -101,6 +101,7 @@ def test_a_study_has_its_own_words_and_english_ones_where_it_has_none() -> None:
     assert texts["pause"] == "Pause"
     assert texts.say("seconds", seconds=5) == "5 Sekunden"
     assert texts.say("minutes", minutes=1) == "1 min {seconds} s"
+    assert texts.say("back", name="Ann") == "Ann is back."
     assert texts.language == "en"
     assert texts == Texts({"seconds": "{seconds} Sekunden", "start": "Los"}) != IN_ENGLISH
     assert hash(texts) == hash(Texts({"seconds": "{seconds} Sekunden", "start": "Los"}))
@@ -136,7 +137,7 @@ def test_no_text_is_code() -> None:
         "say(TEXT.start); say(TEXT.gameOf(a, b)); say(`x${TEXT.start}`);", Texts({"start": EVIL, "gameOf": EVIL})
     )
     plain = json.dumps(EVIL, ensure_ascii=False).replace("<", "\\u003c").replace("\u2028", "\\u2028")
-    inner = plain[1:-1].replace('\\"', '"').replace("`", "\\`").replace("${", "\\${")
+    inner = plain[1:-1].replace('\\"', '"').replace("`", "\\`").replace("$", "\\$")
     assert script == f"say({plain}); say(`{inner.replace('{game}', '${a}')}`); say(`x{inner}`);"
     assert "</" not in script
     assert "\u2028" not in script
