@@ -591,6 +591,7 @@ def test_an_early_end_has_a_fair_page_that_stays_until_the_participant_goes_on(
     tell(together, state="playing", **people(red="here"))
     if reason:
         together.connections[0].send(json.dumps({"error": reason}))
+    tell(together, state="ended", **people(red="away"))
     played = outcome != "ping"
     together.connections[0].send(json.dumps({"done": True, "outcome": outcome, "score": 7, "episodes": int(played)}))
     tab.wait_for_selector("#overlay-title:text('The game has ended')")

@@ -45,7 +45,7 @@ hooks.waits = () => COVERS.includes(presence.shown) || waitsToo();
 
 hooks.said.push((said) => {
   if (said.done) return noteEnd(said);
-  presence.reason = said.error ?? "";
+  if (said.state !== "ended") presence.reason = said.error ?? ""; // what ends the game is said before that it has ended
   if (said.UI) offerNoStart();
   if (said.people instanceof Object) showPeople(said);
   if (!said.state) return;
