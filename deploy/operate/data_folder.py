@@ -11,7 +11,7 @@ from pathlib import Path
 from deploy.aws.versions import Version
 from deploy.operate.storage import Note
 from export.fetch import remove_empty
-from trial.recordings import disk
+from protocol import disk
 
 SCRATCH = ".erase"
 """Where files lie that are being written."""

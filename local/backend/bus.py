@@ -23,7 +23,7 @@ from typing import Any
 from hippodrome.ports import Message, Topic
 from local.backend import files
 from local.backend.retry import Retry, reports_errors, start_thread
-from trial.recordings import disk
+from protocol import disk
 
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]

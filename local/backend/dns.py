@@ -10,7 +10,7 @@ from hippodrome.model import ids
 from hippodrome.ports import DnsRecord
 from local.backend import files
 from local.backend.retry import Retry, reports_errors
-from trial.recordings import disk
+from protocol import disk
 
 
 @reports_errors

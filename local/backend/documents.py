@@ -24,7 +24,7 @@ from pathlib import Path
 from hippodrome.ports import Conflict, Document, Entry
 from local.backend import files
 from local.backend.retry import Retry, reports_errors
-from trial.recordings import disk
+from protocol import disk
 
 STRIPES = 64  # lock files; keys that share one wait for each other
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)

@@ -1,4 +1,4 @@
-"""Records of ours as files, and locks. What must outlive a power cut is written by `trial/recordings/disk.py`."""
+"""Records of ours as files, and locks. What must outlive a power cut is written by `protocol/disk.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from trial.recordings import disk
+from protocol import disk
 
 PRIVATE = 0o600
 

@@ -31,7 +31,7 @@ from local.backend.retry import Retry, start
 from local.backend.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.backend.timers import FolderTimers
 from local.publish import NotPublished, publish
-from trial.recordings import disk
+from protocol import disk
 
 DOMAIN = "localhost"
 _OURS = ("queue", "tasks", "timers")  # only this process writes there, so unfinished files are left over

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from local.backend import files
 from local.backend.task_record import Task
+from protocol import disk
 from protocol.keys import with_number
-from trial.recordings import disk
 
 
 def unfinished(spool: Path, task: Task) -> Sequence[Path]:

@@ -28,8 +28,7 @@ from local.backend.health import is_healthy, port_in
 from local.backend.processes import child_of, kill_group, mark_of, process_of, spawn
 from local.backend.retry import Retry, start_thread
 from local.backend.task_record import HOST, KILLED, Task, TaskFolder, event, folder_of, now
-from protocol import environment, handover
-from trial.recordings import disk
+from protocol import disk, environment, handover
 
 START_TIMEOUT = 120.0  # seconds in which a server must listen
 RESCUE_TIMEOUT = 10.0  # seconds for which a server's end is held back while its recordings cannot be moved

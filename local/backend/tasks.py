@@ -20,7 +20,7 @@ from local.backend.processes import is_shell, kill, marked
 from local.backend.retry import Retry, reports_errors
 from local.backend.task_process import Emit, Say, Shared, TaskProcess
 from local.backend.task_record import HOST, Task, TaskFolder, claim_of
-from trial.recordings import disk
+from protocol import disk
 
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
 KEPT_TASKS, KEPT_LOGS = 200, 50  # the most that are kept of servers that are gone

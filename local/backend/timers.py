@@ -15,7 +15,7 @@ from typing import Any
 from hippodrome.ports import Message
 from local.backend import files
 from local.backend.retry import Retry, reports_errors, start
-from trial.recordings import disk
+from protocol import disk
 
 NAME = re.compile(r"[0-9a-zA-Z_.-]{1,64}")  # what EventBridge Scheduler takes
 AGAIN = 5.0  # seconds until a timer that could not fire is tried again

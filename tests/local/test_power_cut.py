@@ -129,7 +129,7 @@ def test_a_power_cut_breaks_no_promise(steps: list[tuple[str, int]], seed: int, 
 @pytest.mark.parametrize("lazy", ["sync_folder", "write_new"])
 def test_that_model_sees_what_is_not_synced(lazy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same without one of the syncs breaks promises."""
-    from trial.recordings import disk
+    from protocol import disk
 
     without: dict[str, Callable[..., Any]] = {
         "sync_folder": lambda folder: None,

@@ -15,7 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.recordings import disk, recording
+from protocol import disk
+from trial.recordings import recording
 from trial.recordings.recording import Recording, line
 from trial.recordings.spool import Spool
 from trial.recordings.store import FolderStore

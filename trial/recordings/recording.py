@@ -30,8 +30,8 @@ from typing import Any
 
 import numpy as np
 
+from protocol import disk
 from protocol.times import time_text
-from trial.recordings import disk
 from trial.recordings.recorded_values import CUT_OFF, LISTED, Values, text_of
 
 SCHEMA = 1

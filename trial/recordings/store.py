@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Protocol
 
-from trial.recordings import disk
+from protocol import disk
 from trial.recordings.presigned import PresignedStore
 
 
