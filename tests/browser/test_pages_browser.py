@@ -977,6 +977,18 @@ def reconnected(world: World, tab: Any) -> None:
 # The script's modules
 
 
+@pytest.mark.parametrize("sheet", ["style.css", "sessions.css"])
+def test_a_page_carries_the_same_rules_as_the_style_sheet(tab: Any, sheet: str) -> None:
+    whole = (frame.WEB / sheet).read_text(encoding="utf-8")
+    read = "css => { const s = new CSSStyleSheet(); s.replaceSync(css); return [...s.cssRules].map((r) => r.cssText) }"
+    written, carried = (  # browsers keep some values as they were written
+        [" ".join(rule.split()).replace(", ", ",").replace(": ", ":") for rule in tab.evaluate(read, css)]
+        for css in (whole, frame._plain(sheet, whole))
+    )
+    assert carried == written
+    assert len(carried) > 5
+
+
 def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, tab: Any) -> None:
     """They are what browsers take for modules; the page carries them joined only to save requests."""
     loaded: list[str] = []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 
 import pytest
 
 from hippodrome.participants import frame, game_modules, scripts
+from tests.hippodrome.participants.javascript import tokens
 
 GAME = Path(__file__).resolve().parents[3] / "web" / "game"
 MODULES = sorted(GAME.glob("*.js"), key=lambda path: path.name)
@@ -133,3 +135,62 @@ def test_a_page_carries_a_script_without_comments_spaces_and_line_ends_but_texts
     source: str, carried: str
 ) -> None:
     assert frame._plain("a.js", source) == carried
+
+
+def carried(source: str) -> list[str]:
+    """The tokens of a script as a page carries it."""
+    return tokens(frame._plain("a.js", source))
+
+
+SHEET = re.compile(r"(?:\.replaceSync\(|^const css = )`[^`]*`", re.MULTILINE)
+"""A style sheet in a script. Indentation means nothing in it."""
+
+
+@pytest.mark.parametrize("script", [*MODULES, GAME.parent / "step.js"], ids=lambda path: path.stem)
+def test_a_page_carries_the_same_script(script: Path) -> None:
+    source = SHEET.sub(lambda sheet: re.sub(r"\n +", "\n", sheet[0]), script.read_text())
+    assert carried(source) == tokens(source)
+    assert source.endswith("\n"), "the next module would stand on its last line"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'say("a // b");\n',
+        "say('a = b');\n",
+        "find(/a, b/);\n",
+        "find(/;}/);\n",
+        'find(/"/, a = b, "c = d");\n',
+        "say(`${f({ a })} = b`);\n",
+        "say(`a\n  b`);\n",
+        "a(); //b;\nc();\n",
+        "a = [,\n];\n",
+        "if (a < !--b) c();\n",
+        'say("</script>" + /</script/);\n',
+    ],
+)
+def test_a_script_that_would_be_another_one_on_the_page_is_noticed(source: str) -> None:
+    with contextlib.suppress(ValueError):
+        assert carried(source) != tokens(source)
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("a = b / c / d; // e", "a = b / c / d ;"),
+        ('a(/[/"]=/g, b) / 2 /* c */ / d', 'a ( /[/"]=/g , b ) / 2 / d'),
+        ("return /a/ ?.5 : b?.c ?? d", "return /a/ ? .5 : b ?. c ?? d"),
+        ("a + +b - -c++ + d", "a + + b - - c ++ + d"),
+        ("`a ${ { b: `c${d}` } } e`", "`a ${ { b : `c${ d }` } } e`"),
+        ("{ a; }\n[b, c,]", "{ a } [ b , c ]"),
+        ("x = [, b]; for (;;) {}", "x = [ , b ] ; for ( ; ; ) { }"),
+    ],
+)
+def test_tokens_of_a_script(source: str, found: str) -> None:
+    assert " ".join(tokens(source)) == found
+
+
+@pytest.mark.parametrize("source", ["a }", "`a", "`a ${b`", '"a', "3a", "a <!-- b", "@"])
+def test_what_is_no_script_has_no_tokens(source: str) -> None:
+    with pytest.raises(ValueError):
+        tokens(source)
