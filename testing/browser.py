@@ -15,6 +15,28 @@ from hippodrome.model.project import Project, Step
 from hippodrome.participants import pages
 
 NO_CHROMIUM = "there is no Chromium on this machine; to measure this row: apt-get install chromium"
+# What Playwright 1.65 switches off itself: of two lists Chromium takes the last.
+PLAYWRIGHT_OFF = (
+    "AvoidUnnecessaryBeforeUnloadCheckSync",
+    "DestroyProfileOnBrowserClose",
+    "HttpsUpgrades",
+    "HttpsFirstBalancedModeAutoEnable",
+    "LensOverlay",
+    "MediaRouter",
+    "PaintHolding",
+    "ThirdPartyStoragePartitioning",
+    "AvoidCorsURLLoaderRestartOnRedirect",
+    "TcpPortRandomizationWin",
+    "OptimizationHints",
+    "NetworkTimeServiceQuerying",
+    "AimEnabled",
+    "PreconnectToSearch",
+    "msForceBrowserSignIn",
+    "msEdgeUpdateLaunchServicesPreferredVersion",
+)
+# Two pages of the browser's own in each new window, below its address bar, took twice as long as the window's page; and a
+# process for a page that may be opened next.
+OFF = ("WebUIOmniboxPopup", "WebUIOmniboxAimPopup", "SpareRendererForSitePerProcess")
 ARGUMENTS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -23,6 +45,7 @@ ARGUMENTS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    f"--disable-features={','.join((*PLAYWRIGHT_OFF, *OFF))}",
 )
 
 
