@@ -22,7 +22,7 @@ from local.backend.task_process import Emit, Say, Shared, TaskProcess
 from local.backend.task_record import HOST, Task, TaskFolder, claim_of
 from protocol import disk
 
-STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, as on Fargate
+STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, the default of ECS and of `STOP_SECONDS` (on AWS: 120)
 KEPT_TASKS, KEPT_LOGS = 200, 50  # the most that are kept of servers that are gone
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
