@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import io
 import json
 import math
 import os
 import sys
 import threading
 import time
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import IO, Any, ClassVar
 
 from local.check import idle
+from local.check.agent_progress import Progress
 from local.check.outside import Outside
-from local.check.pace import Pace
 from local.check.several import Game
 from protocol import environment as variables
 from protocol import handover
@@ -38,12 +36,9 @@ from trial.core.players import PLAYER, Player, who_plays
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.reader import PictureReader
-from trial.recordings import recording
 from trial.server import assignment
 from trial.settings import trial_section
 
-PLAY_STEPS = 5_000  # in each group
-REPORT_BYTES = 2**20  # after which the report begins anew
 WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
 
 _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
@@ -99,7 +94,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = _Progress(report, folder, Outside(config.scene))
+    progress = Progress(report, folder, Outside(config.scene), _Early.asked)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     document = os.environ.pop("GIVEN", "")
     group = _group(document)
@@ -144,7 +139,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
         progress.over()
 
 
-def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress, deadline: _Deadline) -> bool:
+def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: Progress, deadline: _Deadline) -> bool:
     """Whether `match` returns, in the time that it has on a server."""
     progress.known["within"] = match.SECONDS
     with deadline.within(match.SECONDS):
@@ -153,7 +148,7 @@ def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: _Progres
     return went_well
 
 
-def _match(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress) -> None:
+def _match(adapter: AgentAdapter, question: dict[str, Any], progress: Progress) -> None:
     """Ask the function `match` about made-up people. Raises AgentError, and what `match` raises."""
     function = match.function_of(adapter.agent_module)
     if function is None:
@@ -167,7 +162,7 @@ def _match(adapter: AgentAdapter, question: dict[str, Any], progress: _Progress)
     progress.matched = len(found)
 
 
-def _reader(config: Trial, folder: Path, progress: _Progress) -> PictureReader:
+def _reader(config: Trial, folder: Path, progress: Progress) -> PictureReader:
     """Reads pictures, and notes what in the project's images and objects cannot be drawn."""
     found = Assets() if config.scene is None else assets.load(folder, config.scene.assets)
     progress.undrawn.extend(found.problems)
@@ -202,7 +197,7 @@ def _actions(player: AgentAdapter | JointAdapter, config: Trial) -> dict[str, An
 
 
 def _seen_idle(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: Trial, progress: _Progress
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: Trial, progress: Progress
 ) -> bool:
     """Note whether the action of no key visibly does something, where config.yml says nothing of it. Always true.
 
@@ -229,7 +224,7 @@ def _seen_idle(
 
 
 def _callbacks(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: _Progress, seconds: float
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: Progress, seconds: float
 ) -> Callbacks:
     """The agent's callbacks, which are told what happens as on a server."""
     humans = tuple(each.name for each in players if each.human)
@@ -259,7 +254,7 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
     return found
 
 
-def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], config: Trial) -> bool:
+def _play(player: Any, progress: Progress, first_reset: Callable[[], Any], config: Trial) -> bool:
     """Play up to the end of the last episode, or of the time; False if something failed.
 
     Each action comes once in turn, then they are at random.
@@ -298,114 +293,6 @@ def _play(player: Any, progress: _Progress, first_reset: Callable[[], Any], conf
         callbacks.episode_ended("terminated" if outcome.terminated else "truncated")
     callbacks.session_ended()
     return True
-
-
-class _Progress:
-    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method.
-
-    A line holds all that is known. There are two for each step, and to make a new file for each would take longer than
-    many an environment's step.
-    """
-
-    def __init__(self, report: Path, folder: Path, outside: Outside) -> None:
-        self._report, self._folder, self._outside = report, folder, outside
-        self._file: io.FileIO | None = None
-        self.episodes = self.steps = 0
-        self.matched: int | None = None
-        """How many sessions `match` made of made-up people, if it was asked."""
-        self.action: Any = 0  # or by player
-        self.known: dict[str, Any] = {}
-        self.foreign: list[int] = []
-        self.undrawn: list[str] = []
-        self.callbacks: Any = None
-        self._callback_errors: list[dict[str, Any]] = []
-        self.pace = Pace()
-        self.result: Any = None
-        self._ours = _installed_modules()
-        self._until = math.inf
-
-    def time_over(self) -> bool:
-        """Whether enough has been played. The time counts from the first step on."""
-        if self.steps == 1 and self._until == math.inf:
-            self._until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
-        return self.steps >= PLAY_STEPS or time.monotonic() > self._until
-
-    def call(self, name: str, function: Callable[[], Any]) -> bool:
-        """Call it; whether that went well."""
-        self._write(call=name)
-        try:
-            self.result = function()
-        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-            self._write(call=name, error=_told(error, self._folder))
-            return False
-        if name == "render":
-            self._outside.see(self.result)
-        return True
-
-    def callback_failed(self, name: str, error: BaseException) -> None:
-        """A callback of the agent has raised."""
-        self._callback_errors.append({"name": name, **_told(error, self._folder)})
-
-    def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
-        """Note the first value of these that is too large for the recording."""
-        if "tooLarge" in self.known:
-            return
-        for where, values in (
-            *(("info", info) for info in infos if recording.is_too_large(info)),
-            ("what it returns", extra),
-        ):
-            found = recording.bounded_extra(values)[1] if values else {}
-            for name, size in found.items():
-                self.known["tooLarge"] = {"name": name[:100], "size": size, "where": where}
-                return
-
-    def over(self) -> None:
-        """All has been tried."""
-        self.known["outside"] = self._outside.found()
-        self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
-
-    def _write(self, **what: Any) -> None:
-        far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": _Early.asked}
-        far["pace"], far["matched"] = vars(self.pace), self.matched
-        if self.callbacks is not None:
-            far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
-        if self.undrawn:
-            far["undrawn"] = self.undrawn
-        self._append(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}).encode() + b"\n")
-
-    def _append(self, line: bytes) -> None:
-        with contextlib.suppress(OSError):  # the agent has closed the file
-            if self._file is not None and self._file.tell() < REPORT_BYTES:
-                self._file.write(line)
-                return
-        if self._file is not None:
-            with contextlib.suppress(OSError):
-                self._file.close()
-        part = self._report.with_suffix(".part")
-        self._file = part.open("wb", buffering=0)
-        self._file.write(line)
-        part.replace(self._report)
-
-
-def _installed_modules() -> set[str]:
-    """The top-level modules of installed packages that are loaded."""
-    files = ((name, getattr(module, "__file__", None) or "") for name, module in list(sys.modules.items()))
-    return {name.partition(".")[0] for name, file in files if "site-packages" in Path(file).parts}
-
-
-def _told(error: BaseException, folder: Path) -> dict[str, Any]:
-    """The error in its own words, and the last line of the project's code that was on the way to it."""
-    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-    if isinstance(error, SyntaxError) and error.filename:
-        frames.append((Path(error.filename), error.lineno))
-    ours = [(path.name, line) for path, line in frames if path.parent == folder]
-    file, line = ours[-1] if ours else (None, None)
-    name = type(error).__name__
-    if isinstance(error, SyntaxError):
-        text = f"{name}: {error.msg}"
-    else:
-        text = " ".join(part.strip() for part in traceback.format_exception_only(error))
-    return {"type": name, "text": text, "file": file, "line": line}
 
 
 def _main(report: Path) -> None:

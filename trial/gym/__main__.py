@@ -12,7 +12,7 @@ from pathlib import Path
 
 from trial.gym.errors import unusable
 from trial.gym.limits import Limits
-from trial.gym.server import serve, tell
+from trial.gym.processes import serve, tell
 
 _HELP = {
     "connections": "connections at a time",

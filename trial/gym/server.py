@@ -1,5 +1,5 @@
 """The process that listens: it shakes hands, holds the connections that have asked for nothing yet, and tells clients
-when the process of their environments had to be ended. `python -m trial.gym`, or `start` in a program.
+when the process of their environments had to be ended. `processes.py` starts it.
 
 A connection costs little until its first request. Then its socket goes to a process of its own (`spawner.py`,
 `worker.py`). This process only keeps a descriptor, by which it tells the client if that process dies.
@@ -10,16 +10,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import http
-import os
-import resource
 import selectors
-import signal
 import socket
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
@@ -42,7 +37,7 @@ _HANDSHAKE_SECONDS = 10.0
 _HANDSHAKE_BYTES = 16 * 1024
 _CLOSE_SECONDS = 2.0
 _NO_FILES_SECONDS = 0.05
-_WITHOUT_HANDSHAKE = 100
+WITHOUT_HANDSHAKE = 100
 """So many connections beyond the limit are told that it is reached."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
@@ -136,7 +131,7 @@ class Server:
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 time.sleep(_NO_FILES_SECONDS)  # it would be tried again at once
             return
-        if len(self._connections) >= self._limits.connections + _WITHOUT_HANDSHAKE:
+        if len(self._connections) >= self._limits.connections + WITHOUT_HANDSHAKE:
             accepted.close()
             return
         accepted.setblocking(False)
@@ -334,120 +329,3 @@ def _keep_alive(connection: socket.socket) -> None:
     for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, name):
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-
-
-def serve(
-    host: str,
-    port: int,
-    limits: Limits | None = None,
-    *,
-    modules: Sequence[str] = (),
-    origins: Sequence[str] = (),
-    output: bool = False,
-    record: Path | None = None,
-    ready: Callable[[int], None] = lambda _: None,
-) -> int:
-    """Serve environments until SIGINT or SIGTERM; the exit status. `ready` is called with the port.
-
-    Raises OSError or UnicodeError if the address cannot be used. `modules` are imported where environments are made;
-    `record` is a folder for recordings.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family, backlog=512) as listener:
-        return serve_from(
-            listener,
-            limits or Limits(),
-            modules=modules,
-            origins=origins,
-            output=output,
-            record=record,
-            ready=lambda: ready(listener.getsockname()[1]),
-        )
-
-
-def serve_from(
-    listener: Listener,
-    limits: Limits,
-    *,
-    modules: Sequence[str] = (),
-    origins: Sequence[str] = (),
-    output: bool = False,
-    record: Path | None = None,
-    ready: Callable[[], None] = lambda: None,
-) -> int:
-    """As `serve`, to the connections that `listener` accepts."""
-    _allow_files(limits.connections + 2 * _WITHOUT_HANDSHAKE)
-    control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
-    with control:
-        if not _is_ready(control):
-            os.waitpid(spawner, 0)
-            return 1
-        server = Server(listener, control, limits, origins)
-        before = signal.signal(signal.SIGTERM, _interrupt)
-        try:
-            ready()
-            server.run()
-        except KeyboardInterrupt:
-            return 0
-        except EOFError as error:
-            print(f"The server ends: {error}.", file=sys.stderr)
-            return 1
-        finally:
-            server.close()
-            control.close()
-            signal.signal(signal.SIGTERM, before)
-            os.waitpid(spawner, 0)
-    raise AssertionError("the server runs until it is interrupted")
-
-
-def tell(host: str, port: int) -> None:
-    """Print where environments are served."""
-    shown = f"[{host}]" if ":" in host else host
-    print(f"Environments are served at ws://{shown}:{port}{PATH}. Ctrl-C ends it.", flush=True)
-
-
-def _allow_files(count: int) -> None:
-    """Let this process have so many open files, as far as the system allows."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft != resource.RLIM_INFINITY and soft < count:
-        most = count if hard == resource.RLIM_INFINITY else min(count, hard)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-
-
-def _fork_spawner(
-    listener: Listener, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
-) -> tuple[socket.socket, int]:
-    """Start the spawner; our end of its socket, and its process id."""
-    ours, theirs = socket.socketpair()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid:
-        theirs.close()
-        return ours, pid
-    status = 1
-    try:
-        ours.close()
-        listener.close()
-        from trial.gym import spawner  # noqa: PLC0415 - numpy and gymnasium stay out of the process that listens
-
-        status = spawner.main(theirs, limits, modules, output=output, record=record)
-    except KeyboardInterrupt:
-        status = 0
-    finally:
-        sys.stderr.flush()
-        os._exit(status)
-
-
-def _is_ready(control: socket.socket) -> bool:
-    told = bytearray()
-    while handover.read_ended(told) is None:
-        data = control.recv(4096)
-        if not data:
-            return False
-        told += data
-    return True
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt

@@ -15,7 +15,7 @@ from typing import Any
 
 from trial.gym import linux
 from trial.gym.limits import Limits
-from trial.gym.server import serve_from
+from trial.gym.processes import serve_from
 from trial.programs.environments import LARGEST_REPLY, LARGEST_REQUEST, MOST
 
 LIMITS = Limits(

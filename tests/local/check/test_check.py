@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from local.backend.platform import LocalPlatform
-from local.check import agent_process
+from local.check import agent_progress
 from local.check.agent_report import last_line
 from local.check.outside import Outside
 from local.publish import publish
@@ -142,9 +142,9 @@ def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path)
 def test_how_far_an_agent_came_is_read_from_the_last_whole_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(agent_process, "REPORT_BYTES", 1_000)
+    monkeypatch.setattr(agent_progress, "REPORT_BYTES", 1_000)
     report = tmp_path / "report"
-    progress = agent_process._Progress(report, tmp_path, Outside(None))
+    progress = agent_progress.Progress(report, tmp_path, Outside(None))
     sizes = []
     for step in range(50):
         progress.steps = step
