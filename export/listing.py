@@ -150,7 +150,7 @@ def choose(
 
 _NAMING = (Kind.PARTICIPANT, Kind.MEMBERSHIP)
 _ORDER = {kind: order for order, kind in enumerate((*_NAMING, Kind.SESSION))}
-"""These come first, in this order: the others are read by what they say."""
+"""Documents of these kinds come first, in this order: what they say is needed to read the others."""
 
 
 def version_of(item: Item, mark: str) -> str:

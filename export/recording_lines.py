@@ -80,7 +80,7 @@ def parsed(text: bytes) -> dict[str, Any] | None:
     try:
         line = msgspec.json.decode(text)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-        try:  # more patient with NaN and half characters
+        try:  # json takes NaN and lone surrogates, which msgspec refuses
             line = json.loads(text)
         except (ValueError, RecursionError):
             return None

@@ -138,7 +138,7 @@ def _at(note: str) -> str:
 
 
 def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
-    """Begin anew, and lose nothing."""
+    """End the servers of the study, and move data and state into the folder `earlier`: this run begins with none."""
     end_everything(state)
     place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for folder, name in ((data, "data"), (state, "state")):

@@ -135,7 +135,7 @@ class Decisions(Record, frozen=True):
         return next((each for each in self.formed if any(member.label == label for member in each.members)), None)
 
     def unmatched_of(self, label: str) -> Unmatched | None:
-        """That this participant is unmatched."""
+        """The decision that this participant is unmatched; None if there is none."""
         return next((each for each in self.unmatched if each.label == label), None)
 
     def is_decided(self, label: str) -> bool:

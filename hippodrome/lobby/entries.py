@@ -84,12 +84,12 @@ class Entries:
     outdated: tuple[str, ...] = ()  # keys to delete
 
     def with_waiting(self, one: Waiting) -> Entries:
-        """With this participant, who is there now."""
+        """The listing with this participant, who is there now."""
         left = {label: each for label, each in self.left.items() if label != one.label}
         return replace(self, waiting={**self.waiting, one.label: one}, left=left)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
-        """With this confirmation, which was just written."""
+        """The listing with this confirmation, which was just written."""
         labels = self.confirmed.get(proposal_id, frozenset()) | {label}
         return replace(self, confirmed={**self.confirmed, proposal_id: labels})
 

@@ -1,7 +1,7 @@
 """Asks the function `match` of agent.py who plays with whom (`questions.py`), by documents that servers read and write.
 
-A server without members answers (`trial/server/matching.py`). It may be anyone's code: an answer is only a wish, of
-which the rules take what is possible.
+A server without members answers (`trial/server/matching.py`). The function is the researcher's code, so its answer may
+be anything: the rules take of it what is possible.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Matcher:
             return Question()
 
     def _answer(self, project: Project, question: Question) -> Answer | None:
-        """The answer to the question; None if it has none yet, or none is to be had."""
+        """The answer to the question; None if it has none yet, or if too few wait for one."""
         if len(question.waiting) < project.players:
             return None
         found = self._documents.get(groups_key(project.id, question.id))

@@ -75,7 +75,7 @@ def person(label: str, group: int | None, answers: dict[str, Any]) -> Person:
 
 
 def with_person(question: Question, one: Person) -> Question:
-    """With this participant, who is asked about next. Where `MOST_CAME` have come, they are left out for now."""
+    """The document with this participant, for the next question; unchanged if `MOST_CAME` stand in it already."""
     if one.id in question.people() or is_full(question):
         return question
     return msgspec.structs.replace(question, came=(*question.came, one))

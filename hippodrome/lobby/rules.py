@@ -88,7 +88,7 @@ def here(document: Decisions, entries: Entries, project: Project, label: str, no
 
 
 def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
-    """Without the proposals that have fallen apart, of those that stood in `seen`."""
+    """The document without the proposals that have fallen apart, of those that stood in `seen`."""
     before = {each.id for each in seen.proposed}
     fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
     return without_proposals(document, fallen)
@@ -104,7 +104,7 @@ def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
 
 
 def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
-    """Without these proposals; sessions whose servers were started ahead are open again."""
+    """The document without these proposals; sessions whose servers were started ahead are open again."""
     if not any(each.id in ids for each in document.proposed):
         return document
     back = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
@@ -124,7 +124,7 @@ def _with_proposals(
     players: int,
     open_for: timedelta,
 ) -> Decisions:
-    """With these sessions proposed, by their members. The server that was started first is used first."""
+    """The document with these sessions proposed, by their members. The oldest server is used first."""
     usable = deque(each for each in document.open if each.is_usable(players, now, open_for))
     added = []
     for members in sessions:
@@ -185,7 +185,7 @@ def give_up(document: Decisions, one: Unmatched) -> Decisions:
 
 
 def without_done(document: Decisions, done: Collection[str]) -> Decisions:
-    """Without the formed sessions, by id, and unmatched participants, by label, of whom everything is written."""
+    """The document without those formed sessions (by id) and unmatched participants (by label) that are all written."""
     if not any(each.id in done for each in document.formed) and not any(
         each.label in done for each in document.unmatched
     ):
@@ -198,7 +198,7 @@ def without_done(document: Decisions, done: Collection[str]) -> Decisions:
 
 
 def without(document: Decisions, label: str) -> Decisions:
-    """Without anything of this participant, whose data are erased. In a session that is formed their seat is empty."""
+    """The document without this participant, whose data are erased. In a session that is formed their seat is empty."""
 
     def unnamed(ahead: Ahead | None) -> Ahead | None:
         return msgspec.structs.replace(ahead, by="") if ahead and ahead.by == label else ahead

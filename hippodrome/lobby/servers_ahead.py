@@ -39,7 +39,7 @@ def open_sessions(
     players: int,
     open_for: timedelta,
 ) -> Decisions:
-    """With as many sessions more as it takes until `wanted`, of so many players, can be used."""
+    """The document with so many more open sessions for `players` that as many as `wanted` can be used."""
     usable = sum(each.is_usable(players, now, open_for) for each in document.open)
     added = [Ahead(new_id(), now, by, players) for _ in range(wanted - usable)]
     return msgspec.structs.replace(document, open=by_age([*document.open, *added])) if added else document
@@ -120,5 +120,5 @@ def surplus(
 
 
 def without_open(document: Decisions, ids: Collection[str]) -> Decisions:
-    """Without these open sessions."""
+    """The document without these open sessions."""
     return msgspec.structs.replace(document, open=tuple(each for each in document.open if each.id not in ids))

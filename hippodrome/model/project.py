@@ -64,9 +64,10 @@ class Ssl(Record, frozen=True):
 
 
 class ForPlayers(Record, frozen=True):
-    """What servers run for so many players: of the last registration with that number. As in `Project`.
+    """What was registered last for this number of players; the fields are those of `Project`.
 
-    For 1 it is what the servers run that participants of before the first registration of several have of their own.
+    Servers of games with this number run it, also after another number was registered. For 1 player these are the
+    servers that participants had of their own before several players were registered.
     """
 
     players: int
@@ -148,7 +149,7 @@ class Project(Record, frozen=True):
         return self.players > 1
 
     def following(self, before: Project | None) -> Project:
-        """This registration, after the one `before`: games of other numbers of players keep what they run."""
+        """This registration with what earlier ones had for other numbers of players; `before` is the one before it."""
         kept = {each.players: each for each in (before.other_numbers if before else ())}
         if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
@@ -156,9 +157,10 @@ class Project(Record, frozen=True):
         return msgspec.structs.replace(self, other_numbers=others)
 
     def for_session(self, players: int) -> Project | None:
-        """The project as a game of so many players runs it; None if no such number is known. 0: as it is.
+        """The project as servers of games with so many players run it: as that number was registered last.
 
-        If another number was registered since, it is played as its own was registered last. No warm server does that.
+        0 stands for the number that is registered now. None if the number never was registered. Warm servers run only
+        what is registered now.
         """
         if players in (0, self.players):
             return self

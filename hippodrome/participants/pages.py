@@ -218,7 +218,7 @@ _REASONS = {  # the values of `hippodrome.model.server.Reason`, and the texts fo
 def _over_texts(state: Mapping[str, Any], texts: Texts, *, below: bool = False) -> tuple[str, str]:
     """The title and the text for a server that has ended: what happened, what is kept, what to do.
 
-    `below`: the button that asks for another server is another's, and stands below.
+    `below`: the text names no button, since the client shows one of its own below it.
     """
     reason, ending = str(state.get("reason")), str(state["state"])
     title = texts[_TITLES.get(reason, f"{ending}Title")]

@@ -21,7 +21,7 @@ def label_of(folder: Path) -> str | None:
 
 
 def read_agent(folder: Path) -> list[Diagnostic]:
-    """What Python says to agent.py without running it."""
+    """What is wrong with agent.py as Python reads it, without running it."""
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         source = path.read_bytes() if path.is_file() else b""

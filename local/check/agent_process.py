@@ -239,7 +239,7 @@ def _callbacks(
 
 
 def _foreign_actions(env: Any, actions: range) -> list[int]:
-    """A list in which from now on each action stands that the environment is given and does not have."""
+    """A list that from now on gets each action that the environment is given and does not have."""
     found: list[int] = []
     step = env.step
 

@@ -23,7 +23,7 @@ class Outside:
         self._outside: dict[tuple[str, str], tuple[float, float]] = {}
 
     def see(self, picture: Any) -> None:
-        """A picture, or pictures by player."""
+        """Look at a picture, or at pictures by player."""
         if self._size is None:
             return
         for view, scene in picture.items() if isinstance(picture, Mapping) else (("", picture),):

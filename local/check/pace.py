@@ -19,7 +19,7 @@ class Pace:
         return (self.seconds - self.slowest) / (self.steps - 1) if self.steps > 1 else self.seconds
 
     def took(self, seconds: float) -> None:
-        """One more step was played."""
+        """Count one more step, which took so many seconds."""
         self.steps += 1
         self.seconds += seconds
         self.slowest = max(self.slowest, seconds)

@@ -26,7 +26,7 @@ STAYS = 20  # steps for which a substitute plays, before another does
 
 
 class Reporting(Protocol):
-    """What plays are reported to (`_Progress` of `agent_process.py`)."""
+    """Where plays are reported: `Progress` of `agent_progress.py`."""
 
     action: Any
     steps: int

@@ -34,14 +34,14 @@ class _Member:
     player: str
     samples: deque[float]
     left: float
-    """Seconds for which the others still wait, while the clock stands."""
+    """Seconds for which the others would still wait for them. It counts down while `until` is set."""
     measured: bool
     until: float | None = None
-    """The clock runs: so long do the others wait."""
+    """Until when the others wait for them; None: nobody waits for them now."""
     to_measure: float = MEASURED_SECONDS
-    """Seconds for which their round trip is still measured, while they are not measured."""
+    """Seconds for which their round trip may still be measured. It counts down while `measured_until` is set."""
     measured_until: float | None = None
-    """They are measured, until then at most."""
+    """Until when their round trip may be measured; None: it is not measured now."""
     connected: bool = False
     stalled: bool = False
     hidden: bool = False
@@ -63,12 +63,12 @@ class _Member:
 
     @property
     def gone(self) -> bool:
-        """The clock runs; it does not while they are measured, which takes `MEASURED_SECONDS` at most."""
+        """The others wait for them, at most until `until`. Who is here and is still measured is not gone."""
         return self.over is None and not self.takes_part
 
     @property
     def is_measured_now(self) -> bool:
-        """They are here, and their round trip is not known."""
+        """They are here, and their round trip is not known yet. That takes `MEASURED_SECONDS` at most."""
         return self.over is None and self.takes_part and not self.measured
 
 

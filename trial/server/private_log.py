@@ -1,4 +1,4 @@
-"""Keeps participants' ids out of the log, whichever part of the server says them: the researcher's code may know."""
+"""Keeps participants' ids out of the log, also if the researcher's code knows them and says them."""
 
 from __future__ import annotations
 
