@@ -145,7 +145,7 @@ def test_pause_holds_and_start_goes_on(launch, open_client):
             await client.until(lambda: client.frame[taken % 20, taken % 30, 0] == 255)
             seen = client.frames[-1]
             await client.watch(0.4)
-            assert client.frames[-1] == seen
+            assert client.frames[-1][1] <= seen[1] + 1, "the step that was under way is the last"
             await client.say(command="start")
             await client.until(lambda: client.state["state"] == "playing")
             await client.until(lambda: client.frames[-1][1] > seen[1] + 3)
