@@ -12,6 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 PLACE = re.compile(r"\{([a-z]+)\}")
+_RIGHT_TO_LEFT = re.compile(
+    "acm|afb|aii|apc|ara?|arb|arc|arq|ary|arz|azb|bal|ckb|div|dv|fa|fas|glk|heb?|iw|ji|ks|lki|lrc|mzn|nqo|pbt|per|pes|"
+    "pnb|prs|ps|pus|sdh?|skr|snd|syr|ug|uig|urd?|yid?"
+)
+_SCRIPTS = re.compile("adlm|arab|hebr|mand|nkoo|rohg|samr|syrc|thaa")
+"""Languages and scripts that are written from right to left, as browsers know them. Others can name their script."""
 LANGUAGE = "language"
 """The name of the text that is no text: the language of the others, as pages name it (`<html lang>`)."""
 
@@ -337,6 +343,13 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
 }
 """The English texts by their names, in the order of docs/texts.md."""
 ENGLISH: Mapping[str, str] = {name: text for group in GROUPS.values() for name, text in group.items()}
+
+
+def is_right_to_left(language: str) -> bool:
+    """Whether a language is written from right to left, as pages name it: by its script if it names one (`ku-Arab`)."""
+    name, script, *_ = [*language.lower().split("-"), ""]
+    by_script = len(script) == 4 and script.isalpha()
+    return bool(_SCRIPTS.fullmatch(script) if by_script else _RIGHT_TO_LEFT.fullmatch(name))
 
 
 def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:

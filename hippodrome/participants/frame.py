@@ -16,7 +16,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 from hippodrome.model.project import Project, Step
-from hippodrome.model.texts import IN_ENGLISH, Texts
+from hippodrome.model.texts import IN_ENGLISH, Texts, is_right_to_left
 from hippodrome.participants import scripts
 from hippodrome.participants.texts import in_script, in_template
 
@@ -46,9 +46,10 @@ def message_page(
     page = fill(
         "frame.html",
         lang=lang,
+        dir=_direction(lang),
         title=title,
         head=Html(),
-        style=Html(style("message")),
+        style=Html(style("message") + _of_direction(lang)),
         body="message",
         data=Html(),
         header=Html(),
@@ -94,15 +95,17 @@ def frame(
     `sheet` is a style sheet of `web/` that only some pages need, besides that of every page.
     """
     texts = Texts(project.texts)
+    lang = lang or texts.language
     name = project.name or project.id
     at, steps = project.index(step.key) or 0, len(project.steps)
     progress = fill("progress", texts, step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
     return fill(
         "frame.html",
-        lang=lang or texts.language,
+        lang=lang,
+        dir=_direction(lang),
         title=texts.say("titleStep", title=title or name, step=at + 1, steps=steps) if steps > 1 else title or name,
         head=head,
-        style=Html(style(body) + (_sheet(sheet) if sheet else "")),
+        style=Html(style(body) + (_sheet(sheet) if sheet else "") + _of_direction(lang)),
         body=body,
         data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
         header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),
@@ -217,6 +220,15 @@ def _style(kind: str | None) -> str:
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
     return _plain("style.css", text)
+
+
+def _direction(lang: str) -> Html:
+    """The attribute of a page in a language that is written from right to left: browsers do not go by `lang`."""
+    return Html(' dir="rtl"' if is_right_to_left(lang) else "")
+
+
+def _of_direction(lang: str) -> str:
+    return _sheet("right-to-left.css") if is_right_to_left(lang) else ""
 
 
 @cache

@@ -11,14 +11,19 @@ import html
 import json
 import re
 
-from hippodrome.model.texts import ENGLISH, PLACE, Texts, places
+from hippodrome.model.texts import ENGLISH, IN_ENGLISH, LANGUAGE, PLACE, Texts, places
 
 NAMED = re.compile(r"\bTEXT\.([A-Za-z]+)")
 
 
 def in_script(code: str, texts: Texts) -> str:
     """The script with the texts where it names them."""
-    return _filled(code, texts.all())
+    return _filled(code, {**texts.all(), LANGUAGE: _for_numbers(texts.language)})
+
+
+def _for_numbers(language: str) -> str:
+    """The language in which a script has the browser write numbers: with the digits that all other numbers have."""
+    return language if language == IN_ENGLISH.language else f"{language}-u-nu-latn"
 
 
 def in_template(template: str, texts: Texts) -> str:

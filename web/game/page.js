@@ -31,5 +31,5 @@ export function duration(seconds) {
 
 // Up to 1,000 with two decimals: all that is said in the line above the picture has to stand in it on a phone.
 export function points(score) {
-  return Number(score ?? 0).toLocaleString([], { maximumFractionDigits: Math.abs(score) < 1000 ? 2 : 0 });
+  return Number(score ?? 0).toLocaleString(TEXT.language, { maximumFractionDigits: Math.abs(score) < 1000 ? 2 : 0 });
 }

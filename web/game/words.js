@@ -1,4 +1,5 @@
-// The study's own words for what servers say, which they say in English (`SAID` in hippodrome/model/texts.py).
+// The study's own words: for what servers say, which they say in English (`SAID` in hippodrome/model/texts.py), and on the
+// button that starts and pauses, which keeps the width of the longest that it has had: what is beside it stays in its place.
 import { hooks } from "./hooks.js";
 import { showMessage } from "./overlay.js";
 import { data } from "./page.js";
@@ -10,3 +11,8 @@ function sayOwnWords(said) {
 }
 
 hooks.said.unshift(sayOwnWords);
+hooks.overlay.push(() => {
+  for (const button of document.querySelectorAll("[data-command=toggle]")) {
+    if (button.offsetWidth) button.style.minWidth = `${button.offsetWidth}px`;
+  }
+});

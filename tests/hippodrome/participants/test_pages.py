@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import re
@@ -209,6 +210,21 @@ def test_the_frame_names_study_step_and_researcher() -> None:
 @pytest.mark.parametrize("source", ["<p>x</p>", "<h1>Mine</h1>", "<h2>x</h2>"])
 def test_there_is_always_one_main_heading(source: str) -> None:
     assert len(Elements(step(source).html).named("h1")) == 1
+
+
+def test_a_page_in_a_language_from_right_to_left_says_so() -> None:
+    study = msgspec.structs.replace(PROJECT, texts={"language": "ar"})
+
+    def in_study(source: str) -> Page:
+        return pages.step_page(dataclasses.replace(step_view(source), project=study))
+
+    hebrew = '<html lang="he-IL"><h1>x'
+    for page in (in_study("<h1>x"), game(project=study), step(hebrew), frame.message_page("x", "y", lang="ur")):
+        assert [each.get("dir") for each in Elements(page.html).named("html")] == ["rtl"]
+        assert ".board{direction:ltr}" in page.html
+    for page in (in_study('<html lang="de"><h1>x'), step("<h1>x"), game(), frame.message_page("x", "y")):
+        assert "dir" not in Elements(page.html).named("html")[0]
+        assert "direction:ltr" not in page.html
 
 
 def test_the_language_and_title_of_the_page_are_kept() -> None:

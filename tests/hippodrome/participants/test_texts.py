@@ -129,6 +129,12 @@ def test_texts_stand_where_a_script_names_them(code: str, own: dict[str, str], f
     assert in_script(code, Texts(own)) == filled
 
 
+def test_numbers_are_written_as_the_language_does_with_the_digits_of_all_other_numbers() -> None:
+    code = "n.toLocaleString(TEXT.language)"
+    assert in_script(code, IN_ENGLISH) == 'n.toLocaleString("en")'
+    assert in_script(code, Texts({"language": "fa"})) == 'n.toLocaleString("fa-u-nu-latn")'
+
+
 EVIL = "\"`\\ ${alert(1)} </script><!-- \u2028 {game} // '$game"
 
 

@@ -1,0 +1,96 @@
+"""Pages in other languages: words that are longer than the English ones, and lines from right to left."""
+
+from __future__ import annotations
+
+import string
+from itertools import product
+from typing import Any
+
+import pytest
+
+from hippodrome.model.texts import ENGLISH, is_right_to_left
+from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
+
+__all__ = ["world"]  # a fixture
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+SIZES = [(360, 740), (1280, 800)]
+NO_LONGER_WRITTEN = {"ae"}  # Avestan
+LONG = {"start": "Commencer", "pause": "Pause", "goOn": "Continuer", "saidPing": "Trop lent."}
+HEBREW = {"language": "he", "start": "התחלה", "pause": "הפסקה", "saidPing": "החיבור איטי מדי."}
+TOGGLE = "[data-command=toggle]"
+IS_LEFT_OF = "([one, other]) => find(one).right <= find(other).left".replace(
+    "find", "(selector => document.querySelector(selector).getBoundingClientRect())"
+)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_long_word_on_the_button_that_starts_is_whole_and_moves_nothing(
+    world: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    world.more = {"texts": LONG}
+    play(world, tab)
+    seen = {}
+    for state, word in {"ready": "Commencer", "playing": "Pause", "paused": "Continuer"}.items():
+        tell(world, state=state)
+        tab.wait_for_selector(f"{TOGGLE}:text-is('{word}')")
+        seen[state] = tab.locator(TOGGLE).bounding_box()
+        assert seen[state]["height"] <= tab.locator("[data-command=reset]").bounding_box()["height"]  # in one line
+    assert seen["playing"] == pytest.approx(seen["ready"], abs=1)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_browsers_write_the_same_languages_from_right_to_left(tab: Any) -> None:
+    names = ["".join(letters) for letters in product(string.ascii_lowercase, repeat=2)]
+    names += ["ary", "heb", "prs", "skr", "fil", "ku-Arab", "pa-Arab", "ar-Latn", "he-IL", "ur-Latn-PK", "zh-Hant"]
+    tab.goto("about:blank")
+    found = tab.evaluate(
+        "names => names.filter(name => new Intl.Locale(name).getTextInfo().direction === 'rtl')", names
+    )
+    assert {name for name in names if is_right_to_left(name)} == set(found) - NO_LONGER_WRITTEN
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_from_right_to_left_the_stages_of_waiting_are_marked_at_the_right(
+    world: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    world.more, world.step = {"texts": HEBREW}, 2
+    tab.goto(world.url)
+    tab.wait_for_selector("#stage-queued[aria-current]")
+    mark, line = (
+        tab.evaluate(f"parseFloat(getComputedStyle(document.querySelector('#stage-queued'), '{part}').right)")
+        for part in ("::before", "::after")
+    )
+    assert (mark, line) == (0, pytest.approx(9.6))
+    assert tab.evaluate("parseFloat(getComputedStyle(document.querySelector('#stage-queued')).paddingRight)") > 30
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-right-to-left-waiting")
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_from_right_to_left_words_are_turned_and_the_game_is_not(
+    world: World, tab: Any, width: int, height: int
+) -> None:
+    tab.set_viewport_size({"width": width, "height": height})
+    world.more = {"texts": HEBREW}
+    play(world, tab)
+    tell(world, state="playing", score=-1234, episodeScore=-3.5)
+    tab.wait_for_selector(f"{TOGGLE}:text-is('{HEBREW['pause']}')")
+    assert tab.evaluate("document.documentElement.dir") == "rtl"
+    directions = {
+        name: tab.evaluate("name => getComputedStyle(document.querySelector(name)).direction", name)
+        for name in (".hud", ".overlay", ".commands", ".legend", "#screen", ".pad")
+    }
+    assert {name for name, direction in directions.items() if direction == "ltr"} == {"#screen", ".pad"}
+    assert tab.evaluate(IS_LEFT_OF, [".pad .left", ".pad .right"])
+    if width > height:
+        assert tab.evaluate(IS_LEFT_OF, [".hud", "#screen"])
+        assert tab.evaluate(IS_LEFT_OF, ["#screen", ".controls"])
+    else:
+        assert tab.evaluate(IS_LEFT_OF, ["#episode", "#total"])
+    assert tab.inner_text("#score") == "\u200e-3.5"  # a sign that keeps the minus before its number
+    assert tab.inner_text("#total") == ENGLISH["total"].replace("{score}", "\u200e-1,234")
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-right-to-left")
