@@ -8,6 +8,7 @@ step).
 from __future__ import annotations
 
 import secrets
+from datetime import timedelta
 from typing import Any
 
 from hippodrome import http
@@ -180,6 +181,8 @@ class Journey:
 
     def _poll(self, request: Request, project: Project, user_id: str) -> Response:
         """The state of the server, for the waiting page: one read of its record. With sessions see `SharedGame`."""
+        if request.has_query("ticket") and not project.has_sessions:  # a page for several: this list is older
+            project = self._project_cache.live_project(project.id, timedelta(0)) or project
         step = project.step(request.query_value("poll"))
         if project.has_sessions:
             return http.as_json(200, self._poll_together(request, project, user_id, step))
@@ -193,8 +196,10 @@ class Journey:
             standing = self._shared_game.visit(project, user_id, shown)
         else:
             found = self._shared_game.decided(project, user_id)
-            if found is None and (alone := self._shared_game.state_alone(project, user_id, step)):
-                return alone
+            if found is None or not request.has_query("ticket"):  # a page that was made for one has no ticket
+                alone = self._shared_game.state_alone(project, user_id, step, is_member=found is not None)
+                if alone is not None:
+                    return alone
             if found is None:
                 raise PageError.of(Texts(project.texts), 403, "outdated")
             standing = found

@@ -118,7 +118,7 @@ class Relays:
         self._authorize(project, user_id, form, record)
         if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
-        if record is None or record.is_sessions:  # it may leave the lobby, or leaves the session: it stops no attempt
+        if record is None or record.is_closed or record.is_sessions:  # they leave the lobby or the session: no attempt
             message, name = StopServer(project.id, user_id), ids.server_name(ids.server_label(project.id, user_id), 1)
         else:
             message, name = StopServer(project.id, user_id, record.attempt), record.name

@@ -50,6 +50,8 @@ class Start:
         # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
         project = self._services.project_cache.live_project(message.project_id, fresh)
+        if is_session_id(message.user_id) and not (project and project.has_sessions):  # the list may be older than it
+            project = self._services.project_cache.live_project(message.project_id, timedelta(0))
         if project is None or (is_session_id(message.user_id) and not project.has_sessions):
             self._cancel_start(message)
             return
@@ -75,11 +77,13 @@ class Start:
 
     def _as_it_plays(self, project: Project, message: StartServer) -> Project | None:
         """The project as the participant's own server runs it, if that was started before several players were
-        registered, and starts still or is to be replaced; else None.
+        registered, and starts still or is to be replaced; else None. Whoever has a membership plays with others.
         """
         before = project.for_session(1)
         stored = before and self._repository.server(ids.server_label(project.id, message.user_id))
-        return before if stored and (message.attempt > 1 or not stored.server.is_closed) else None
+        if not stored or not server.plays_on(stored.server):
+            return None
+        return None if self._repository.membership(project.id, message.user_id) else before
 
     def _for_session(self, project: Project, message: StartServer) -> Project:
         """The project as this session runs it, also if another number of players is registered since.

@@ -56,6 +56,6 @@ class Stops:
     def _open(self, stop: StopServer) -> StopServer | None:
         """The message, if the participant has an open server in the project or may have a session; else None."""
         stored = self._services.repository.server(ids.server_label(stop.project_id, stop.user_id))
-        if stored is None:
-            return stop if self._sessions.has_sessions(stop.project_id) else None
-        return None if stored.server.is_closed else stop
+        if stored is not None and not stored.server.is_closed:
+            return stop
+        return stop if self._sessions.has_sessions(stop.project_id) else None

@@ -102,16 +102,19 @@ class Termination:
     def _record_to_stop(self, message: StopServer) -> Versioned | None:
         """The record of the server to stop; None if it is closed. If there is no record, create a tombstone.
 
-        In a project with sessions participants have no record. Their message may be for their session's server.
+        In a project with sessions participants have no record, or one of before it had sessions. Their message may be
+        for their session's server.
         """
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
-        if stored is not None:
-            return stored if stored.server.is_open(message.attempt or stored.server.attempt) else None
-        if message.reason != Reason.STOPPED:
+        if stored is not None and stored.server.is_open(message.attempt or stored.server.attempt):
+            return stored
+        if message.reason != Reason.STOPPED or (stored is not None and message.attempt is not None):
             return None
         if ids.is_user_id(message.user_id) and self._sessions.has_sessions(message.project_id):
             stop = self._sessions.stop_of(message)
             return self._record_to_stop(stop) if stop else None
+        if stored is not None:
+            return None
         try:
             self._repository.create(
                 server.stopped_before_start(message.project_id, message.user_id, 1, self._platform.now())

@@ -78,20 +78,28 @@ class SharedGame:
     def alone(self, project: Project, user_id: str) -> Project | None:
         """The project as the participant's own server runs it, which was started before several players were
         registered; None if they have none any more. A read, if one player was registered before.
-        """
-        before = project.for_session(1)
-        record = self._services.repository.server_of(project.id, user_id) if before else None
-        return before if record and plays_on(record) else None
 
-    def state_alone(self, project: Project, user_id: str, step: Step | None) -> dict[str, Any] | None:
+        Whoever has a membership plays with others: their own server was started by a function that had not read the
+        registration yet.
+        """
+        before, repository = project.for_session(1), self._services.repository
+        record = repository.server_of(project.id, user_id) if before else None
+        if record is None or not plays_on(record):
+            return None
+        return None if repository.membership(project.id, user_id) else before
+
+    def state_alone(
+        self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
+    ) -> dict[str, Any] | None:
         """The state for a page that was made when one player was registered; None if that never was. A read.
 
-        Without a server it says that it has ended: then the page is loaded again, and is the lobby.
+        Without a server it says that it has ended: then the page is loaded again, and is the lobby, or that of the
+        session whose member the participant is now.
         """
         before = project.for_session(1)
         if before is None:
             return None
-        record = self._services.repository.server_of(project.id, user_id)
+        record = None if is_member else self._services.repository.server_of(project.id, user_id)
         state = self._services.state(before, user_id, step, record)
         return state if record else state | {"state": ENDED}
 

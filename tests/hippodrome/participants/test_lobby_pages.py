@@ -449,3 +449,39 @@ def test_a_page_that_only_the_registration_for_one_named_and_that_is_gone_is_lef
     page = ann.get()
     assert 'id="text-betweenEpisodes"' in page
     assert 'id="text-instructions"' not in page
+
+
+def test_who_has_become_a_member_plays_with_others_whatever_server_of_their_own_has_been_started(
+    for_one: FakePlatform,
+) -> None:
+    """By a function that had not read the registration yet. A page that was made for one is loaded again."""
+    ann = Player(for_one, "ann").to_game()
+    address = ann.data["poll"]
+    register_two(for_one)
+    matched(for_one, ann, bob := Player(for_one, "bob").to_game())
+    token = serve(for_one)
+    start_for_one(for_one, "ann")
+    state = ann.data["state"]
+    assert (state["session"], state["token"]) == (True, member_token(token, "ann"))
+    assert ann.poll(address)["state"] == "ended"
+    assert [bob.poll()["state"], ann.poll()["state"]] == ["ready", "ready"]
+
+
+def start_for_one(platform: FakePlatform, user: str) -> None:
+    """Start the participant's own server as a function does that knows the registration for one player."""
+    other = installed(study(**ONE))
+    serve_owner(other, user)
+    key = server.key(ids.server_label("maze", user))
+    platform.documents.put(key, other.documents.kept[key][0])
+    place.use(platform)
+
+
+def test_a_function_that_has_not_read_the_registration_for_several_yet_reads_it_for_the_poll_of_the_lobby(
+    for_one: FakePlatform,
+) -> None:
+    """Else the page would take the participant for matched."""
+    ann = Player(for_one, "ann").to_game()
+    assert ann.data["state"]["state"] == "queued"
+    for_one.documents.keep(MASTER_LIST, to_json(MasterList([study(**STUDY).following(study(**ONE))])))
+    ticket = ids.ticket("secret", "ann", "3")
+    assert ann.poll(f"?projectId=maze&userId=ann&poll=3&ticket={ticket}")["state"] == "lobby"

@@ -724,3 +724,75 @@ def test_who_plays_alone_gets_what_is_registered_now() -> None:
     lose(platform, servers)
     deliver(platform, servers)
     assert task(platform)[0] == "alone, mended"
+
+
+def alone(user: str = "alice") -> tuple[FakePlatform, Servers]:
+    """A participant plays alone, and two players are registered then."""
+    platform = installed(study(trial={"game": "alone"}))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", user))
+    runs(platform, servers)
+    register_as_well(platform, pairs(**TWO))
+    return platform, servers
+
+
+def test_a_start_that_is_told_again_while_the_next_server_is_on_its_way_is_no_way_to_a_game_of_two() -> None:
+    platform, servers = alone()
+    lose(platform, servers)
+    servers.start(StartServer("maze", "alice"))
+    deliver(platform, servers)
+    assert task(platform)[0] == "alone"
+
+
+def test_who_asked_for_another_server_of_their_own_before_is_on_the_way_to_a_game_of_two() -> None:
+    platform, servers = alone()
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    servers.start(StartServer("maze", "alice", 2))
+    deliver(platform, servers)
+    assert task(platform)[0] == "two"
+
+
+def test_who_has_become_a_member_gets_no_next_server_of_their_own() -> None:
+    platform, servers = alone()
+    form(platform)
+    lose(platform, servers)
+    deliver(platform, servers)
+    assert platform.tasks.running == {}
+
+
+@pytest.mark.parametrize("stop", [StopServer("maze", "alice"), StopUser("alice")], ids=["theirs", "everywhere"])
+def test_a_server_of_their_own_that_has_ended_does_not_keep_a_members_stop_from_their_session(stop: Any) -> None:
+    platform, servers = alone()
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    form(platform)
+    servers.start(StartServer("maze", SESSION, players=2))
+    answer(platform, "bob", "1", "2", "3", "4")
+    assert servers.stop([StopServer("maze", "alice", 1)]) == []
+    assert record(platform).state is State.STARTING, "that was their own server's"
+    assert servers.stop([stop]) == []
+    assert record(platform).is_closed
+    assert nothing_left(platform)
+
+
+def test_who_waits_in_the_lobby_may_leave_it_by_the_relay_also_after_a_server_of_their_own() -> None:
+    platform, servers = alone()
+    assert servers.stop([StopServer("maze", "alice")]) == []
+    answer(platform, "alice", "1", "2")
+    platform.bus.sent.clear()
+    place.use(platform)
+    try:
+        assert ask(send_stop_server_message, "alice", **proof("alice")) == 202
+    finally:
+        place.use(None)
+    assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice"})]
+
+
+def test_a_function_that_has_not_read_yet_that_several_play_reads_it_for_a_session() -> None:
+    platform = installed(study())
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "bob"))
+    platform.tasks.running.clear()
+    project = pairs(**TWO).following(study())
+    platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))
+    servers.start(StartServer("maze", SESSION, players=2))
+    assert task(platform)[0] == "two"
