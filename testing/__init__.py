@@ -29,6 +29,7 @@ Faults, one module for each height at which they are injected
     `os_faults`       at the system's calls of one machine; `power_cut` loses what was not synced
 
 How much and how fast
+    `waiting`         `until` something is true
     `quiet_log`       the log stands still meanwhile
     `exploration`     how many examples and cases `make test` and `make hunt` take
     `preloaded`       processes of `python -m …` that begin with their imports done; `held_study` and `held_rehearsal` use it

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
+from testing.waiting import until
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PRIVKEY
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,10 +82,7 @@ def shown(port, root):
 
 
 def wait_until_shown(port, root, serial):
-    deadline = time.monotonic() + 30
-    while shown(port, root) != serial:  # every connection on the way succeeds
-        assert time.monotonic() < deadline, "the renewed certificate is not picked up"
-        time.sleep(0.05)
+    until(lambda: shown(port, root) == serial, 30)  # every connection on the way succeeds
 
 
 def test_a_running_server_picks_up_the_renewed_certificate(place, trial):
@@ -132,10 +130,7 @@ def test_a_pair_that_does_not_fit_leaves_the_running_server_as_it_is(place, tria
     serial = place.obtain().stored.serial
     port, root = trial(), place.pebble.root()
     (place.folder / PRIVKEY).write_text("-----BEGIN PRIVATE KEY-----\nnonsense\n-----END PRIVATE KEY-----\n")
-    deadline = time.monotonic() + 30
-    while "the present one stays" not in (tmp_path / "trial.txt").read_text():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: "the present one stays" in (tmp_path / "trial.txt").read_text(), 30)
     other = place.folder.parent / "other"
     other.mkdir()
     from tests.certificate.pebble import make_ca

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from deploy.study.image.bundle import make_bundle
+from testing.waiting import until
 from tests.deploy.recipe import Container, Recipe, recipe, stages
 from tests.deploy.registering import folder, machine, town, write_study
 from tests.trial.conftest import grid_agent
@@ -218,10 +218,7 @@ def test_what_the_agent_has_started_ends_with_the_step(recipe: Recipe, folder: P
     write_study(folder, agent_DOT_py=started + grid_agent(20))
     assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
     child = Path("/proc", (tmp_path / "child").read_text(), "stat")
-    until = time.monotonic() + 10
-    while child.exists() and child.read_text().rpartition(")")[2].split()[0] != "Z":
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    until(lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z", 10)
 
 
 def test_what_the_agent_is_tried_with_names_the_image_and_the_rest_of_the_section_does_not(folder: Path) -> None:

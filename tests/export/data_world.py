@@ -32,10 +32,6 @@ def into_folder(root: Path) -> Put:
     return put
 
 
-def into_bucket(client: Any, bucket: str) -> Put:
-    return lambda key, body: client.put_object(Bucket=bucket, Key=key, Body=body)
-
-
 def register(put: Put) -> None:
     put(MASTER_LIST, to_json(MasterList([PROJECT])))
 

@@ -25,6 +25,7 @@ import pytest
 from local.backend.processes import end_everything
 from local.rehearsal.study_process import servers_of
 from testing import exploration
+from testing.waiting import until
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens
 from tests.local.walk import Walker
@@ -60,10 +61,7 @@ def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
         for _ in range(60):
             game.recv(timeout=10)
         (part,) = (here.state / "spool").rglob("*.part")
-        until = time.monotonic() + 20
-        while not any(line["kind"] == "step" for line in recording.read(part.read_bytes())):
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        until(lambda: any(line["kind"] == "step" for line in recording.read(part.read_bytes())))
     return walker, state
 
 
@@ -75,11 +73,7 @@ def kill_server(here: Local) -> None:
 
 def goes_on(here: Local, walker: Walker) -> None:
     """The participant gets another server and comes to the end; both recordings are where they belong."""
-    until = time.monotonic() + 60
-    while (state := walker.state()).get("attempt") != 2 or state["state"] != "ready":
-        assert time.monotonic() < until, (state, here.text())
-        time.sleep(0.1)
-    walker.play(state)
+    walker.play(walker.until("ready", 60, attempt=2))
     walker.answer(word="two")
     assert "<h1>end</h1>" in walker.page()
     _gone(here)

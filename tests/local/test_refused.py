@@ -29,6 +29,7 @@ from local.backend.timers import FolderTimers
 from local.publish import publish
 from local.watch import Watch
 from testing.os_faults import Call, Fault, Injector, Reach
+from testing.waiting import until
 from tests.local.backend.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
 from tests.local.conftest import write_study
 
@@ -59,13 +60,6 @@ def refusing(tmp_path: Path) -> Iterator[Callable[..., Injector]]:
             return injector
 
         yield begin
-
-
-def until(done: Callable[[], object], seconds: float = 20) -> None:
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(("operation", "error"), [("rename", errno.ENOSPC), ("unlink", errno.EIO)])

@@ -7,7 +7,6 @@ import re
 import socket
 import ssl
 import stat
-import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,6 +21,7 @@ from local.backend import authority
 from local.backend.authority import Authority
 from local.web import connections
 from local.web.names import Names
+from testing.waiting import until
 from tests.local.conftest import Local
 from tests.trial.hippo_page import HippoPage, hippo_page, new_user_id
 
@@ -69,10 +69,7 @@ class FrontEnd:
         return found
 
     def until_the_game(self) -> None:
-        until = time.monotonic() + 20
-        while self.ask()["page"] != "show_game_page":
-            assert time.monotonic() < until
-            time.sleep(0.1)
+        until(lambda: self.ask()["page"] == "show_game_page")
 
     def page(self) -> Any:
         address = f"wss://{self.user_id}.localhost:{self.port}/"
@@ -97,10 +94,7 @@ def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Ma
             await play(page)
 
     asyncio.run(game())
-    until = time.monotonic() + 15
-    while "bye" not in (shown := end.ask()["page"]):
-        assert time.monotonic() < until, shown
-        time.sleep(0.1)
+    until(lambda: "bye" in end.ask()["page"], 15)
     assert "end" in end.ask("POST", {"word": "thanks"})["page"]
     answers = one.data / f"quick/users/{end.user_id}/answers"
     assert sorted(file.name for file in answers.iterdir()) == ["1.json", "2.json", "3.json"]
@@ -142,14 +136,13 @@ def test_servers_that_pages_would_look_for_elsewhere_are_replaced(local: Make) -
 
 def poll(client: httpx.Client, one: Local, link: dict[str, str], attempt: int = 1) -> dict[str, Any]:
     """The server's state, once it is ready."""
-    until = time.monotonic() + 20
-    while True:
-        state = client.get(f"{one.url}/next", params={**link, "poll": "2"}).json()
-        if (state["state"], state.get("attempt")) == ("ready", attempt):
-            break
-        assert time.monotonic() < until, state
-        time.sleep(0.1)
-    found: dict[str, Any] = state
+
+    def ready() -> dict[str, Any] | None:
+        state: dict[str, Any] = client.get(f"{one.url}/next", params={**link, "poll": "2"}).json()
+        return state if (state["state"], state.get("attempt")) == ("ready", attempt) else None
+
+    found = until(ready)
+    assert found is not None
     return found
 
 

@@ -6,7 +6,6 @@ import gzip
 import json
 import os
 import signal
-import time
 from collections import deque
 from collections.abc import Callable
 
@@ -14,6 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from local.rehearsal.study_process import servers_of
+from testing.waiting import until
 from tests.local.conftest import Local
 from tests.local.walk import Walker
 
@@ -27,10 +27,7 @@ def ready(here: Local, number: int) -> None:
 
 def wait_for(here: Local, number: int) -> None:
     """Wait until so many servers have a process."""
-    until = time.monotonic() + 15
-    while len(here.servers()) != number:
-        assert time.monotonic() < until, here.servers()
-        time.sleep(0.05)
+    until(lambda: len(here.servers()) == number, 15)
 
 
 def test_who_comes_gets_a_server_that_waited_and_their_recording_lies_where_it_always_does(local: Make) -> None:
@@ -91,10 +88,7 @@ def test_a_server_lost_while_it_waited_is_replaced_and_one_lost_in_play_goes_on_
         for process in servers_of(here.data, {"P1"}):
             os.kill(process.pid, signal.SIGKILL)
         here.goes_on()
-    until = time.monotonic() + 40
-    while (again := walker.state()).get("attempt") != 2 or again["state"] != "ready":
-        assert time.monotonic() < until, again
-        time.sleep(0.1)
+    again = walker.until("ready", attempt=2)
     assert walker.play(again)["score"] == 240
 
 

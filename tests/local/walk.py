@@ -40,10 +40,10 @@ class Walker:
         sent = self.http.post(self.link, data={**hidden, **answers}, headers={"accept": "text/html"})
         assert sent.status_code == 303, sent.text
 
-    def until(self, wanted: str, seconds: float = 40) -> dict[str, Any]:
-        """Wait for the game's server to be in that state."""
+    def until(self, wanted: str, seconds: float = 40, *, attempt: int | None = None) -> dict[str, Any]:
+        """Wait for the game's server (of this attempt, if given) to be in that state."""
         until = time.monotonic() + seconds
-        while (state := self.state()).get("state") != wanted:
+        while (state := self.state()).get("state") != wanted or attempt not in (None, state.get("attempt")):
             assert time.monotonic() < until, state
             time.sleep(0.1)
         return state

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -121,14 +120,6 @@ async def both_play(server: Any, frames: int = 5) -> tuple[Client, Client]:
 async def both_see(frames: int, *clients: Client) -> None:
     """Whoever did not take their pictures would be away after some seconds, and the game would be held."""
     await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in clients))
-
-
-def wait_for(true: Callable[[], object], seconds: float = 15) -> None:
-    """Wait until something is true of a server that runs."""
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def answer(store: Path, user_id: str, step: str = "3") -> dict[str, Any]:

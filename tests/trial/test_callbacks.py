@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from protocol import exits
+from testing.waiting import until
 from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
@@ -47,13 +48,6 @@ def play(callbacks, steps=2, why="terminated"):
         callbacks.stepped({"player_0": 2}, {"player_0": 1.5}, {"player_0": step}, {"player_0": {"t": step}})
     callbacks.episode_ended(why)
     callbacks.session_ended()
-
-
-def wait_for(condition):
-    until = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.005)
 
 
 class Noting:
@@ -251,7 +245,7 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
         (1, None, 4),
     ]
     callbacks.stepped({}, {}, {}, {})
-    wait_for(lambda: not callbacks.busy)
+    until(lambda: not callbacks.busy, 10)
     assert [(line["step"], line["value"]) for line in lines(callbacks)] == [(6, 6)]
     callbacks.close()
 

@@ -6,6 +6,7 @@ import json
 import pytest
 
 from protocol.session import Member, Session
+from testing.waiting import until
 from tests.trial.sessions import (
     ENV,
     MEMBERS,
@@ -22,7 +23,6 @@ from tests.trial.sessions import (
     put,
     recordings,
     refused,
-    wait_for,
 )
 from tests.trial.two_players import two_players
 from trial.core.session import PARTNER_STOPPED
@@ -279,7 +279,7 @@ def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_pr
     asyncio.run(killed())
     again = launch_session(launch)
     folder = first.store / f"study/sessions/{SID}/trials/pair-1"
-    wait_for(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")))
+    until(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")), 15)
     (lines,) = recordings(again.store).values()
     assert steps(lines)
 

@@ -11,6 +11,7 @@ from websockets.asyncio.client import connect
 from protocol.handover import Handover
 from protocol.keys import handover_key
 from protocol.session import Session
+from testing.waiting import until
 from tests.trial.sessions import (
     ENV,
     MEMBERS,
@@ -27,7 +28,6 @@ from tests.trial.sessions import (
     put,
     recordings,
     refused,
-    wait_for,
 )
 from tests.trial.two_players import two_players
 from trial.server import assignment, handshake
@@ -68,7 +68,7 @@ def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_formed(l
 def test_the_server_looks_for_the_session_by_itself(launch):
     server = launch_session(launch, SPARE_SECONDS="0.1")
     form(server.store)
-    wait_for(lambda: "the members of the session are known now: 2 of 2" in server.said())
+    until(lambda: "the members of the session are known now: 2 of 2" in server.said(), 15)
 
 
 def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
@@ -141,7 +141,7 @@ def test_policies_of_each_group_are_there_before_the_group_is_known(launch):
     players = {"left": "human", "right": "human"}
     groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
     server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
-    wait_for(lambda: "the agent is ready" in server.said())
+    until(lambda: "the agent is ready" in server.said(), 15)
     assert "the third player's policy is made" in server.said()
     form(server.store, document(group=1))
     asyncio.run(both_play(server))
@@ -230,7 +230,7 @@ def test_an_idle_time_begins_when_the_session_is_formed_not_at_the_handover(laun
     time.sleep(0.5)
     put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
     asyncio.run(ask(server))
-    wait_for(lambda: "assigned to a session now" in server.said())
+    until(lambda: "assigned to a session now" in server.said(), 15)
     time.sleep(1.5)
     assert server.process.poll() is None
     form(server.store)

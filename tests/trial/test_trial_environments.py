@@ -11,7 +11,7 @@ import signal
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from testing.gym_server import SECONDS, Client
+from testing.waiting import until
 from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
@@ -65,13 +66,6 @@ def url(server: Any, query: str = f"?token={TOKEN}") -> str:
 
 def processes(server: Any) -> list[int]:
     return [pid for pid in linux.descendants(server.process.pid) if linux.runs(pid)]
-
-
-def until(true: Callable[[], bool], seconds: float = SECONDS) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 @contextlib.contextmanager
@@ -173,7 +167,7 @@ def test_programs_are_limited(launch: Any) -> None:
             stack.enter_context(served(server))
         with pytest.raises(ConnectionLost, match=f"{MOST} programs"), served(server):
             pass
-    until(lambda: len(processes(server)) == 2)  # who listens and who starts processes
+    until(lambda: len(processes(server)) == 2, SECONDS)  # who listens and who starts processes
     with served(server) as env:
         env.reset()
 
@@ -209,11 +203,11 @@ def test_nothing_stays_behind_when_the_server_ends(launch: Any, number: signal.S
     with served(server, "Odd-v0") as env:
         env.reset()
         threading.Thread(target=_hang, args=(env,), daemon=True).start()
-        until(lambda: len(processes(server)) == 3)
+        until(lambda: len(processes(server)) == 3, SECONDS)
         left = processes(server)
         os.kill(server.process.pid, number)
         server.wait()
-        until(lambda: not any(map(linux.runs, left)))
+        until(lambda: not any(map(linux.runs, left)), SECONDS)
 
 
 def _hang(env: RemoteEnv) -> None:
@@ -228,10 +222,10 @@ def test_a_process_that_was_killed_is_started_again(launch: Any) -> None:
         (listens,) = linux.children(server.process.pid)
         below = processes(server)
         os.kill(listens, signal.SIGKILL)
-        until(lambda: not any(map(linux.runs, below)))  # an environment may answer until its own process ends
+        until(lambda: not any(map(linux.runs, below)), SECONDS)  # an environment may answer until its own process ends
         with pytest.raises(ConnectionLost):
             env.step_many([1] * 10)
-    until(lambda: processes(server) == [])
+    until(lambda: processes(server) == [], SECONDS)
     with served(server) as env:
         env.reset()
 

@@ -38,7 +38,6 @@ from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, U
 from trial.settings import Settings, trial_section
 
 SPACE = ("noop", "up", "right")
-BOTH = frozenset({"me", "it"})
 PLAYS = {"me": "human", "it": "agent:Partner"}
 
 

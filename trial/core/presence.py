@@ -19,12 +19,12 @@ Where = Literal["here", "reads", "awaited", "away", "policy"]
 """What the others are told of a player. reads: here, but still at the page before the game or between two episodes;
 awaited: has not come yet; away: was here."""
 LEAST_ABSENCE = 3.0
-"""An absence uses so many seconds at least, or a third of `absent`, before the game of `gather`: the countdown begins
-anew after it."""
+"""An absence uses at least so many seconds, or a third of `absent` (before the game: of `gather`) if that is less: after
+it the countdown begins anew."""
 GIVEN_BACK = 0.25
-"""So many seconds of their time a member has again for each second of play."""
+"""For each second of play, a member gets so many seconds of used time back."""
 MEASURED_SECONDS = 20.0
-"""For so long at most is a member here whose round trip is not known: then the samples so far decide."""
+"""The most seconds in which a member's round trip is measured. Then the samples so far decide."""
 Over = Literal["absent", "ping"]
 """Why a member does not play any more: their time is over, or their round trip is too long."""
 

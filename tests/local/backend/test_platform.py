@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from hippodrome.ports import TaskRequest, Topic
 from lambdas import installed
 from local.backend import platform as platform_module
 from local.backend.platform import LocalPlatform
+from testing.waiting import until
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
@@ -31,10 +31,7 @@ def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkey
         platform.bus.publish(Topic.START, {})
         platform.timers.set(NAME, platform.now(), {})
         platform.tasks.run(TaskRequest(NAME, "h", "h", 1, 2, {"TOKEN": "x"}))
-        until = time.monotonic() + 10
-        while not all(came.values()):
-            assert time.monotonic() < until, came
-            time.sleep(0.02)
+        until(lambda: all(came.values()), 10)
     finally:
         platform.close(1)
     bodies = "".join(record["body"] for event in came["task"] for record in event["Records"])

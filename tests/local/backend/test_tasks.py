@@ -26,6 +26,7 @@ from local.backend.processes import end_everything, marked
 from local.backend.task_record import Task, TaskFolder
 from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
+from testing.waiting import until
 from tests.local.conftest import ROOT
 from trial.recordings import recording
 
@@ -80,12 +81,11 @@ class Here:
 
     def written(self) -> None:
         """Wait until all that was told is written down: an event is sent before its version is saved."""
-        until = time.monotonic() + 20
-        for event in self.events:
-            file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
-            while json.loads(file.read_text())["version"] < event["detail"]["version"]:
-                assert time.monotonic() < until
-                time.sleep(0.01)
+        until(lambda: all(map(self._is_written, self.events)))
+
+    def _is_written(self, event: dict[str, Any]) -> bool:
+        file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
+        return bool(json.loads(file.read_text())["version"] >= event["detail"]["version"])
 
     def forget(self) -> None:
         """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
@@ -211,10 +211,7 @@ def test_children_of_a_server_go_with_it(here: Here, tmp_path: Path) -> None:
     here.tasks(command=(sys.executable, str(script))).run(request())
     here.wait("STOPPED")
     child = int(here.log().split()[0])
-    until = time.monotonic() + 20
-    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE)
 
 
 def test_the_next_process_takes_up_what_runs(here: Here) -> None:
@@ -259,10 +256,8 @@ def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
     arguments = [here.state, here.data, here.project, moment, seconds]
     command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
-    until = time.monotonic() + 10
-    while moment != "before" and not (here.state / "tasks" / f"{NAME}.pid").exists():  # no process is that soon again
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    if moment != "before":  # then there is no process that writes it
+        until((here.state / "tasks" / f"{NAME}.pid").exists, 10)
 
 
 def test_killed_between_the_intent_and_the_process_it_is_simply_asked_for_again(here: Here) -> None:
@@ -292,10 +287,7 @@ def test_killed_after_the_process_began_it_is_found(here: Here, moment: str) -> 
 @pytest.mark.parametrize("moment", ["after", "end"])
 def test_what_ended_while_nobody_looked_is_told_with_its_exit_code(here: Here, moment: str) -> None:
     _begin_and_be_killed(here, moment, seconds=0.2)
-    until = time.monotonic() + 10
-    while here.processes():
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: not here.processes(), 10)
     here.tasks().start()
     assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
 
@@ -350,10 +342,7 @@ def test_processes_that_nobody_knows_of_are_ended(here: Here) -> None:
     here.written()
     (here.state / "tasks" / f"{NAME}.json").unlink()
     here.tasks().start()
-    until = time.monotonic() + 20
-    while here.processes():
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: not here.processes())
 
 
 def test_a_recording_of_a_killed_server_is_kept(here: Here) -> None:

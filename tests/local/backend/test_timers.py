@@ -13,6 +13,7 @@ import pytest
 from hippodrome.ports import DnsRecord
 from local.backend.dns import FileDns
 from local.backend.timers import FolderTimers
+from testing.waiting import until
 
 Make = Callable[..., FolderTimers]
 
@@ -40,22 +41,15 @@ def timers(tmp_path: Path, fired: list[Any]) -> Iterator[Make]:
         one.close()
 
 
-def _wait(done: Callable[[], object], seconds: float = 20) -> None:
-    until = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 def test_a_timer_fires_when_it_is_due_and_is_gone(timers: Make, fired: list[Any]) -> None:
     here = timers()
     here.start()
     here.set("late", _now() + timedelta(hours=1), {"n": 3})
     here.set("past", _now() - timedelta(seconds=1), {"n": 1})
     here.set("soon", _now() + timedelta(seconds=2), {"n": 2})
-    _wait(lambda: len(fired) == 2)
+    until(lambda: len(fired) == 2)
     assert fired == [{"n": 1}, {"n": 2}]
-    _wait(lambda: list(here.list()) == ["late"])
+    until(lambda: list(here.list()) == ["late"])
 
 
 def test_a_timer_of_an_earlier_process_fires(timers: Make, fired: list[Any]) -> None:
@@ -63,7 +57,7 @@ def test_a_timer_of_an_earlier_process_fires(timers: Make, fired: list[Any]) -> 
     first.set("overdue", _now() - timedelta(days=1), {"n": 1})
     first.set("soon", _now() + timedelta(seconds=2), {"n": 2})
     timers().start()
-    _wait(lambda: len(fired) == 2)
+    until(lambda: len(fired) == 2)
     assert fired == [{"n": 1}, {"n": 2}]
 
 
@@ -73,7 +67,7 @@ def test_a_replaced_timer_fires_once_and_at_the_new_time(timers: Make, fired: li
     here.set("one", _now() + timedelta(seconds=3), {"n": "old"})
     due = (_now() + timedelta(seconds=5)).replace(microsecond=0)  # as AWS has it
     here.set("one", due, {"n": "new"})
-    _wait(lambda: fired)
+    until(lambda: fired)
     assert fired == [{"n": "new"}]
     assert _now() >= due
 

@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatu
 from websockets.sync.client import connect
 
 from testing.gym_server import Client, GymServer, gym_server
+from testing.waiting import until
 
 WITHIN = 15.0
 
@@ -26,7 +27,7 @@ WITHIN = 15.0
 def nothing_stays_behind(server: GymServer) -> Iterator[None]:
     """After each test, with all connections closed, only the server and its spawner run; and it serves others."""
     yield
-    wait_for(lambda: len(below(server)) == 1)
+    until(lambda: len(below(server)) == 1, WITHIN)
     with Client(server.url) as other:
         assert len(other.ask("reset", instance_id=other.make("Odd/Calm-v0"))) == 2
 
@@ -40,13 +41,6 @@ def patient_server() -> contextlib.AbstractContextManager[GymServer]:
 def below(server: GymServer) -> list[psutil.Process]:
     """What the server has started and what that has started."""
     return psutil.Process(server.pid).children(recursive=True)
-
-
-def wait_for(true: Callable[[], bool]) -> None:
-    until = time.monotonic() + WITHIN
-    while not true():
-        assert time.monotonic() < until, "waited in vain"
-        time.sleep(0.02)
 
 
 def stepped(client: Client, env_id: str, **action: Any) -> Any:
@@ -228,7 +222,7 @@ def test_too_much_memory_of_several_processes(asking: Client) -> None:
 
 
 def test_a_process_that_an_environment_left_ends_with_the_connection(server: GymServer, asking: Client) -> None:
-    wait_for(lambda: len(below(server)) == 1)  # what an earlier test has left is on its way out
+    until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
     stepped(asking, "Odd/Forking-v0")
     assert len(below(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
 
@@ -289,7 +283,7 @@ def test_only_the_path_of_environments_is_served(server: GymServer) -> None:
 
 
 def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServer) -> None:
-    wait_for(lambda: len(below(server)) == 1)  # what an earlier test has left is on its way out
+    until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
     with connect(server.url) as websocket:
         for _ in range(3):
             assert websocket.ping().wait(WITHIN)
@@ -331,7 +325,7 @@ def test_a_worker_that_has_ended_makes_room_at_once(small: GymServer) -> None:
         spawner.suspend()
         ending.kill()
         third.websocket.send(json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}}))
-        wait_for(lambda: ending.status() == psutil.STATUS_ZOMBIE)
+        until(lambda: ending.status() == psutil.STATUS_ZOMBIE, WITHIN)
         time.sleep(0.2)  # until the server has passed the request on, which nothing shows
         spawner.resume()
         assert "error" not in third.websocket.recv(WITHIN)
@@ -372,7 +366,7 @@ def test_nothing_of_a_server_that_is_ended_stays(how: signal.Signals) -> None:
         os.kill(own.pid, how)
         if how is not signal.SIGKILL:
             assert closed_within(client) == "The server ends."
-        wait_for(lambda: ended(pids))
+        until(lambda: ended(pids), WITHIN)
 
 
 def test_workers_end_with_their_spawner(server: GymServer) -> None:
@@ -380,7 +374,7 @@ def test_workers_end_with_their_spawner(server: GymServer) -> None:
         client.make("CartPole-v1")
         spawner, worker = (one.pid for one in below(own))
         os.kill(spawner, signal.SIGKILL)
-        wait_for(lambda: ended([worker]))
+        until(lambda: ended([worker]), WITHIN)
 
 
 def test_a_worker_that_hangs_ends_with_its_spawner() -> None:
@@ -392,7 +386,7 @@ def test_a_worker_that_hangs_ends_with_its_spawner() -> None:
         spawner, worker = (one.pid for one in below(own))
         time.sleep(0.3)
         os.kill(spawner, signal.SIGKILL)
-        wait_for(lambda: ended([worker]))
+        until(lambda: ended([worker]), WITHIN)
 
 
 def test_connections_that_say_nothing_are_limited_too() -> None:
@@ -403,7 +397,7 @@ def test_connections_that_say_nothing_are_limited_too() -> None:
             assert one_more.recv(1) == b""
         for one in silent:
             one.close()
-        wait_for(lambda: serves(own))
+        until(lambda: serves(own), WITHIN)
 
 
 def serves(server: GymServer) -> bool:
