@@ -19,7 +19,7 @@ import msgspec
 
 from console import screen
 from console.problem import Problem
-from export import episodes, fetch, keys, listing, manifest, table_files, tables
+from export import datasets, fetch, keys, listing, manifest, table_files, tables
 from export.answers import Answers
 from export.fetch import Fetcher
 from export.listing import Tally, Wanted
@@ -228,7 +228,7 @@ def _datasets(folder: Path, state: State, project_id: str, options: Options) -> 
         return made if state.fact("minari") == now else []
     state.set_fact("minari", "")
     with _bar("Writing Minari datasets") as told:
-        made = episodes.build(folder, state, project_id, told)
+        made = datasets.build(folder, state, project_id, told)
     state.set_fact("datasets", msgspec.json.encode(made).decode())
     state.set_fact("minari", now)
     return made

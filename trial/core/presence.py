@@ -19,8 +19,8 @@ Where = Literal["here", "reads", "awaited", "away", "policy"]
 """What the others are told of a player. reads: here, but still at the page before the game or between two episodes;
 awaited: has not come yet; away: was here."""
 LEAST_ABSENCE = 3.0
-"""An absence uses at least so many seconds, or a third of `absent` (before the game: of `gather`) if that is less: after
-it the countdown begins anew."""
+"""An absence uses at least so many seconds, or a third of `absent` (before the game: of `gather`) if that is less.
+After it the countdown begins anew."""
 GIVEN_BACK = 0.25
 """For each second of play, a member gets so many seconds of used time back."""
 MEASURED_SECONDS = 20.0
