@@ -189,6 +189,6 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     arrows = [
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
     ]  # without ui all are on
-    left = texts.left_in_english(config)
-    found = [*remarks(config), *left, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
+    own = [*texts.shown_as_they_are(config), *texts.left_in_english(config)]
+    found = [*remarks(config), *own, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
     return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]

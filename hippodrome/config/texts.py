@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Keys, Mistake, Remark
 from hippodrome.config.each_value import Checked
+from hippodrome.config.english import is_not_english
 from hippodrome.config.project_keys import TEXTS
 from hippodrome.model.texts import ENGLISH, LANGUAGE, places, texts_of
 from protocol.values import show
 
 _BRACES = re.compile(r"\{[^{}]*\}")
-_LANGUAGE = re.compile(r"[A-Za-z]{2,3}(-[A-Za-z0-9]{2,8}){0,3}")
+_LANGUAGE = re.compile(
+    r"[A-Za-z]{2,3}(-[A-Za-z]{4})?(-([A-Za-z]{2}|[0-9]{3}))?(-([A-Za-z0-9]{5,8}|[0-9][A-Za-z0-9]{3}))?"
+)
+"""What browsers take for a language: with its script, region and variant. For others their scripts get an error."""
+_HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
+_QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
 _SHOWN = 3  # names of texts in a remark
 
@@ -26,6 +31,8 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
         elif wrong := [place for place in _BRACES.findall(text) if place[1:-1] not in places(ENGLISH[name])]:
             yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")
+        elif left := re.search("[{}]", _BRACES.sub("", text)):
+            yield Mistake((*TEXTS, name), f"participants would read {left[0]}, a brace too many; {_known(name)}")
 
 
 def _known(name: str) -> str:
@@ -36,22 +43,37 @@ def _known(name: str) -> str:
     return f"there {'are' if first else 'is'} {' and '.join(filter(None, [', '.join(first), last]))}"
 
 
+def shown_as_they_are(config: Config) -> Iterator[Remark]:
+    """What to say of texts in which participants read signs that were meant for a program."""
+    for name, text in config.project.own_texts.items():
+        if found := _HTML.search(text):
+            yield Remark((*TEXTS, name), f"participants read {found[0]} as it stands here: a text is no HTML")
+        elif _QUOTED.fullmatch(text):
+            said = f'participants read the quotation marks, too; YAML\'s own are "…", not {text[0]}…{text[-1]}'
+            yield Remark((*TEXTS, name), said)
+
+
 def left_in_english(config: Config) -> Iterator[Remark]:
     """What to say of a study in another language: texts of ours that its participants may read in English.
 
-    Its `texts` say which language it is in, or its pages do.
+    Its `texts` say which language it is in, or its pages do. If neither does, the words of both tell.
     """
     own = config.project.own_texts
+    pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
+    languages = [found[1] for page in pages if (found := _PAGE_LANGUAGE.search(page))]
+    if not (languages or LANGUAGE in own) and is_not_english([*pages, *own.values()]):
+        yield _unnamed(own)
+        return
     needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions)
-    yield from _left(own, _languages(file for step in config.steps for file in step.files), needed)
+    yield from _left(own, languages, needed)
 
 
-def _languages(files: Iterable[Path]) -> Iterator[str]:
-    """What step pages say of their language."""
-    for file in files:
-        found = _PAGE_LANGUAGE.search(file.read_text(encoding="utf-8", errors="replace"))
-        if found:
-            yield found[1]
+def _unnamed(own: Mapping[str, str]) -> Remark:
+    said = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are"
+    if own:
+        return Remark(TEXTS, f"{said}; give the language of these texts, such as language: fr")
+    how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
+    return Remark(TEXTS[:1], f"{said}; {how}")
 
 
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 
 from hippodrome.config.diagnostics import Keys, where_of
-from hippodrome.config.project_keys import NAMES, STEPS
+from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
+from hippodrome.model.texts import ENGLISH
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""
@@ -16,11 +17,15 @@ _ELSEWHERE = {section: names for section, names in NAMES.items() if section != (
 """Where a key may have been meant to stand. The names in a scene, such as width, may be those of anything else."""
 
 
+_AROUND_TEXTS = ((), TEXTS[:-1])
+"""Where texts stand if they are not indented far enough."""
+
+
 def explain(path: Keys) -> tuple[str, list[Keys]]:
     """What to say about an unknown key, and the path it was meant for, if there is a good guess."""
     section, key = path[:-1], str(path[-1])
     own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
-    home = _home(key)
+    home = _home(key, section)
     if home is not None:
         place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
@@ -38,7 +43,7 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
 def meant_for(path: Keys) -> Keys | None:
     """The path of the key that was most likely meant by an unknown one: misplaced, or with a typing error."""
     section, key = path[:-1], str(path[-1])
-    home = _home(key)
+    home = _home(key, section)
     if home is not None:
         return (*home, key)
     for home in (section, *_ELSEWHERE):
@@ -48,11 +53,12 @@ def meant_for(path: Keys) -> Keys | None:
     return None
 
 
-def _home(key: str) -> Keys | None:
-    """The section that has this key."""
+def _home(key: str, section: Keys) -> Keys | None:
+    """The section that has this key, which stands in `section`."""
     if key == FINAL or key.isdecimal():
         return STEPS
-    return next((home for home, known in _ELSEWHERE.items() if key in known), None)
+    texts = TEXTS if key in ENGLISH and section in _AROUND_TEXTS else None
+    return next((home for home, known in _ELSEWHERE.items() if key in known), texts)
 
 
 def _nearest(key: str, home: Keys, cutoff: float) -> str | None:

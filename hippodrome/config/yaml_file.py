@@ -34,6 +34,13 @@ _NO_SPACE = re.compile(r"\s*(?:- +)?(?P<key>[\w-]+):(?P<value>[^\s:/].*)")
 """`key:value`, which YAML takes for a text."""
 _MATCHED_BY = re.compile(r"\s*matching: +(?P<how>same|different): +(?P<field>[^\s{}#][^{}#]*?)\s*(?:#|$)")
 """`matching: same: language`: a map in one line needs braces."""
+_ENDED = re.compile(r"""\s*(?:- +)?[\w-]+: +(?P<read>"[^"]*"|'[^']*'|\{[^{}]*\})\s*""")
+"""A text in quotes, or a map in braces, behind which the line goes on."""
+_NOT_ENDED = {
+    '"': 'inside of "…" write \\" for a quotation mark',
+    "'": 'put a text with an apostrophe into "…"',
+    "{": 'put a text that begins with { into "…"',
+}
 
 
 class UnreadableConfig(Exception):
@@ -129,6 +136,10 @@ def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
             return UnreadableConfig(f'an unexpected colon; write "{better}"', number + 1)
         message = "an unexpected colon; check the indentation, put text with a colon in quotes"
         return UnreadableConfig(message, number + 1)
+    ended = _ENDED.fullmatch(source[: mark.column]) if "expected <block end>" in problem else None
+    if ended:
+        rest = printable(source[mark.column :].strip())
+        return UnreadableConfig(f"the value ends before {rest}; {_NOT_ENDED[ended['read'][0]]}", number + 1)
     if "expected <block end>" in problem and "<scalar>" not in problem:
         message = "the indentation does not match the lines above; a section's keys start in one column"
         return UnreadableConfig(message, number + 1)

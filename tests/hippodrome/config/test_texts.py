@@ -8,15 +8,16 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from hippodrome.config import parse_registration, read_project
+from hippodrome.config import english, parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
 from hippodrome.model.project import Project
 from hippodrome.model.texts import ENGLISH, texts_of
-from tests.hippodrome.config.folder import SMALL, folder, one, read, small
+from tests.hippodrome.config.folder import SMALL, folder, mistakes, one, read, small
 
 __all__ = ["folder"]
 
-GERMAN = (Path(__file__).parents[3] / "docs" / "texts.de.yml").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[3]
+GERMAN = (ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8")
 PAGES = """\
 project:
   id: small
@@ -49,6 +50,22 @@ def remarks(folder: Path, config: str) -> list[str]:
         (
             '{gameOf: "{game} {of} {games}"}',
             "project.texts.gameOf: nothing stands for {of} here; there are {game} and {games}",
+        ),
+        (
+            '{step: "{step} {of {steps}"}',
+            "project.texts.step: participants would read {, a brace too many; there are {step} and {steps}",
+        ),
+        (
+            '{seconds: "{{seconds}}"}',
+            "project.texts.seconds: participants would read {, a brace too many; there is {seconds}",
+        ),
+        (
+            '{start: "Los }"}',
+            "project.texts.start: participants would read }, a brace too many; this text has no places",
+        ),
+        (
+            "{language: fr-FRA}",
+            'project.texts.language: must be a language as pages name it, such as de or pt-BR, not "fr-FRA"',
         ),
         ('{start: "Los {}"}', "project.texts.start: nothing stands for {} here; this text has no places"),
         ("{start: [Los]}", 'project.texts.start: must be text, in quotes: "…", not a list'),
@@ -118,6 +135,88 @@ def test_only_one_text_that_stays_english_is_named(folder: Path) -> None:
 @pytest.mark.parametrize("texts", ["    continue: Next page\n", "    language: en-GB\n    continue: Next page\n"])
 def test_a_study_in_english_gets_no_remark(folder: Path, texts: str) -> None:
     assert remarks(folder, with_texts(SMALL, texts)) == []
+
+
+@pytest.mark.parametrize(
+    "language", ["en", "fil", "pt-BR", "es-419", "zh-Hant-TW", "sr-Latn", "de-CH-1996", "ca-ES-valencia"]
+)
+def test_a_language_with_its_script_region_and_variant(folder: Path, language: str) -> None:
+    assert read(folder, with_texts(SMALL, f"    language: {language}\n")).project.own_texts == {"language": language}
+
+
+FRENCH = (
+    "<h1>Souhaitez-vous participer ?</h1><p>Vous allez jouer à un petit jeu avec une autre personne. Cela dure environ "
+    "cinq minutes. Nous enregistrons vos réponses et vos actions dans le jeu, sans votre nom. Vous pouvez arrêter à tout "
+    "moment en fermant cette page.</p>{# the and you to #}<script>with the and you</script><p class='to you and the'>Merci beaucoup de votre "
+    "aide, et à bientôt !"
+)
+NOT_ENGLISH = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are; "
+
+
+def unnamed(folder: Path, config: str) -> list[str]:
+    """The remarks on a study that does not name its language."""
+    found = [str(said) for said in remarks_on(folder, read(folder, config))]
+    return [said for said in found if NOT_ENGLISH in said]
+
+
+def test_a_study_in_another_language_that_does_not_name_it_gets_a_remark(folder: Path) -> None:
+    (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
+    how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
+    assert unnamed(folder, PAGES) == [f"config.yml:1: remark: project: {NOT_ENGLISH}{how}"]
+    how = "give the language of these texts, such as language: fr"
+    texts = with_texts(PAGES, "    continue: Continuer\n")
+    assert unnamed(folder, texts) == [f"config.yml:2: remark: project.texts: {NOT_ENGLISH}{how}"]
+    assert unnamed(folder, with_texts(PAGES, "    language: en\n")) == []
+    assert unnamed(folder, with_texts(PAGES, "    language: fr\n")) == []
+    (folder / "steps" / "thanks.html").write_text("<html lang=fr><p>Merci.", encoding="utf-8")
+    assert unnamed(folder, PAGES) == []
+
+
+def test_texts_alone_tell_that_their_language_is_missing(folder: Path) -> None:
+    texts = GERMAN[GERMAN.index("  texts:\n") :].replace("    language: de\n", "")
+    (said,) = unnamed(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
+    assert said.startswith("config.yml:3: remark: project.texts: ")
+
+
+STEPS = [ROOT / "steps", *sorted(ROOT.glob("examples/*/steps"))]
+
+
+@pytest.mark.parametrize("steps", STEPS, ids=lambda path: path.parent.name)
+def test_english_pages_are_far_from_seeming_another_language(steps: Path) -> None:
+    words = [word for file in steps.glob("*.html") for word in english.words_of(file.read_text(encoding="utf-8"))]
+    assert len(words) >= english.ENOUGH
+    assert english.share(words) > 1.5 * english.LEAST
+
+
+def test_other_languages_are_far_from_seeming_english() -> None:
+    dutch = "Wilt u meedoen? U speelt een spel met een ander. Het is kort. We bewaren of u dat wilt uw antwoorden in de data."
+    for text in (FRENCH, GERMAN[GERMAN.index("language: de") :], dutch):
+        assert english.share(english.words_of(text)) < english.LEAST / 4
+    assert not english.is_not_english(["Zu wenig, als dass man es wissen kann."])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<b>Weiter</b>", "participants read <b> as it stands here: a text is no HTML"),
+        ("Weiter&nbsp;!", "participants read &nbsp; as it stands here: a text is no HTML"),
+        ("“Weiter”", 'participants read the quotation marks, too; YAML\'s own are "…", not “…”'),
+        ("« Weiter »", 'participants read the quotation marks, too; YAML\'s own are "…", not «…»'),
+        ("Wenn 1 < 2 & 3 > 2, „weiter“!", None),
+    ],
+)
+def test_signs_that_are_meant_for_a_program_get_a_remark(folder: Path, text: str, said: str | None) -> None:
+    found = [str(each) for each in remarks_on(folder, read(folder, with_texts(SMALL, f"    continue: '{text}'\n")))]
+    expected = [f"config.yml:3: remark: project.texts.continue: {said}"] if said else []
+    assert [each for each in found if "project.texts.continue" in each] == expected
+
+
+def test_texts_that_are_not_indented_far_enough_are_told_where_they_belong(folder: Path) -> None:
+    belongs = "unknown key; it belongs under project.texts (check the indentation)"
+    text = SMALL.replace("project:\n", "project:\n  texts:\n  language: de\n  waited: Gewartet\n", 1)
+    expected = [f"config.yml:3: project.language: {belongs}", f"config.yml:4: project.waited: {belongs}"]
+    assert mistakes(folder, text) == expected
+    assert one(folder, f"{SMALL}continue: Weiter\n") == f"continue: {belongs}"
 
 
 def test_a_study_needs_only_the_texts_that_its_participants_may_read() -> None:
