@@ -24,7 +24,7 @@ from hippodrome.model import ids
 from hippodrome.model.server import Reason, State
 from tests import first_hour
 from tests.deploy.installation import ROOT
-from tests.deploy.living import Living, held
+from tests.deploy.running_installation import RunningInstallation, held
 
 REHEARSE = 'make doctor ARGS="--rehearse"'
 PLAY = 'make doctor ARGS="--rehearse --play 2 --transcript transcript.json"'
@@ -41,7 +41,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.fixture(scope="module")
-def living() -> Iterator[Living]:
+def running() -> Iterator[RunningInstallation]:
     """The installation after `make deploy`."""
     with pytest.MonkeyPatch.context() as patch, held(ROOT, patch, play=4.0, email="you@example.org") as world:
         yield world
@@ -57,50 +57,55 @@ def arguments(command: str) -> list[str]:
     return words[words.index("deploy") + 1 :]
 
 
-def types(living: Living, capsys: Any, command: str, answer: str = "") -> None:
+def types(running: RunningInstallation, capsys: Any, command: str, answer: str = "") -> None:
     """Type a command of the page; it prints what the page shows."""
     # Gap: there is no Internet that could be asked for the site and the zone.
     more = ["--only-aws"] if command.startswith("make doctor") else []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdin", Terminal(f"{answer}\n"))
-        ran = living.run(capsys, *arguments(command), *more)
+        ran = running.run(capsys, *arguments(command), *more)
     assert ran.code == Exit.DONE, ran.err + ran.out
     said = ran.err.replace("Begin? [y/N] ", f"Begin? [y/N] {answer}\n") + ran.out  # what is typed is seen at a terminal
-    assert first_hour.differs(first_hour.shown()[command], said, living.root_domain) == "", said
+    assert first_hour.differs(first_hour.shown()[command], said, running.root_domain) == "", said
 
 
-def test_one_server_is_rehearsed(living: Living, capsys: Any) -> None:
-    types(living, capsys, REHEARSE)
+def test_one_server_is_rehearsed(running: RunningInstallation, capsys: Any) -> None:
+    types(running, capsys, REHEARSE)
 
 
 def test_bots_prove_what_the_page_says(
-    living: Living, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    running: RunningInstallation, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    types(living, capsys, PLAY, answer="y")
+    types(running, capsys, PLAY, answer="y")
     assert json.loads((tmp_path / "transcript.json").read_text())["schema"] == 1
 
 
 @pytest.fixture
-def played(living: Living) -> None:
+def played(running: RunningInstallation) -> None:
     """Somebody has taken part, and their server is gone."""
-    (project,) = registered_projects(living.platform.documents)
-    living.participant("me", answered=5, project=project)
+    (project,) = registered_projects(running.platform.documents)
+    running.participant("me", answered=5, project=project)
     now = datetime.now(UTC)
     then = max(now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0))  # it was today
-    living.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)
+    running.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)
     body = gzip.compress("".join(f"{json.dumps(line)}\n" for line in lines).encode())
-    living.put(f"{STUDY}/users/me/trials/{name}/3-episode-0001.jsonl.gz", body)
+    running.put(f"{STUDY}/users/me/trials/{name}/3-episode-0001.jsonl.gz", body)
 
 
 @pytest.mark.parametrize("command", [STATUS, DATA, COST])
 def test_what_came_of_it_is_shown(
-    living: Living, played: None, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+    running: RunningInstallation,
+    played: None,
+    capsys: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
 ) -> None:
     for name in ("config.yml", "agent.py"):  # in a folder of its own: `make data` writes into it
         shutil.copy(ROOT / name, tmp_path)
     shutil.copytree(ROOT / "steps", tmp_path / "steps")
     monkeypatch.chdir(tmp_path)
-    types(living, capsys, command)
+    types(running, capsys, command)

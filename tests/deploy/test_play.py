@@ -39,7 +39,7 @@ from testing.moto_world import MotoWorld
 from testing.simulation import conditions, tasks
 from testing.studies import study
 from tests.deploy.installation import ROOT, Ran
-from tests.deploy.living import Living, held
+from tests.deploy.running_installation import RunningInstallation, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
 from tests.trial.two_players import two_players
 
@@ -65,7 +65,7 @@ def write_study(
 
 
 @pytest.fixture
-def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
+def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
     """An installation that lives, with one live study."""
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
     with held(write_study(tmp_path / "study"), monkeypatch, play=1.5, email="admin@example.org") as world:
@@ -73,7 +73,7 @@ def living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
 
 
 @pytest.fixture
-def living_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Living]:
+def running_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
     """An installation that lives, with one live study in which two participants play together."""
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
     both = {"players": {"left": "human", "right": "human"}, "countdown": 0, "actionSpace": ["noop", "up", "down"]}
@@ -87,39 +87,39 @@ def living_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Liv
         yield world
 
 
-def play(living: Living, capsys: Any, *arguments: str) -> Ran:
-    return living.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
+def play(running: RunningInstallation, capsys: Any, *arguments: str) -> Ran:
+    return running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
 
 
-def documents(living: Living) -> set[str]:
+def documents(running: RunningInstallation) -> set[str]:
     """What lies in the bucket."""
-    return set(living.keys())
+    return set(running.keys())
 
 
-def versions(living: Living) -> set[str]:
+def versions(running: RunningInstallation) -> set[str]:
     """The keys of every version and delete marker."""
-    found = living.client("s3").list_object_versions(Bucket=living.env["BUCKET"])
+    found = running.client("s3").list_object_versions(Bucket=running.env["BUCKET"])
     return {line["Key"] for line in [*found.get("Versions", ()), *found.get("DeleteMarkers", ())]}
 
 
-def assert_nothing_left(living: Living) -> None:
-    assert [task.name for task in living.platform.tasks.list()] == []
-    assert (living.records(), living.timers()) == ({}, {})
-    assert [key for key in versions(living) if "rehearsal" in key or key.startswith("_servers/")] == []
-    assert [one.id for one in registered_projects(living.platform.documents)] == [STUDY]
+def assert_nothing_left(running: RunningInstallation) -> None:
+    assert [task.name for task in running.platform.tasks.list()] == []
+    assert (running.records(), running.timers()) == ({}, {})
+    assert [key for key in versions(running) if "rehearsal" in key or key.startswith("_servers/")] == []
+    assert [one.id for one in registered_projects(running.platform.documents)] == [STUDY]
 
 
 # The whole
 
 
 def test_a_rehearsal_proves_everything_and_leaves_nothing(
-    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(whole, "FRESH", FRESH)
-    living.visited = f"projectId={STUDY}&userId=somebody"  # so that a function has just read the list of projects
-    living.until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(living))
-    before, file = documents(living), tmp_path / "transcript.json"
-    ran = play(living, capsys, "--json", "--transcript", str(file))
+    running.visited = f"projectId={STUDY}&userId=somebody"  # so that a function has just read the list of projects
+    running.until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(running))
+    before, file = documents(running), tmp_path / "transcript.json"
+    ran = play(running, capsys, "--json", "--transcript", str(file))
     assert ran.code == Exit.DONE, ran.out
     told = json.loads(file.read_text())
     assert told == ran.json["transcript"]
@@ -133,19 +133,21 @@ def test_a_rehearsal_proves_everything_and_leaves_nothing(
     assert texts["data"].startswith("8 answers and 3 recordings")
     stages = next(line["seconds"] for line in told["lines"] if line["key"] == "times")
     assert {stage: bool(seconds) for stage, seconds in stages.items()} == dict.fromkeys(STAGES, True)
-    assert walk.KILLED in living.stopped
-    assert living.alarmed == ["ALARM", "OK"]
+    assert walk.KILLED in running.stopped
+    assert running.alarmed == ["ALARM", "OK"]
     # What is kept as evidence names nobody, opens nothing, and does not say whose account this is.
-    secrets = {*living.secrets, ACCOUNT, living.root_domain, living.env["BUCKET"], living.ids["zone"], "arn:aws"}
+    secrets = {*running.secrets, ACCOUNT, running.root_domain, running.env["BUCKET"], running.ids["zone"], "arn:aws"}
     assert [secret for secret in secrets if secret in file.read_text() or secret in ran.err] == []
     assert len(secrets) > 10
     # And nothing is left of it.
-    assert documents(living) == before
-    assert_nothing_left(living)
+    assert documents(running) == before
+    assert_nothing_left(running)
 
 
-def test_a_rehearsal_of_a_study_for_two_counts_their_session_once(living_pair: Living, capsys: Any) -> None:
-    ran = play(living_pair, capsys, "--json")
+def test_a_rehearsal_of_a_study_for_two_counts_their_session_once(
+    running_pair: RunningInstallation, capsys: Any
+) -> None:
+    ran = play(running_pair, capsys, "--json")
     told = ran.json["transcript"]
     assert {line["key"]: line["text"] for line in told["lines"] if line["mark"] != "good"} == {}, ran.out
     assert list(told["proven"]) == list(LINES)
@@ -155,17 +157,17 @@ def test_a_rehearsal_of_a_study_for_two_counts_their_session_once(living_pair: L
     assert texts["killed"].startswith("The server counted as lost (spot); another was ready")
     assert texts["end"].startswith("1 server ended")
     assert " for 3 servers with " in texts["cost"], "the session's two attempts, and the one that its timer ends"
-    assert_nothing_left(living_pair)
+    assert_nothing_left(running_pair)
 
 
 def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
-    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch
+    running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    living.broken["hippodrome-sweep"] = '{"errorType": "KeyError", "errorMessage": "secret"}'
-    living.deaf = living.asleep = True
+    running.broken["hippodrome-sweep"] = '{"errorType": "KeyError", "errorMessage": "secret"}'
+    running.without_alarms = running.without_timers = True
     monkeypatch.setattr(upkeep, "ACTED", 0.5)
     monkeypatch.setattr(upkeep, "FIRED", 0.5)
-    ran = play(living, capsys, "--json")
+    ran = play(running, capsys, "--json")
     assert ran.code == Exit.FAILED
     told = {line["key"]: line for line in ran.json["transcript"]["lines"]}
     assert {key for key, line in told.items() if line["mark"] != "good"} == {"timer", "sweep", "alarm"}
@@ -174,12 +176,12 @@ def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
     assert "its topic was not told" in told["alarm"]["text"]
     assert all(told[key]["advice"] for key in ("timer", "sweep", "alarm"))
     assert set(told) == set(LINES)
-    assert living.alarmed == ["ALARM", "OK"], "it was set back all the same"
-    assert_nothing_left(living)
+    assert running.alarmed == ["ALARM", "OK"], "it was set back all the same"
+    assert_nothing_left(running)
 
 
 def test_ctrl_c_in_the_midst_removes_everything(
-    living: Living, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     watch = walk.Walk._watch
 
@@ -189,47 +191,47 @@ def test_ctrl_c_in_the_midst_removes_everything(
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(walk.Walk, "_watch", pressed)
-    ran = play(living, capsys, "--transcript", str(tmp_path / "transcript.json"))
+    ran = play(running, capsys, "--transcript", str(tmp_path / "transcript.json"))
     assert ran.code == Exit.INTERRUPTED
-    assert living.secrets, "servers had been started"
-    assert_nothing_left(living)
+    assert running.secrets, "servers had been started"
+    assert_nothing_left(running)
     told = json.loads((tmp_path / "transcript.json").read_text())
     assert [line["key"] for line in told["lines"]][-2:] == ["cost", "erased"]
     assert "data" not in told["proven"]
 
 
-def test_a_rehearsal_that_was_killed_is_removed_by_the_next(living: Living, capsys: Any) -> None:
+def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInstallation, capsys: Any) -> None:
     account = open_account()
     installation = find_installation(account)
     platform = account.platform(installation)
     copy = Copy(account, installation, platform)
     copy.make(registered_projects(platform.documents)[0])
     walked = copy.user("1")
-    living.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
-    living.record(copy.user("2"), State.CLOSED, copy.project)  # it has nothing but a server's record
+    running.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
+    running.record(copy.user("2"), State.CLOSED, copy.project)  # it has nothing but a server's record
     now = datetime.now(UTC)
     assert left_behind(platform.documents, now) == [], "it may be under way"
     assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
     assert remove(account, installation, platform, copy.id) > 5
-    assert_nothing_left(living)
+    assert_nothing_left(running)
 
 
-def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(living: Living) -> None:
+def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
     account = open_account()
     installation = find_installation(account)
     platform = account.platform(installation)
     copy = Copy(account, installation, platform)
     copy.make(registered_projects(platform.documents)[0])
     walked, sid, ahead = copy.user("1"), f"s.{1:020x}", f"s.{2:020x}"
-    living.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
-    living.put(session_key(copy.id, sid), Session(sid, 2, (Member(walked, None, 0),)).to_json())
-    living.record(sid, State.CLOSED, copy.project)
-    living.record(ahead, State.READY, copy.project)
-    living.put(f"_lobby/{copy.id}/slabel.way", b"{}")
-    living.put(decisions.key(copy.id), to_json(Decisions(1, open=(Ahead(ahead, datetime.now(UTC)),))))
+    running.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
+    running.put(session_key(copy.id, sid), Session(sid, 2, (Member(walked, None, 0),)).to_json())
+    running.record(sid, State.CLOSED, copy.project)
+    running.record(ahead, State.READY, copy.project)
+    running.put(f"_lobby/{copy.id}/slabel.way", b"{}")
+    running.put(decisions.key(copy.id), to_json(Decisions(1, open=(Ahead(ahead, datetime.now(UTC)),))))
     remove(account, installation, platform, copy.id, users=copy.users)
-    assert_nothing_left(living)
-    assert living.keys("_lob") == []
+    assert_nothing_left(running)
+    assert running.keys("_lob") == []
 
 
 @pytest.mark.parametrize("name", ["rehearsal-20261122", "rehearsal-deadbeef", "rehearsal-1"])
@@ -261,23 +263,25 @@ def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
 # Asking
 
 
-def test_nothing_is_begun_without_a_yes(living: Living, capsys: Any) -> None:
-    before = documents(living)
-    ran = living.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "3")
+def test_nothing_is_begun_without_a_yes(running: RunningInstallation, capsys: Any) -> None:
+    before = documents(running)
+    ran = running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "3")
     assert ran.code == Exit.DECLINED
     assert re.search(r"3 bots and three servers more, .* It costs about \$0\.\d\d, \$0\.\d\d at most", ran.err), ran.err
-    assert documents(living) == before
+    assert documents(running) == before
 
 
-def test_playing_is_a_kind_of_rehearsal(living: Living, capsys: Any) -> None:
-    ran = living.run(capsys, "doctor", "--play", "1")
+def test_playing_is_a_kind_of_rehearsal(running: RunningInstallation, capsys: Any) -> None:
+    ran = running.run(capsys, "doctor", "--play", "1")
     assert (ran.code, "--rehearse --play" in ran.err) == (Exit.FAILED, True)
 
 
-def test_a_transcript_that_cannot_be_written_is_told_before_anything_is_begun(living: Living, capsys: Any) -> None:
-    ran = play(living, capsys, "--transcript", "/nowhere/transcript.json")
+def test_a_transcript_that_cannot_be_written_is_told_before_anything_is_begun(
+    running: RunningInstallation, capsys: Any
+) -> None:
+    ran = play(running, capsys, "--transcript", "/nowhere/transcript.json")
     assert (ran.code, "There is no folder /nowhere" in ran.err) == (Exit.FAILED, True)
-    assert living.secrets == set()
+    assert running.secrets == set()
 
 
 # The copy

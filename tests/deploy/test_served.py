@@ -1,4 +1,4 @@
-"""An account on moto that several threads and processes use at once, as `Living` and commands as processes do."""
+"""An account on moto that several threads and processes use at once, as `RunningInstallation` and commands as processes do."""
 
 from __future__ import annotations
 

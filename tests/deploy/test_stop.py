@@ -47,7 +47,7 @@ def start(world: Installed, project: str, *users: str) -> None:
     assert servers.tasks_changed([event for event in events if event]) == []
 
 
-def living(world: Installed) -> list[str]:
+def running_servers(world: Installed) -> list[str]:
     return [task.name for task in world.platform.tasks.list()]
 
 
@@ -62,7 +62,7 @@ def test_every_server_is_stopped_and_its_page_will_say_who_did_it(world: Install
     start(world, "other", "x")
     ran = world.run(capsys, "stop", "--yes", "--json")
     assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 31)
-    assert (living(world), world.records(), world.timers()) == ([], {}, {})
+    assert (running_servers(world), world.records(), world.timers()) == ([], {}, {})
     assert reasons(world, "maze", *people) == {Reason.STOPPED}
     assert "Participants can start a server again" in ran.err
     assert not any(person in ran.out + ran.err for person in people)
@@ -82,7 +82,7 @@ def test_only_one_project(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice")
     start(world, "other", "alice")
     assert world.run(capsys, "stop", "--yes", "--project", "maze").code == Exit.DONE
-    assert living(world) == [ids.server_name(ids.server_label("other", "alice"), 1)]
+    assert running_servers(world) == [ids.server_name(ids.server_label("other", "alice"), 1)]
     assert len(world.records()) == len(world.timers()) == 1
 
 
@@ -94,7 +94,7 @@ def test_a_dry_run_and_no_answer_change_nothing(world: Installed, capsys: Any) -
     assert (dry.code, dry.json["found"]["servers"]) == (Exit.CHANGES, 1)
     assert asked.code == Exit.DECLINED
     assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
-    assert living(world)
+    assert running_servers(world)
 
 
 def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: Installed, capsys: Any) -> None:
@@ -108,7 +108,7 @@ def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: I
         platform.timers.set(name, platform.now(), {})
     platform.dns.change(add=[DnsRecord("www.example.org", "203.0.113.1")])
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
-    assert (living(world), world.timers()) == ([], {})
+    assert (running_servers(world), world.timers()) == ([], {})
     assert set(world.records()) == {f"{nobody}.example.org", "www.example.org"}
 
 
@@ -118,7 +118,7 @@ def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(worl
     tasks.create_cluster(theirs)
     tasks.run(TaskRequest(theirs, "hippodrome", theirs, 1, 2, {}))
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
-    assert living(world) == [theirs]
+    assert running_servers(world) == [theirs]
     assert [*tasks.clusters()] == [theirs]
 
 
@@ -126,7 +126,7 @@ def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, ca
     world.record("alice", State.STARTING)  # claimed; neither timer nor task yet
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
     Servers(world.platform).start(StartServer("maze", "alice"))
-    assert living(world) == []
+    assert running_servers(world) == []
 
 
 WARM = study(task_definition="hippodrome", warm_servers=3)
@@ -148,7 +148,7 @@ def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(worl
     assert ran.code == Exit.DONE
     assert "3 servers were stopped; nothing is left" in ran.err
     assert "maze will have warm ones again within five minutes; `register --no-live` closes it" in ran.err
-    assert (living(world), world.records(), world.timers(), dict(pool(world).warm_servers)) == ([], {}, {}, {})
+    assert (running_servers(world), world.records(), world.timers(), dict(pool(world).warm_servers)) == ([], {}, {}, {})
     assert world.keys("maze/spares/") == []
     assert reasons(world, "maze", "alice") == {Reason.STOPPED}
 
@@ -158,9 +158,9 @@ def test_what_somebody_plays_on_who_took_a_warm_server_is_of_their_project(world
     (name,) = world.warm(WARM, 1)
     Servers(world.platform).start(StartServer("maze", "alice"))
     assert world.run(capsys, "stop", "--yes", "--project", "other").code == Exit.DONE
-    assert living(world) == [name]
+    assert running_servers(world) == [name]
     assert world.run(capsys, "stop", "--yes", "--project", "maze").code == Exit.DONE
-    assert living(world) == []
+    assert running_servers(world) == []
 
 
 def test_a_closed_study_gets_no_warm_servers_again(world: Installed, capsys: Any) -> None:
@@ -169,7 +169,7 @@ def test_a_closed_study_gets_no_warm_servers_again(world: Installed, capsys: Any
     world.register(msgspec.structs.replace(WARM, live=False))
     assert "warm ones again" not in world.run(capsys, "stop", "--yes").err
     Servers(world.platform).start(KeepWarm("maze"))
-    assert (living(world), dict(pool(world).warm_servers)) == ([], {})
+    assert (running_servers(world), dict(pool(world).warm_servers)) == ([], {})
 
 
 def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:
@@ -179,7 +179,7 @@ def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Instal
     assert with_trouble.code == Exit.FAILED
     assert "AccessDeniedException" in with_trouble.err
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
-    assert (living(world), world.timers()) == ([], {})
+    assert (running_servers(world), world.timers()) == ([], {})
 
 
 def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed, monkeypatch: Any) -> None:
@@ -222,4 +222,4 @@ def test_as_a_process(world: Installed) -> None:
         assert process(env, "stop").code == Exit.DECLINED
         ran = process(env, "stop", "--yes", "--json")
     assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 1)
-    assert living(world) == []
+    assert running_servers(world) == []

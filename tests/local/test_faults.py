@@ -21,16 +21,16 @@ import pytest
 
 from testing import exploration
 from testing.os_faults import ERRORS, KILLS, Call, Fault, Reach
-from tests.local.faulty_home import JOURNEYS, Home, Stranded, run
+from tests.local.faulty_study import JOURNEYS, FaultyStudy, Stranded, run
 
 SEED, SAMPLE = 9, 5
 ELSEWHERE = Fault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)
 
 
-def points(home: Home) -> Iterator[Fault]:
+def points(study: FaultyStudy) -> Iterator[Fault]:
     """Every fault of a journey: at the first and the last call of each kind, at the first if it only looks."""
     yield ELSEWHERE
-    for call, count in sorted(home.injector.calls.items()):
+    for call, count in sorted(study.injector.calls.items()):
         looks = call.operation in ("stat", "process", "list", "read", "open")
         for number in {1} if looks else {1, count}:
             for error in ERRORS[call.operation]:
@@ -54,12 +54,12 @@ def went_wrong(journey: str, folder: Path, fault: Fault | None) -> list[str]:
 
 @pytest.mark.parametrize("journey", JOURNEYS)
 def test_without_faults_nothing_is_left(journey: str, tmp_path: Path) -> None:
-    assert went_wrong(journey, tmp_path / "home", None) == []
+    assert went_wrong(journey, tmp_path / "study", None) == []
 
 
 @pytest.mark.parametrize("journey", ["server_is_killed", "warm_is_given"])
 def test_a_data_folder_on_another_file_system(journey: str, tmp_path: Path) -> None:
-    assert went_wrong(journey, tmp_path / "home", ELSEWHERE) == []
+    assert went_wrong(journey, tmp_path / "study", ELSEWHERE) == []
 
 
 def test_a_few_faults_of_all(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def test_by_chance_anything_is_refused_and_everything_killed(local: Make, seed: 
     for walk in walks:
         walk.start()
     for number in range(4):
-        dicey(here, port, seed * 100 + number)
+        refused_by_chance(here, port, seed * 100 + number)
         time.sleep(dice.uniform(2, 8))
         if dice.random() < 0.5:
             for process in servers_of(here.data)[:1]:
@@ -223,11 +223,11 @@ def test_by_chance_anything_is_refused_and_everything_killed(local: Make, seed: 
     assert {json.loads(path.read_text())["state"] for path in (here.data / "_servers").iterdir()} == {"closed"}
 
 
-def dicey(here: Local, port: int, seed: int) -> None:
+def refused_by_chance(here: Local, port: int, seed: int) -> None:
     """Hold the study with calls that fail by chance."""
     with here.output.open("ab") as output:
         here.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.local.dicey_local", str(here.folder), "--port", str(port)],
+            [sys.executable, "-m", "tests.local.local_refused_by_chance", str(here.folder), "--port", str(port)],
             cwd=here.place,
             env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60", "SEED": str(seed), "CHANCE": "0.002"},
             stdout=output,

@@ -14,7 +14,7 @@ from typing import Any
 
 from websockets.asyncio.client import ClientConnection, connect
 
-from tests.trial.taking import TakesMessages
+from tests.trial.client_messages import TakesMessages
 
 KEYS = {"ArrowLeft": ("leftArrow", "left"), "ArrowRight": ("rightArrow", "right"), "KeyQ": ("leftUp", "leftUp")}
 

@@ -13,7 +13,7 @@ from local.__main__ import main
 from testing.os_faults import ERRORS, Call, Injector
 
 
-class Dice(Injector):
+class ByChance(Injector):
     """Refuses calls by chance; one in ten times all that can be refused for this reason, for a moment."""
 
     dice = random.Random(int(os.environ["SEED"]))
@@ -27,5 +27,5 @@ class Dice(Injector):
 
 if __name__ == "__main__":
     sys.argv[0] = "local"
-    with Dice(Path.cwd()).installed():
+    with ByChance(Path.cwd()).installed():
         typer.run(main)

@@ -62,8 +62,8 @@ UNTIL_KILLED = 100.0  # seconds
 NOBODY = 1  # a port on which nobody listens
 
 
-class Living(Installed):
-    """`Installed`, alive. `agent` is the folder of the agent that every server plays."""
+class RunningInstallation(Installed):
+    """`Installed`, in which things happen by themselves. `agent` is the folder of the agent that every server plays."""
 
     def __init__(self, agent: Path) -> None:
         super().__init__()
@@ -77,8 +77,8 @@ class Living(Installed):
         self.stopped: list[str] = []  # the reasons that StopTask was given
         self.alarmed: list[str] = []  # the states that alarms were set to
         self.broken: dict[str, str] = {}  # functions that fail when they are invoked, and how
-        self.deaf = False  # whether the topic of the alarms is told nothing
-        self.asleep = False  # whether timers do not fire
+        self.without_alarms = False  # whether the topic of the alarms is told nothing
+        self.without_timers = False  # whether timers do not fire
         self.visited = ""  # the query of a page that somebody looks at all the time
         self.secrets: set[str] = set()  # what servers were told that nobody else may see
         self.troubles: list[str] = []
@@ -86,7 +86,7 @@ class Living(Installed):
     def __enter__(self) -> Self:
         super().__enter__()
         try:
-            self._live()
+            self._begin()
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise
@@ -102,7 +102,7 @@ class Living(Installed):
         super().__exit__(*error)
         assert error[0] or not self.troubles, self.troubles
 
-    def _live(self) -> None:
+    def _begin(self) -> None:
         self._temporary = self._stack.enter_context(tempfile.TemporaryDirectory())
         self._served = self._stack.enter_context(self.served())
         ours: tuple[str, Any] = ("before-call", self._before_call)
@@ -192,7 +192,7 @@ class Living(Installed):
             self._look_after(arn)
 
     def _fire(self) -> None:
-        if not self.asleep:
+        if not self.without_timers:
             for name, (at, _) in self.timers().items():
                 if at < datetime.now(UTC) + NEAR:
                     with contextlib.suppress(KeyError):  # cancelled at this moment
@@ -281,11 +281,11 @@ class Living(Installed):
 
     def _history(self) -> dict[str, Any]:
         summary = f"Successfully executed action {self.alarm_topic}"
-        told = [] if self.deaf or "ALARM" not in self.alarmed else [{"HistorySummary": summary}]
+        told = [] if self.without_alarms or "ALARM" not in self.alarmed else [{"HistorySummary": summary}]
         return {"AlarmHistoryItems": told}
 
 
-def _signer(world: Living) -> http.server.ThreadingHTTPServer:
+def _signer(world: RunningInstallation) -> http.server.ThreadingHTTPServer:
     """The site's `/sign`, as API Gateway hands it to `sign_requests`; without TLS, for servers alone."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -311,7 +311,7 @@ def _signer(world: Living) -> http.server.ThreadingHTTPServer:
     return http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
 
 
-def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPServer:
+def _site(world: RunningInstallation, folder: Path, pem: bytes) -> http.server.ThreadingHTTPServer:
     """The participants' site over TLS, as API Gateway hands it to `next_step`."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -354,7 +354,7 @@ def _site(world: Living, folder: Path, pem: bytes) -> http.server.ThreadingHTTPS
 @contextlib.contextmanager
 def held(
     folder: Path, patch: pytest.MonkeyPatch, *, play: float, email: str, together: bool = False
-) -> Iterator[Living]:
+) -> Iterator[RunningInstallation]:
     """An installation that lives, with the study of this folder, as `make deploy` leaves it; its rehearsals are short.
 
     `play` is the longest game of a bot in seconds; but those on the server that is killed play until it is, however
@@ -376,7 +376,7 @@ def held(
     patch.setattr(walk, "VICTIM_PLAYS", UNTIL_KILLED)
     patch.setattr(walk, "STRUCK", 1.0)
     patch.setattr(walk, "ARRIVALS", 0.1)
-    with Living(folder) as world:
+    with RunningInstallation(folder) as world:
         patch.setattr(whole, "site", lambda context, project_id: world.where(project_id))
         registration = read_project(folder).registration()
         for page in (folder / "steps").iterdir():

@@ -45,13 +45,13 @@ class Stranded(AssertionError):
     """What should come does not come."""
 
 
-class Home:
+class FaultyStudy:
     """The folders of a study, and the processes that hold it one after the other."""
 
     def __init__(self, folder: Path, *, warm: int = 0, fault: Fault | None = None) -> None:
         folder.mkdir()
-        self.project = write_study(folder / "study", warm=warm, start=2)
-        self.root = folder / "home"
+        self.project = write_study(folder / "project", warm=warm, start=2)
+        self.root = folder / "study"
         self.data, self.state = self.root / "data", self.root / ".hippodrome" / "data"
         self.root.mkdir()
         self.injector = Injector(self.root, fault)
@@ -258,66 +258,66 @@ class Home:
 # Journeys
 
 
-def plays_and_ends(home: Home) -> None:
-    home.play()
-    home.answer("3", "bye")
+def plays_and_ends(study: FaultyStudy) -> None:
+    study.play()
+    study.answer("3", "bye")
 
 
-def server_is_killed(home: Home) -> None:
-    home.kill_server(home.tell_server("/begin"))
-    home.play(attempt=2)
-    home.answer("3", "bye")
+def server_is_killed(study: FaultyStudy) -> None:
+    study.kill_server(study.tell_server("/begin"))
+    study.play(attempt=2)
+    study.answer("3", "bye")
 
 
-def server_is_stopped(home: Home) -> None:
-    home.tell_server("/begin")
+def server_is_stopped(study: FaultyStudy) -> None:
+    study.tell_server("/begin")
     while True:
-        home.look()
+        study.look()
         try:
-            assert home.platform
-            home.platform.bus.publish(Topic.STOP, {"projectId": PROJECT, "userId": USER, "attempt": 1})
+            assert study.platform
+            study.platform.bus.publish(Topic.STOP, {"projectId": PROJECT, "userId": USER, "attempt": 1})
             break
         except (OSError, Killed):
-            home.check_time("no stop can be sent")
+            study.check_time("no stop can be sent")
             time.sleep(0.02)
-    while home.record().get("state") != "closed":
-        home.look()
-        home.check_time("it is not stopped")
+    while study.record().get("state") != "closed":
+        study.look()
+        study.check_time("it is not stopped")
         time.sleep(0.03)
 
 
-def restarted(home: Home) -> None:
-    home.tell_server("/begin")
-    home.kill()
-    home.play()
-    home.answer("3", "bye")
+def restarted(study: FaultyStudy) -> None:
+    study.tell_server("/begin")
+    study.kill()
+    study.play()
+    study.answer("3", "bye")
 
 
-def both_are_killed(home: Home) -> None:
-    page = home.tell_server("/begin")
-    home.injector.dead.set()
-    home.kill_server(page)
-    home.look()
-    home.play(attempt=2)
-    home.answer("3", "bye")
+def both_are_killed(study: FaultyStudy) -> None:
+    page = study.tell_server("/begin")
+    study.injector.dead.set()
+    study.kill_server(page)
+    study.look()
+    study.play(attempt=2)
+    study.answer("3", "bye")
 
 
-def warm_is_given(home: Home) -> None:
+def warm_is_given(study: FaultyStudy) -> None:
     """The warm server is killed in play, and another one follows."""
-    while "ready" not in _states(home):
-        home.look()
-        home.check_time("no server waits")
+    while "ready" not in _states(study):
+        study.look()
+        study.check_time("no server waits")
         time.sleep(0.03)
-    server_is_killed(home)
+    server_is_killed(study)
 
 
-def _states(home: Home) -> list[str]:
+def _states(study: FaultyStudy) -> list[str]:
     """Of all servers."""
-    with home.injector.unharmed():
-        return [json.loads(path.read_bytes())["state"] for path in (home.data / "_servers").glob("*.json")]
+    with study.injector.unharmed():
+        return [json.loads(path.read_bytes())["state"] for path in (study.data / "_servers").glob("*.json")]
 
 
-JOURNEYS: dict[str, Callable[[Home], None]] = {
+JOURNEYS: dict[str, Callable[[FaultyStudy], None]] = {
     journey.__name__: journey
     for journey in (plays_and_ends, server_is_killed, server_is_stopped, restarted, both_are_killed, warm_is_given)
 }
@@ -342,15 +342,15 @@ def hurried() -> Iterator[None]:
         yield
 
 
-def run(journey: str, folder: Path, fault: Fault | None = None) -> Home:
-    """One journey with one fault. Raises `Stranded`; `Home.wrong` says what else is not as it should be."""
-    home = Home(folder, warm=1 if journey == "warm_is_given" else 0, fault=fault)
+def run(journey: str, folder: Path, fault: Fault | None = None) -> FaultyStudy:
+    """One journey with one fault. Raises `Stranded`; `FaultyStudy.wrong` says what else is not as it should be."""
+    study = FaultyStudy(folder, warm=1 if journey == "warm_is_given" else 0, fault=fault)
     try:
-        with hurried(), home.injector.installed():
-            home.begin()
-            home.answer("1", "hello")
-            JOURNEYS[journey](home)
-            home.end()
+        with hurried(), study.injector.installed():
+            study.begin()
+            study.answer("1", "hello")
+            JOURNEYS[journey](study)
+            study.end()
     finally:
-        end_everything(home.state)
-    return home
+        end_everything(study.state)
+    return study
