@@ -10,14 +10,10 @@ from hippodrome.config.diagnostics import Keys, Mistake, Remark
 from hippodrome.config.each_value import Checked
 from hippodrome.config.english import is_not_english
 from hippodrome.config.project_keys import TEXTS
-from hippodrome.model.texts import ENGLISH, LANGUAGE, places, texts_of
+from hippodrome.model.texts import ENGLISH, LANGUAGE, is_language, places, texts_of
 from protocol.values import show
 
 _BRACES = re.compile(r"\{[^{}]*\}")
-_LANGUAGE = re.compile(
-    r"[A-Za-z]{2,3}(-[A-Za-z]{4})?(-([A-Za-z]{2}|[0-9]{3}))?(-([A-Za-z0-9]{5,8}|[0-9][A-Za-z0-9]{3}))?"
-)
-"""What browsers take for a language: with its script, region and variant. For others their scripts get an error."""
 _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
 _QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
@@ -27,7 +23,7 @@ _SHOWN = 3  # names of texts in a remark
 def mistakes(checked: Checked) -> Iterator[Mistake]:
     """What is wrong with texts that are well formed by themselves: places that nothing fills, and no language."""
     for name, text in checked.root.project.own_texts.items():
-        if name == LANGUAGE and not _LANGUAGE.fullmatch(text):
+        if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
         elif wrong := [place for place in _BRACES.findall(text) if place[1:-1] not in places(ENGLISH[name])]:
             yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")

@@ -18,6 +18,11 @@ _RIGHT_TO_LEFT = re.compile(
 )
 _SCRIPTS = re.compile("adlm|arab|hebr|mand|nkoo|rohg|samr|syrc|thaa")
 """Languages and scripts that are written from right to left, as browsers know them. Others can name their script."""
+_LANGUAGE = re.compile(
+    "[A-Za-z]{2,3}(-[A-Za-z]{4})?(-([A-Za-z]{2}|[0-9]{3}))?(-([A-Za-z0-9]{5,8}|[0-9][A-Za-z0-9]{3}))?"
+)
+"""Language, script, region, variant. Others, such as `zh-cmn` and `en-GB-UK`, are none for the browser's own functions:
+they raise RangeError (ECMA-402, section 6.2)."""
 LANGUAGE = "language"
 """The name of the text that is no text: the language of the others, as pages name it (`<html lang>`)."""
 
@@ -343,6 +348,11 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
 }
 """The English texts by their names, in the order of docs/texts.md."""
 ENGLISH: Mapping[str, str] = {name: text for group in GROUPS.values() for name, text in group.items()}
+
+
+def is_language(text: str) -> bool:
+    """Whether pages and scripts can name a language so, such as `de` or `pt-BR`."""
+    return _LANGUAGE.fullmatch(text) is not None
 
 
 def is_right_to_left(language: str) -> bool:

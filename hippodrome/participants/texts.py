@@ -11,7 +11,7 @@ import html
 import json
 import re
 
-from hippodrome.model.texts import ENGLISH, IN_ENGLISH, LANGUAGE, PLACE, Texts, places
+from hippodrome.model.texts import ENGLISH, IN_ENGLISH, LANGUAGE, PLACE, Texts, is_language, places
 
 NAMED = re.compile(r"\bTEXT\.([A-Za-z]+)")
 
@@ -22,8 +22,12 @@ def in_script(code: str, texts: Texts) -> str:
 
 
 def _for_numbers(language: str) -> str:
-    """The language in which a script has the browser write numbers: with the digits that all other numbers have."""
-    return language if language == IN_ENGLISH.language else f"{language}-u-nu-latn"
+    """The language in which a script has the browser write numbers: with the digits that all other numbers have.
+
+    English for what is no language, as a project may name it that nothing has checked: no number could be written.
+    """
+    english = IN_ENGLISH.language
+    return f"{language}-u-nu-latn" if language != english and is_language(language) else english
 
 
 def in_template(template: str, texts: Texts) -> str:

@@ -977,7 +977,7 @@ def reconnected(world: World, tab: Any) -> None:
 # The script's modules
 
 
-@pytest.mark.parametrize("sheet", ["style.css", "sessions.css"])
+@pytest.mark.parametrize("sheet", sorted(path.name for path in frame.WEB.glob("*.css")))
 def test_a_page_carries_the_same_rules_as_the_style_sheet(tab: Any, sheet: str) -> None:
     whole = (frame.WEB / sheet).read_text(encoding="utf-8")
     read = "css => { const s = new CSSStyleSheet(); s.replaceSync(css); return [...s.cssRules].map((r) => r.cssText) }"

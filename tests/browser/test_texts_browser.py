@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hippodrome.model.project import Project
-from hippodrome.model.texts import ENGLISH, PLACE, Texts, places
+from hippodrome.model.texts import ENGLISH, LANGUAGE, PLACE, Texts, is_language, places
 from hippodrome.participants import pages
 from hippodrome.participants.frame import message_page
 from hippodrome.participants.texts import in_script
@@ -40,13 +41,21 @@ def said(texts: Texts, name: str) -> str:
 @example(own={"start": "{a$"})  # twice, one behind the other
 @given(own=st.dictionaries(st.sampled_from(sorted(ENGLISH)), WORDS, min_size=1, max_size=12))
 def test_a_script_says_what_the_study_says(tab: Any, own: dict[str, str]) -> None:
-    texts, lines, wanted = Texts(own), [], []
-    for name in own:
+    texts, lines, wanted = Texts({name: text for name, text in own.items() if name != LANGUAGE}), [], []
+    for name in own.keys() - {LANGUAGE}:
         given_places = ", ".join(map(json.dumps, places(ENGLISH[name])))
         named, text = f"TEXT.{name}" + (f"({given_places})" if given_places else ""), said(texts, name)
         lines += [named, f"`a${{{named}}}{{b`", f"`${{{named}}}${{{named}}}`"]
         wanted += [text, f"a{text}{{b", f"{text}{text}"]
     assert tab.evaluate(in_script(f"[{', '.join(lines)}]", texts)) == wanted
+
+
+@given(language=st.from_regex(r"[A-Za-z]{2,3}(-[A-Za-z]{4})?(-[A-Za-z0-9]{2,3})?(-[A-Za-z0-9]{4,8})?", fullmatch=True))
+def test_numbers_can_be_written_in_each_language(tab: Any, language: str) -> None:
+    code = in_script("(12.5).toLocaleString(TEXT.language)", Texts({LANGUAGE: language}))
+    assert re.fullmatch("12.5", tab.evaluate(code))
+    valid = "language => { try { return Boolean(new Intl.Locale(language)); } catch { return false; } }"
+    assert tab.evaluate(valid, language) == is_language(language)
 
 
 HOSTILE = "</script><b title='x' id=\"y\">&amp;</b><!-- ${alert(1)} `\\` $step $ {x} \u2028 __proto__ $"

@@ -78,6 +78,10 @@ def remarks(folder: Path, config: str) -> list[str]:
             "{language: German}",
             'project.texts.language: must be a language as pages name it, such as de or pt-BR, not "German"',
         ),
+        (
+            "{language: zh-cmn}",
+            'project.texts.language: must be a language as pages name it, such as de or pt-BR, not "zh-cmn"',
+        ),
         ("Los", 'project.texts: must be a section: indented lines such as "start: "Los"" below it, not "Los"'),
     ],
 )

@@ -133,6 +133,7 @@ def test_numbers_are_written_as_the_language_does_with_the_digits_of_all_other_n
     code = "n.toLocaleString(TEXT.language)"
     assert in_script(code, IN_ENGLISH) == 'n.toLocaleString("en")'
     assert in_script(code, Texts({"language": "fa"})) == 'n.toLocaleString("fa-u-nu-latn")'
+    assert in_script(code, Texts({"language": "zh-cmn"})) == 'n.toLocaleString("en")', "or no number could be written"
 
 
 EVIL = "\"`\\ ${alert(1)} </script><!-- \u2028 {game} // '$game"
