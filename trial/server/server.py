@@ -20,33 +20,26 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from protocol import exits
-from protocol.keys import answer_key
 from trial.agent import match
 from trial.agent.agent import AgentAdapter
 from trial.agent.tracebacks import report
 from trial.agent.worker import Worker
 from trial.core import messages
 from trial.core.effects import AgentTimeout
-from trial.core.messages import BadMessage, CloseConnection, CommandRefused, Hello, NotAMessage
+from trial.core.messages import BadMessage, CloseConnection, CommandRefused, NotAMessage
 from trial.core.players import PlayersError
 from trial.policies.policy import PolicyError
 from trial.programs import watch
 from trial.programs.environments import MOST, Environments
 from trial.recordings.spool import Spool, store_file
-from trial.recordings.store import Store, open_store, short_error
+from trial.recordings.store import Store, open_store
+from trial.server.admission import NOT_ASSIGNED, Admission, first_of
 from trial.server.assignment import Found, Search, set_environment
 from trial.server.drawing import Drawing
 from trial.server.handshake import (
-    OTHER_ID,
-    OTHER_STUDY,
-    check_access,
     check_matches,
-    check_member,
     is_program,
-    receive_hello,
-    show_refusal,
     token_in_address,
-    tokens_for,
 )
 from trial.server.lifetime import Lifetime, exit_hard_after
 from trial.server.listener import CLOSE_SECONDS, Listener
@@ -58,7 +51,6 @@ from trial.settings import Settings
 from trial.wire import round_trips
 from trial.wire.connection import Connection
 from trial.wire.inbound import Inbound
-from trial.wire.reconnects import Reconnects
 
 log = logging.getLogger("trial")
 
@@ -70,8 +62,6 @@ TELL_SECONDS = 5.0
 """If a trial cannot begin, the process tells it to clients that connect within so many seconds. Then it ends, and
 another server replaces it."""
 _TOLD_SECONDS = 0.3  # the same, once a client has been told
-_NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
-_TOO_OFTEN = "You connect too often. Please wait: it is tried again."
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
@@ -95,8 +85,8 @@ class Server:
         self._trials: list[TrialLoop] = []  # also those that are over: a policy or a callback may still run
         self._finished_steps: set[str] = set()
         self._search: Search
+        self._admission: Admission
         self._connections: dict[Connection, asyncio.Task[None]] = {}
-        self._reconnects = Reconnects()
         self._tasks: set[asyncio.Task[None]] = set()
         self._watchers = watch.Watchers()
         self._watching = 0  # programs that are connected
@@ -110,6 +100,7 @@ class Server:
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
         self._search = Search(self._store, settings)
+        self._admission = Admission(lambda: self.settings, self._search, self._store, self._finished_steps)
         self._listener = Listener(settings, self._store, self._connected)
         port = await self._listener.open()
         print(json.dumps({"port": port}), flush=True)
@@ -243,7 +234,7 @@ class Server:
             else:
                 await self._serve_watching(websocket)
             return
-        hello = await self._authenticate(websocket)
+        hello = await self._admission.admit(websocket)
         self._listener.authenticated(websocket)
         trial = self._trial_of(hello.step)
         drawing = self._drawing
@@ -277,7 +268,7 @@ class Server:
         """Serve a program that watches, with the token in its address. Raises CloseConnection and ConnectionClosed."""
         check_matches(token_in_address(websocket), self.settings.token)
         if not self.settings.assigned:
-            raise CloseConnection(1013, _NOT_ASSIGNED)
+            raise CloseConnection(1013, NOT_ASSIGNED)
         if self._watching >= watch.MOST:
             raise CloseConnection(1013, f"{watch.MOST} programs watch already")
         self._listener.authenticated(websocket)
@@ -295,7 +286,7 @@ class Server:
         """
         self._listener.authenticated(websocket)
         if not self.settings.assigned:
-            await websocket.close(1013, _NOT_ASSIGNED)
+            await websocket.close(1013, NOT_ASSIGNED)
         elif self._environments.connections >= MOST:
             await websocket.close(1013, f"{MOST} programs are connected already; try later.")
         else:
@@ -312,69 +303,9 @@ class Server:
             raise CommandRefused("no game is going on")
         return self._trial
 
-    async def _authenticate(self, websocket: ServerConnection) -> Hello:
-        """The first message of a client who may play. Raises CloseConnection."""
-        hello = await receive_hello(websocket, self.settings.hello_seconds)
-        try:
-            await self._admit(websocket, hello)
-        except CloseConnection as closing:
-            if closing.code == 4401 and hello.names_project and websocket.subprotocol is None:
-                await show_refusal(websocket, closing.words)
-            raise
-        if hello.step is not None and hello.step not in self.settings.game_steps:
-            raise CloseConnection(4404, "that is not a game step of this server")
-        now = asyncio.get_running_loop().time()
-        if self.settings.session and not self._reconnects.allowed(hello.user_id or "", now):
-            raise CloseConnection(4429, _TOO_OFTEN)
-        if self.settings.session and hello.step is not None:
-            await self._check_turn(hello.user_id or "", hello.step)
-        return hello
-
-    async def _admit(self, websocket: ServerConnection, hello: Hello) -> None:
-        """Raises CloseConnection unless this is a participant of this server, with the token where one is needed."""
-        warm = self.settings.warm_server
-        check_access(websocket, hello, tokens_for(self.settings, hello.user_id), self.settings.plain_origins)
-        if not self.settings.assigned:
-            await self._wait_for_assignment(websocket)
-        if warm:  # now it is known which of the tokens counts
-            check_access(websocket, hello, tokens_for(self.settings, hello.user_id), self.settings.plain_origins)
-        if self.settings.session:
-            check_member(websocket, hello.user_id, self.settings)
-        elif hello.token is None:
-            check_matches(hello.user_id, self.settings.user_id, OTHER_ID)
-            if hello.project_id is not None:  # an id may take part in two studies, and its name leads to one server
-                check_matches(hello.project_id, self.settings.project_id, OTHER_STUDY)
-        else:
-            check_matches(hello.user_id, self.settings.user_id)
-
-    async def _check_turn(self, user_id: str, step: str) -> None:
-        """Raises CloseConnection unless the member has answered every game step before this one.
-
-        Else a member whose client names a later step would begin its game, and keep the others out of theirs.
-        """
-        steps = self.settings.game_steps
-        earlier = [each for each in steps[: steps.index(step)] if each not in self._finished_steps]
-        for key in (answer_key(self.settings.project_id, user_id, each) for each in earlier):
-            try:
-                async with asyncio.timeout(self.settings.hello_seconds):
-                    found = await asyncio.to_thread(self._store.get, key)
-            except Exception as error:
-                log.warning("cannot look for an earlier answer (%s)", short_error(error))
-                raise CloseConnection(1013, _NOT_ASSIGNED) from error
-            if found is None:
-                raise CloseConnection(4404, "an earlier game step is not over for you")
-
-    async def _wait_for_assignment(self, websocket: ServerConnection) -> None:
-        """Look for the documents that say who plays here. Raises CloseConnection if they are not there in time."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self.settings.hello_seconds):
-                await _first_of(self._search.look(), websocket.wait_closed())
-        if not self.settings.assigned:
-            raise CloseConnection(1013, _NOT_ASSIGNED)
-
     async def _connect(self, trial: TrialLoop, human: str, connection: Connection) -> None:
         """Connect a client to the trial once it has begun. Raises CloseConnection if it cannot begin."""
-        await _first_of(trial.ready.wait(), connection.websocket.wait_closed())
+        await first_of(trial.ready.wait(), connection.websocket.wait_closed())
         if connection.websocket.close_code is not None:
             return  # gone before the game was ready; a client that plays now is not disturbed
         if trial.core.broken:
@@ -470,13 +401,3 @@ class Server:
 def _reason(words: str) -> str:
     """The words as the reason of a close, which has at most 123 bytes (RFC 6455, 5.5)."""
     return words.encode("utf-8", "replace")[:120].decode("utf-8", "ignore")
-
-
-async def _first_of(*waits: Coroutine[Any, Any, Any]) -> None:
-    """Wait until the first of these is done; cancel the others."""
-    tasks = [asyncio.ensure_future(wait) for wait in waits]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
