@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from pathlib import Path
 from typing import Any
 
 from local.rehearsal.study_process import ROOT, Process, StudyProcess, logs_of
@@ -12,11 +13,15 @@ from trial.recordings.recording import read
 
 
 class HeldStudy(StudyProcess):
-    """`StudyProcess`, whose process begins with its imports done."""
+    """`StudyProcess`, whose process begins with its imports done. At `port` it can be started again."""
+
+    def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
+        super().__init__(folder, data, log=log)
+        self._port = port
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         options["env"] = {**options["env"], "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT)}
-        return preloaded.start("local", arguments, **options)
+        return preloaded.start("local", [*arguments, "--port", str(self._port)], **options)  # the last one counts
 
     def steps_written(self, owner: str = "*") -> int:
         """The steps in the recordings that servers of this participant or session have not finished."""
