@@ -10,6 +10,7 @@ import pytest
 
 from hippodrome.model.texts import ENGLISH, is_right_to_left
 from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
+from tests.browser.test_together_browser import LOBBY
 
 __all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
@@ -94,3 +95,14 @@ def test_from_right_to_left_words_are_turned_and_the_game_is_not(
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-right-to-left")
+
+
+def test_the_sentence_about_empty_places_is_the_studys_own_with_its_colon(world: World, tab: Any) -> None:
+    own = "{players} places, {here} prises\u00a0: un joueur automatique prend l'autre."
+    world.more, world.step = {"texts": {"takesPlace": own}, "players": 3}, 2
+    world.state = {**LOBBY, "players": 3, "here": 2, "then": "policies", "proposed": True}
+    tab.goto(world.url)
+    sentence = own.replace("{players}", "3").replace("{here}", "2")
+    tab.wait_for_function(
+        "text => document.getElementById('lobby-here').textContent === text", arg=f"{sentence} {ENGLISH['moment']}"
+    )

@@ -88,7 +88,7 @@ function textOfSession(players, there, then) {
   if (then !== "policies") return textOfFew(players, there);
   const one = players - there === 1;
   if (there === 1) return `${one ? TEXT.aloneWithOne : TEXT.aloneWithSome} ${TEXT.moment}`;
-  return `${textOfFew(players, there)}: ${one ? TEXT.takesPlace : TEXT.takePlaces} ${TEXT.moment}`;
+  return `${one ? TEXT.takesPlace(there, players) : TEXT.takePlaces(there, players)} ${TEXT.moment}`;
 }
 
 // How long it is until the participant no longer waits, and what happens then.
