@@ -21,19 +21,26 @@ from testing import exploration, memoized_aws
 TESTS = Path(__file__).resolve().parent
 HUNT_TIMEOUT = 900  # seconds of a test that takes all its cases, where `make test` takes one of twelve
 ONE_AFTER_ANOTHER = (
-    ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
-    ("tests/browser/test_pages_browser.py",),
-    ("tests/ministack/test_first_hour.py",),
-    ("tests/browser/test_study.py",),
     ("tests/browser/",),
-    ("tests/hippodrome/aws/test_faults.py",),
-    ("tests/certificate/",),
     ("tests/trial/gym/",),
+    ("tests/browser/test_together_browser.py", "tests/browser/test_study.py"),
+    ("tests/browser/test_pages_browser.py",),
+    ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
+    ("tests/ministack/test_first_hour.py",),
+    ("tests/certificate/",),
     ("tests/deploy/test_build.py",),
-    ("tests/infra/test_enforcement.py",),
     ("tests/bench/test_bench.py",),
+    ("tests/infra/test_enforcement.py",),
+    ("tests/hippodrome/aws/test_faults.py",),
 )
-"""Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin."""
+"""Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin.
+
+Of two places that fit a test, the longer one counts.
+"""
+_PLACES = sorted(
+    ((place, number) for number, places in enumerate(ONE_AFTER_ANOTHER) for place in places),
+    key=lambda entry: -len(entry[0]),
+)
 
 
 gc.disable()  # until all is imported; see `pytest_collection_finish`
@@ -51,7 +58,7 @@ for _server in (socketserver.BaseServer, BaseWSGIServer):
 
 
 def _group(nodeid: str) -> int | None:
-    return next((number for number, places in enumerate(ONE_AFTER_ANOTHER) if nodeid.startswith(places)), None)
+    return next((number for place, number in _PLACES if nodeid.startswith(place)), None)
 
 
 def _turn(item: pytest.Item) -> int:
@@ -98,7 +105,7 @@ def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str)
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Each of `ONE_AFTER_ANOTHER` is one worker's, whole.
+    """Each of `ONE_AFTER_ANOTHER` is one worker's, whole; of the others a worker gets a few at a time.
 
     The marks `xdist_group` in them say the same, but pytest-xdist 3.8 does not see them with pytest 9.2, and says nothing
     (pytest-xdist, issue 1386).
@@ -106,14 +113,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     gc.enable()  # this process collects no tests
     if config.getoption("dist") != "loadgroup":
         return None
-    from xdist.scheduler import LoadGroupScheduling
+    from tests.scheduling import InUnits
 
-    class ByFolder(LoadGroupScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            group = _group(nodeid)
-            return str(super()._split_scope(nodeid) if group is None else group)
-
-    return ByFolder(config, log)
+    return InUnits(config, log, _group)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
