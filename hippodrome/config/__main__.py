@@ -2,6 +2,7 @@
 
 python -m hippodrome.config check [FOLDER]      print every mistake, in line order
 python -m hippodrome.config schema              print the JSON Schema, for editors
+python -m hippodrome.config texts               print all texts that participants read, to be translated
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hippodrome.config import ConfigErrors, config_schema, layout, read_project
+from hippodrome.config.texts_file import texts_file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -24,11 +26,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check.add_argument("folder", nargs="?", default=".", type=Path, help="the project's folder (default: this one)")
     check.add_argument("--strict", action="store_true", help="count what is in HIPPO Gym's form as a mistake")
     commands.add_parser("schema", help="print the JSON Schema for editors")
+    commands.add_parser("texts", help="print all texts that participants read, to be translated")
     chosen = parser.parse_args(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
     if chosen.command == "schema":
         sys.stdout.write(json.dumps(config_schema(), indent=2, ensure_ascii=False) + "\n")
+        return 0
+    if chosen.command == "texts":
+        sys.stdout.write(texts_file())
         return 0
     try:
         config = read_project(chosen.folder)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Keys, Mistake, Remark
 from hippodrome.config.each_value import Checked
-from hippodrome.config.english import is_not_english
+from hippodrome.config.english import is_not_english, words_of
 from hippodrome.config.project_keys import TEXTS
 from hippodrome.model.texts import ENGLISH, LANGUAGE, is_language, places, texts_of
 from protocol.values import show
@@ -18,6 +18,7 @@ _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
 _QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
 _SHOWN = 3  # names of texts in a remark
+_SENTENCE = 3  # words that are the same in no two languages
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
@@ -57,7 +58,7 @@ def left_in_english(config: Config) -> Iterator[Remark]:
     own = config.project.own_texts
     pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
     languages = [found[1] for page in pages if (found := _PAGE_LANGUAGE.search(page))]
-    if not (languages or LANGUAGE in own) and is_not_english([*pages, *own.values()]):
+    if not (languages or LANGUAGE in own) and (is_not_english(pages) or is_not_english(own.values())):
         yield _unnamed(own)
         return
     needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions)
@@ -77,7 +78,7 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
     foreign = [each for each in (named, *languages) if each and not _is_english(each)]
     if not foreign or (named and _is_english(named)):
         return
-    missing = [name for name in needed if name not in own]
+    missing = [name for name in needed if name not in own or _is_untouched(name, own[name])]
     if missing:
         language = foreign[0]
         path: Keys = TEXTS if own else ("project",)
@@ -85,6 +86,11 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
         which = f"{len(missing)} texts of ours stay" if len(missing) > 1 else "one text of ours stays"
         said = f"the study is in another language ({language}), and {which} English: {shown}"
         yield Remark(path, f"{said}; see docs/texts.md")
+
+
+def _is_untouched(name: str, text: str) -> bool:
+    """Whether a text has been copied and not translated. Short ones, such as Pause, can be the same in both."""
+    return text == ENGLISH[name] and len(words_of(text)) >= _SENTENCE
 
 
 def _is_english(language: str) -> bool:

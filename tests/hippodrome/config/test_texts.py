@@ -120,6 +120,15 @@ def test_texts_that_stay_english_get_one_remark(folder: Path) -> None:
     assert said == [f"config.yml:2: remark: project.texts: {which}: titleStep, studyBy, send …; see docs/texts.md"]
 
 
+ALL_ENGLISH = (ROOT / "docs" / "texts.en.yml").read_text(encoding="utf-8").partition("project:\n")[2]
+
+
+def test_sentences_that_were_copied_and_not_translated_stay_english(folder: Path) -> None:
+    texts = ALL_ENGLISH.replace("    language:", "    language: fr").replace("A study by", "Une étude de")
+    (said,) = remarks(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
+    assert "(fr), and 32 texts of ours stay English: saved, stillSending, noReply …; see" in said
+
+
 def test_a_page_says_which_language_the_study_is_in(folder: Path) -> None:
     (folder / "steps" / "consent.html").write_text("<!doctype html>\n<HTML class=x lang='de-AT'><p>Hallo")
     (said,) = remarks(folder, SMALL)
@@ -180,6 +189,9 @@ def test_texts_alone_tell_that_their_language_is_missing(folder: Path) -> None:
     texts = GERMAN[GERMAN.index("  texts:\n") :].replace("    language: de\n", "")
     (said,) = unnamed(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
     assert said.startswith("config.yml:3: remark: project.texts: ")
+    (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
+    (said,) = unnamed(folder, PAGES.replace("  id: small\n", f"  id: small\n{ALL_ENGLISH}"))
+    assert said.endswith("; give the language of these texts, such as language: fr")
 
 
 STEPS = [ROOT / "steps", *sorted(ROOT.glob("examples/*/steps"))]

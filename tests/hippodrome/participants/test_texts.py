@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from hippodrome.config.__main__ import main as command
 from hippodrome.model.texts import ENGLISH, GROUPS, IN_ENGLISH, SAID, Texts, places
 from hippodrome.participants import frame, game_modules, scripts
 from hippodrome.participants.texts import NAMED, in_script, in_template
@@ -81,6 +82,13 @@ def test_the_page_for_researchers_lists_all_texts() -> None:
     _, *sections = (ROOT / "docs" / "texts.md").read_text(encoding="utf-8").split("\n## ")
     listed = {part.split("\n")[0]: re.findall(r"^\| `(\w+)` \| (.*) \|$", part, re.MULTILINE) for part in sections}
     assert listed == {group: list(texts.items()) for group, texts in GROUPS.items()}
+
+
+def test_the_english_texts_can_be_copied_and_lack_the_language_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    file = (ROOT / "docs" / "texts.en.yml").read_text(encoding="utf-8")
+    assert yaml.safe_load(file)["project"]["texts"] == {**ENGLISH, "language": None}
+    assert command(["texts"]) == 0
+    assert capsys.readouterr().out == file
 
 
 def test_the_german_texts_are_complete() -> None:
