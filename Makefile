@@ -95,7 +95,7 @@ WORKERS ?=
 AT_ONCE := 4
 # Python keeps its bytecode, whatever the shell's environment says: every worker and every process of a test uses it.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(or $(WORKERS),$(AT_ONCE)) --dist loadgroup
-QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/test_trial_core.py tests/trial/test_trial_decisions.py \
+QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/core \
 	$(addprefix --ignore ,tests/hippodrome/aws tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py)
 
 .PHONY: test

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+from tests.trial.core.test_decisions import Driver
 from tests.trial.session_driver import SessionDriver
-from tests.trial.test_trial_decisions import Driver
 from trial.core.effects import SendMessage
 
 ON = {"afterAbsent": "policy", "substitute": "random"}

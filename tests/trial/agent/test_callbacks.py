@@ -486,7 +486,7 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
 
 
 def test_the_callbacks_of_the_documentation_run(tmp_path):
-    text = (Path(__file__).parents[2] / "docs/callbacks.md").read_text()
+    text = (Path(__file__).parents[3] / "docs/callbacks.md").read_text()
     (tmp_path / "agent.py").write_text(text.split("```python\n")[1].split("```")[0])
     agent = AgentAdapter(tmp_path, "CartPole-v1", None)
     agent.start()

@@ -17,7 +17,7 @@ import pytest
 
 from trial.agent.agent import AgentAdapter
 
-OLD_GYM = Path(__file__).parents[2] / "trial/agent/old_gym"
+OLD_GYM = Path(__file__).parents[3] / "trial/agent/old_gym"
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import Settings
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SPACE = ("noop", "up", "right")
 UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right", "fpsUp"), True)
 FRAME = np.zeros((2, 2, 3), np.uint8)

@@ -56,7 +56,7 @@ def test_a_group_that_cannot_play_is_left_out_and_told(bad: list[str]) -> None:
     assert problem
 
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 SHOWN = [
     textwrap.dedent(block)
     for name in ("agent.md", "sessions.md")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from testing.exploration import examples
-from tests.trial.test_trial_decisions import FRAME, sent
+from tests.trial.core.test_decisions import FRAME, sent
 from trial.core import messages
 from trial.core.effects import (
     Begun,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-EXAMPLE = Path(__file__).parents[2] / "agent.py"
+EXAMPLE = Path(__file__).parents[3] / "agent.py"
 
 
 def example() -> Any:

@@ -23,7 +23,7 @@ from trial.policies.policy import PolicyError
 from trial.policies.thread import PolicyThread
 
 TWO = Box(-1, 1, (2,), np.float32)
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def module(**classes: type) -> types.ModuleType:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import textwrap
 from collections import UserDict
 from pathlib import Path
@@ -394,3 +395,14 @@ def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written() -
 def test_a_circle_in_the_dict_ends_somewhere(tmp_path: Path) -> None:
     returned = '(lambda c: c.update(me=c) or {"done": False, "circle": c})({})'
     assert "circle" in line_of(tmp_path, returned)["extra"]
+
+
+def test_shapes_of_a_step():
+    five = read_step_result((1, np.float32(2), np.bool_(True), False, {"a": 1}))
+    assert (five.reward, five.terminated, five.truncated, five.info) == (2.0, True, False, {"a": 1})
+    assert read_step_result((1, 2, True, None)).terminated
+    hippo = read_step_result({"observation": 1, "reward": 3, "done": True, "info": {}, "action": np.int64(4)})
+    assert (hippo.reward, hippo.terminated, hippo.action) == (3.0, True, 4)
+    for wrong in (None, (1, 2), (1, "x", False, {}), (1, math.nan, False, {}), 5):
+        with pytest.raises(AgentError):
+            read_step_result(wrong)

@@ -21,7 +21,7 @@ from trial.recordings.recording import Recording, line
 from trial.recordings.spool import Spool
 from trial.recordings.store import FolderStore
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 class Stingy(io.FileIO):
