@@ -28,7 +28,7 @@ ONE_AFTER_ANOTHER = (
     ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
     ("tests/ministack/test_first_hour.py",),
     ("tests/certificate/",),
-    ("tests/deploy/test_build.py",),
+    ("tests/deploy/code/test_build.py",),
     ("tests/bench/test_bench.py",),
     ("tests/infra/test_enforcement.py",),
     ("tests/hippodrome/aws/test_faults.py",),

@@ -19,10 +19,10 @@ from tests.ministack.test_first_hour import BEFORE, DRAINING, FAILURES, IN_THE_W
 
 MENTIONED = {
     "make run": "tests/local",
-    "make logs ARGS=--errors": "tests/deploy/test_logs.py",
+    "make logs ARGS=--errors": "tests/deploy/operate/test_logs.py",
     "make destroy ARGS=--data": "tests/ministack/test_installation.py",
     "make register ARGS=--live": "tests/ministack/test_first_hour.py",
-    'make deploy … ARGS="--site play"': "tests/deploy/test_stack.py",
+    'make deploy … ARGS="--site play"': "tests/deploy/stack/test_stack.py",
 }
 """Commands in sentences that the story does not run, and who does."""
 
@@ -50,19 +50,19 @@ def test_commands_in_sentences_are_run_as_well() -> None:
 
 
 ELSEWHERE = {
-    "AWS has not activated this account yet.": "deploy/test_doctor.py",
-    "These credentials may not …": "deploy/test_doctor.py",
-    "The AWS credentials have expired.": "deploy/test_doctor.py",
-    "This AWS account may not run another build now.": "deploy/test_codebuild.py",
-    "The installation stands, but has no certificate. …": "deploy/test_up.py",
+    "AWS has not activated this account yet.": "deploy/operate/test_doctor.py",
+    "These credentials may not …": "deploy/operate/test_doctor.py",
+    "The AWS credentials have expired.": "deploy/operate/test_doctor.py",
+    "This AWS account may not run another build now.": "deploy/study/test_codebuild.py",
+    "The installation stands, but has no certificate. …": "deploy/lifecycle/test_up.py",
     "… wants no further orders …": "certificate/test_command.py",
     "Nothing is ordered until …": "certificate/test_command.py",
-    "The image could not be built": "deploy/test_codebuild.py",
-    "Interrupted. CloudFormation goes on with the stack …": "deploy/test_stack.py",
-    "Interrupted. The same command goes on from here.": "deploy/test_register_refused.py",
-    "Something of that name is in another region: say …": "deploy/test_destroy_waits.py",
-    "This has to wait until …; then the rest is deleted.": "deploy/test_destroy_waits.py",
-    "After … ACM still says that the site's certificate is in use by …": "deploy/test_destroy_waits.py",
+    "The image could not be built": "deploy/study/test_codebuild.py",
+    "Interrupted. CloudFormation goes on with the stack …": "deploy/stack/test_stack.py",
+    "Interrupted. The same command goes on from here.": "deploy/study/test_register_refused.py",
+    "Something of that name is in another region: say …": "deploy/lifecycle/test_destroy_waits.py",
+    "This has to wait until …; then the rest is deleted.": "deploy/lifecycle/test_destroy_waits.py",
+    "After … ACM still says that the site's certificate is in use by …": "deploy/lifecycle/test_destroy_waits.py",
 }
 """Failures that other tests bring about, and where."""
 

@@ -28,8 +28,8 @@ DATA = {
 }  # folders that a module reads at run time, seen from the project's root
 
 # Distributions of which only the modules go in that imports reach, and where following them ends. Safe where nothing
-# that we use is imported by a computed name (tests/deploy/test_build.py runs the result). Powertools' Logger leads to
-# its HTTP resolvers in one place, for values that are pydantic models: we log none.
+# that we use is imported by a computed name (tests/deploy/code/test_build.py runs the result). Powertools' Logger leads
+# to its HTTP resolvers in one place, for values that are pydantic models: we log none.
 PRUNED = {"aws-lambda-powertools": ("aws_lambda_powertools.event_handler",)}
 
 _RUNTIME = {"boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3"}

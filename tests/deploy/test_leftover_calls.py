@@ -18,7 +18,7 @@ from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import Repository
 from testing.studies import study
 from tests.deploy.installation import KEYS, Installed, installed, process  # noqa: F401
-from tests.deploy.test_stop import start
+from tests.deploy.operate.test_stop import start
 
 
 def sweep(world: Installed) -> None:

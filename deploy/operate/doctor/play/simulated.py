@@ -1,6 +1,6 @@
 """How long AWS's stages take in the simulation, in seconds. A rehearsal shows its own times beside these.
 
-The figures are those of `testing/simulation`. The commands do not import it: `tests/deploy/test_play.py` compares.
+The figures are those of `testing/simulation`, which no command imports: `tests/deploy/operate/test_play.py` compares.
 """
 
 from __future__ import annotations

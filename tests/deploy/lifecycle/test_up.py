@@ -17,7 +17,7 @@ from deploy.lifecycle.apply import ApplyRequest, Outcome
 from deploy.stack.certificate import Choice, Report
 from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Verdict
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
 CONFIG = """project:
   id: study

@@ -18,7 +18,7 @@ from lambdas import next_step, start_server
 from tests.deploy.registering import CONFIG, Town, bodies, configure, folder, machine, town, write_study
 
 __all__ = ["folder", "machine", "town"]
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]
 

@@ -16,7 +16,7 @@ from deploy.study.image.bundle import make_bundle
 from tests.deploy.registering import folder, machine, town, write_study
 
 __all__ = ["folder", "machine", "town"]
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_the_same_files_are_the_same_bundle_wherever_they_lie(folder: Path, tmp_path: Path) -> None:

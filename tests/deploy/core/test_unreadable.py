@@ -22,7 +22,7 @@ from protocol.keys import session_key
 from protocol.session import Member, Session
 from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
-from tests.deploy.test_doctor import account, context  # noqa: F401
+from tests.deploy.operate.test_doctor import account, context  # noqa: F401
 
 USER = "R_3fGxW2vPqT9aBcD"
 CHECKS = {"documents": documents.documents, "pages": documents.step_pages}

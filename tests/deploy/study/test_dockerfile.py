@@ -20,7 +20,7 @@ from tests.deploy.registering import folder, machine, town, write_study
 from tests.trial.conftest import client_of, grid_agent
 
 __all__ = ["folder", "machine", "recipe", "town"]
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> None:

@@ -15,7 +15,7 @@ from deploy.study.image.files import Ignore, project_files
 from tests.deploy.registering import folder, machine, town, write_study
 
 __all__ = ["folder", "machine", "town"]
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize("app", ["App", "src/hippogym_app"])

@@ -21,9 +21,9 @@ from deploy.stack.settings import Settings
 from hippodrome.model import ids
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
+from tests.deploy.lifecycle.test_destroy import DATA, buckets, families, installed, run
 from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
-from tests.deploy.test_destroy import DATA, buckets, families, installed, run
 
 __all__ = ["installed", "world"]
 

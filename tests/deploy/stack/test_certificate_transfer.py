@@ -19,8 +19,8 @@ from hippodrome.certificates import order
 from hippodrome.certificates.order import Issued, OrderRequest, read_chain
 from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
 from tests.deploy.certificates import chain
+from tests.deploy.lifecycle.test_destroy import TAG, buckets, make_bucket
 from tests.deploy.stack_world import DOMAIN, REGION, World, world
-from tests.deploy.test_destroy import TAG, buckets, make_bucket
 
 __all__ = ["world"]
 
