@@ -190,7 +190,7 @@ def test_tokens_of_a_script(source: str, found: str) -> None:
     assert " ".join(tokens(source)) == found
 
 
-@pytest.mark.parametrize("source", ["a }", "`a", "`a ${b`", '"a', "3a", "a <!-- b", "@"])
+@pytest.mark.parametrize("source", ["a }", "if (a) /b , c/.exec(d);", "`a", "`a ${b`", '"a', "3a", "a <!-- b", "@"])
 def test_what_is_no_script_has_no_tokens(source: str) -> None:
     with pytest.raises(ValueError):
         tokens(source)
