@@ -14,7 +14,7 @@ _TOKEN = re.compile(
     re.VERBOSE,
 )
 _REGULAR = re.compile(r"/(?![*/])(?:[^\\/\[\n]|\\.|\[(?:[^\]\\\n]|\\.)*\])+/[a-z]*")
-_DIVIDED = re.compile(r"/=|/(?= )")  # without a space it may be a regular expression, as in `if (a) /b/.exec(c)`
+_DIVIDED = re.compile(r"/=|/(?=[ (])")  # before anything else it may be a regular expression: `if (a) /b/.exec(c)`
 _TEMPLATE = re.compile(r"(?:[^`\\$]|\\.|\$(?!\{))*(`|\$\{)", re.DOTALL)
 _OPERATORS = {"return", "typeof", "case", "in", "of", "delete", "void", "throw", "new", "else", "do", "await", "yield"}
 _ENDS = {")", "]", "}", "++", "--"}
