@@ -7,7 +7,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from tests.conftest import _group
+from tests.conftest import ONE_AFTER_ANOTHER, TESTS, _group
 from tests.scheduling import MOST, TURNS, InUnits, units
 
 WORKERS = 3
@@ -64,6 +64,11 @@ def test_the_longer_of_two_places_says_which_worker_gets_a_test() -> None:
     assert _group("tests/browser/test_pages_browser.py::test_it") != _group("tests/browser/test_examples.py::test_it")
     assert _group("tests/trial/gym/test_gym_ids.py::test_it") is not None
     assert _group("tests/trial/test_match.py::test_it") is None
+
+
+def test_what_is_one_workers_is_there() -> None:
+    places = [place for places in ONE_AFTER_ANOTHER for place in places]
+    assert [place for place in places if not (TESTS.parent / place).exists()] == []
 
 
 def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
