@@ -49,19 +49,20 @@ class Start:
     def _handle_start(self, message: StartServer) -> None:
         # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
+        of_session = is_session_id(message.user_id)
         project = self._services.project_cache.live_project(message.project_id, fresh)
-        if is_session_id(message.user_id) and not (project and project.has_sessions):  # the list may be older than it
+        if of_session and not (project and project.has_sessions):  # the list may be older than it
             project = self._services.project_cache.live_project(message.project_id, timedelta(0))
-        if project is None or (is_session_id(message.user_id) and not project.has_sessions):
+        if project is None or (of_session and not project.has_sessions):
             self._cancel_start(message)
             return
         if project.has_sessions and ids.is_user_id(message.user_id):
-            before = self._as_it_plays(project, message)
+            before = self._repository.project_of_own_server(project, message.user_id)
             if before is None:
                 self._services.lobby.under_way(project, message.user_id)
                 return
             project = before
-        if is_session_id(message.user_id):
+        if of_session:
             project = self._for_session(project, message)
         self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
         stored = self._create_or_find(project, message)
@@ -74,16 +75,6 @@ class Start:
         own = self._assign_warm_server(project, stored)
         if own is not None:
             self._start(project, own)
-
-    def _as_it_plays(self, project: Project, message: StartServer) -> Project | None:
-        """The project as the participant's own server runs it, if that was started before several players were
-        registered, and starts still or is to be replaced; else None. Whoever has a membership plays with others.
-        """
-        before = project.for_session(1)
-        stored = before and self._repository.server(ids.server_label(project.id, message.user_id))
-        if not stored or not server.plays_on(stored.server):
-            return None
-        return None if self._repository.membership(project.id, message.user_id) else before
 
     def _for_session(self, project: Project, message: StartServer) -> Project:
         """The project as this session runs it, also if another number of players is registered since.

@@ -84,6 +84,19 @@ class Repository:
 
     # Servers
 
+    def project_of_own_server(self, project: Project, user_id: str) -> Project | None:
+        """The project as a participant's own server runs it that was started before several players were registered.
+
+        None if that server has ended for good, or was never there. A participant with a membership plays with others: a
+        function that had not read the registration yet has started their own server. No call if one player is
+        registered, or never was. Errors as in `membership`.
+        """
+        before = project.for_session(1) if project.has_sessions else None
+        record = self.server_of(project.id, user_id) if before else None
+        if record is None or not server.plays_on(record):
+            return None
+        return None if self.membership(project.id, user_id) else before
+
     def server_of(self, project_id: str, user_id: str) -> Server | None:
         """The record of the participant's server; None if there is none."""
         stored = self.server(ids.server_label(project_id, user_id))

@@ -70,8 +70,8 @@ class GameStep:
         return http.html(200, page.html, page.headers)
 
     def _as_it_plays(self, visit: Visit) -> Visit:
-        """The visit of who plays on their own server, though several players are registered since, is one of before."""
-        before = self._shared.alone(visit.project, visit.user_id) if visit.project.has_sessions else None
+        """The visit with the project as the participant's own server runs it, also if several are registered since."""
+        before = self._services.repository.project_of_own_server(visit.project, visit.user_id)
         return replace(visit, project=before) if before else visit
 
     def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:

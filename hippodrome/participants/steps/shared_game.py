@@ -13,7 +13,7 @@ from hippodrome.lobby.lobby import Lobby, LobbyState, NoServerYet
 from hippodrome.model import participant
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, State, plays_on
+from hippodrome.model.server import Server, State
 from hippodrome.participants.pages import LOBBY
 from hippodrome.participants.steps.services import StepServices
 from protocol.session import member_token
@@ -74,19 +74,6 @@ class SharedGame:
         """Where the participant is without having asked; None if that is not decided yet. Nothing is written."""
         membership = self._services.repository.membership(project.id, user_id)
         return self._standing(project, membership) if membership else None
-
-    def alone(self, project: Project, user_id: str) -> Project | None:
-        """The project as the participant's own server runs it, which was started before several players were
-        registered; None if they have none any more. A read, if one player was registered before.
-
-        Whoever has a membership plays with others: their own server was started by a function that had not read the
-        registration yet.
-        """
-        before, repository = project.for_session(1), self._services.repository
-        record = repository.server_of(project.id, user_id) if before else None
-        if record is None or not plays_on(record):
-            return None
-        return None if repository.membership(project.id, user_id) else before
 
     def state_alone(
         self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
