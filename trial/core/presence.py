@@ -30,18 +30,36 @@ Over = Literal["absent", "ping"]
 
 
 @dataclass(slots=True)
+class _Countdown:
+    """Seconds that count down while it runs."""
+
+    left: float
+    until: float | None = None
+    """When they are over; None: it does not run. Meanwhile `left` stays what it was."""
+
+    def run(self, now: float, seconds: float) -> None:
+        """So many seconds count down from now on, unless it runs already."""
+        if self.until is None:
+            self.until = now + seconds
+
+    def stop(self, now: float, least: float = 0.0) -> None:
+        """Keep what is left. Having run uses up `least` seconds at least."""
+        if self.until is not None:
+            self.left, self.until = max(0.0, min(self.until - now, self.left - least)), None
+
+    def is_over(self, now: float) -> bool:
+        return self.until is not None and now >= self.until
+
+
+@dataclass(slots=True)
 class _Member:
     player: str
     samples: deque[float]
-    left: float
-    """Seconds for which the others would still wait for them. It counts down while `until` is set."""
+    waiting: _Countdown
+    """How long the others wait for them. It runs while they do."""
     measured: bool
-    until: float | None = None
-    """Until when the others wait for them; None: nobody waits for them now."""
-    to_measure: float = MEASURED_SECONDS
-    """Seconds for which their round trip may still be measured. It counts down while `measured_until` is set."""
-    measured_until: float | None = None
-    """Until when their round trip may be measured; None: it is not measured now."""
+    measuring: _Countdown = field(default_factory=lambda: _Countdown(MEASURED_SECONDS))
+    """How long their round trip may be measured. It runs while it is."""
     connected: bool = False
     stalled: bool = False
     hidden: bool = False
@@ -63,7 +81,7 @@ class _Member:
 
     @property
     def gone(self) -> bool:
-        """The others wait for them, at most until `until`. Who is here and is still measured is not gone."""
+        """The others wait for them, at most while `waiting` runs. Who is here and is still measured is not gone."""
         return self.over is None and not self.takes_part
 
     @property
@@ -107,7 +125,9 @@ class Presence:
     def __post_init__(self) -> None:
         left, samples = self.rules.absent if self.begun else self.rules.gather, self.rules.ping_samples
         measured = self.begun or not self.rules.max_ping
-        self._members = {name: _Member(name, deque(maxlen=samples), left, measured) for name in self.players}
+        self._members = {
+            name: _Member(name, deque(maxlen=samples), _Countdown(left), measured) for name in self.players
+        }
 
     # ---- what happens
 
@@ -212,10 +232,10 @@ class Presence:
         several refuses nobody.
         """
         members = self._members.values()
-        over = [one for one in members if one.until is not None and now >= one.until]
+        over = [one for one in members if one.waiting.is_over(now)]
         for member in over:
             member.over = "absent"
-        decided = [one for one in members if one.measured_until is not None and now >= one.measured_until]
+        decided = [one for one in members if one.measuring.is_over(now)]
         for member in decided:
             member.measured = True
             if not member.samples or self._too_long(member) > len(member.samples) // 2:
@@ -243,7 +263,7 @@ class Presence:
         for member in self._members.values():
             member.measured = True
             if not self.begun:
-                member.left = self.rules.absent
+                member.waiting.left = self.rules.absent
         self.begun, self.reads = True, False
         self._tell()
         return True
@@ -270,7 +290,7 @@ class Presence:
 
     def time_left(self, player: str) -> float:
         """Seconds for which the others would wait for the member from now on: none if no absence is left to them."""
-        left = self._members[player].left
+        left = self._members[player].waiting.left
         return left if left >= self._least else 0.0
 
     def over(self, player: str) -> Over | None:
@@ -306,15 +326,15 @@ class Presence:
     def wake_at(self, now: float, *, on_break: bool) -> float:
         """When to call `look` again if nothing happens; infinite if there is no need to."""
         counts = math.inf if self._counts_until is None else self._counts_until
-        measured = [one.measured_until for one in self._members.values() if one.measured_until is not None]
-        return min(self._until(now, reads=on_break), counts, *measured)
+        measuring = [one.measuring.until for one in self._members.values() if one.measuring.until is not None]
+        return min(self._until(now, reads=on_break), counts, *measuring)
 
     def round_trips(self) -> dict[str, int]:
         """The median of each member's last samples in milliseconds, of those who have some."""
         return {one.player: round(_median(one.samples) * 1000) for one in self._members.values() if one.samples}
 
     def _until(self, now: float, *, reads: bool) -> float:
-        ends = [one.until for one in self._members.values() if one.until is not None]
+        ends = [one.waiting.until for one in self._members.values() if one.waiting.until is not None]
         page = self._page_until
         if (reads or self.reads) and page is not None and not self.all_gone_on(now):
             ends.append(page)
@@ -330,16 +350,13 @@ class Presence:
         waits = self.waits
         for member in self._members.values():
             if member.gone and waits:
-                if member.until is None:
-                    member.until = now + self.time_left(member.player)
-            elif member.until is not None:
-                least = 0.0 if member.gone else self._least
-                member.left, member.until = max(0.0, min(member.until - now, member.left - least)), None
+                member.waiting.run(now, self.time_left(member.player))
+            else:
+                member.waiting.stop(now, 0.0 if member.gone else self._least)
             if member.is_measured_now:
-                if member.measured_until is None:
-                    member.measured_until = now + member.to_measure
-            elif member.measured_until is not None:
-                member.to_measure, member.measured_until = max(0.0, member.measured_until - now), None
+                member.measuring.run(now, member.measuring.left)
+            else:
+                member.measuring.stop(now)
 
     @property
     def _least(self) -> float:
@@ -352,7 +369,7 @@ class Presence:
         played, self._on_since = now - self._on_since, now
         for member in self._members.values():
             if member.here:
-                member.left = min(self.rules.absent, member.left + GIVEN_BACK * played)
+                member.waiting.left = min(self.rules.absent, member.waiting.left + GIVEN_BACK * played)
 
 
 def _where(member: _Member, page: bool, plays_on: bool) -> Where:
