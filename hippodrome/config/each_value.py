@@ -24,6 +24,7 @@ from protocol.trial_keys import names
 from protocol.trial_sections import Ui
 from protocol.values import show
 
+_EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections without keys of ours
 _ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find
 
 
@@ -142,13 +143,5 @@ def message_of(error: ErrorDetails, path: Keys) -> str:
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])
     known = NAMES.get(path)
-    example = (
-        "1: consent"
-        if path == STEPS
-        else 'start: "Los"'
-        if path == TEXTS
-        else f"{min(known)}: …"
-        if known
-        else "key: value"
-    )
+    example = _EXAMPLES.get(path) or (f"{min(known)}: …" if known else "key: value")
     return f'must be a section: indented lines such as "{example}" below it, not {show(error["input"])}'

@@ -378,16 +378,17 @@ def places(text: str) -> tuple[str, ...]:
 class Texts:
     """The texts of one study: its own words, and English where it has none. Equal and hashed by its own words."""
 
-    __slots__ = ("_own",)
+    __slots__ = ("_hash", "_own")
 
     def __init__(self, own: Mapping[str, str]) -> None:
         self._own = {name: text for name, text in own.items() if text and name in ENGLISH}
+        self._hash = hash(frozenset(self._own.items()))  # each template and script of a page asks for it
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Texts) and self._own == other._own
 
     def __hash__(self) -> int:
-        return hash(frozenset(self._own.items()))
+        return self._hash
 
     def __getitem__(self, name: str) -> str:
         return self._own.get(name, ENGLISH[name])
