@@ -10,6 +10,7 @@
   disk.py                how both sides write files on one machine, so that a power cut leaves none half written
   exits.py               the exit codes of a server
   keyboard.py            the names of keys
+  similar.py             which known name was probably meant by an unknown one
 
 It imports only the standard library, because it is part of the functions' zips and of the trial's image.
 """

@@ -5,9 +5,9 @@ Source of the names: https://www.w3.org/TR/uievents-key/. A letter is the same k
 
 from __future__ import annotations
 
-import difflib
 import re
 
+from protocol.similar import nearest
 from protocol.values import printable, show
 
 MOST_AT_ONCE = 4
@@ -65,8 +65,7 @@ def _meant(text: str) -> str | None:
     folded = text.strip().lower()
     if folded in names or folded in _OTHER_NAMES:
         return names.get(folded) or _OTHER_NAMES[folded]
-    near = difflib.get_close_matches(folded, names, n=1, cutoff=0.7)
-    return names[near[0]] if near else None
+    return nearest(folded, names.values())
 
 
 def parts(combined: str) -> tuple[str, ...]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 from protocol import values
+from protocol.similar import did_you_mean
 from protocol.values import show
 
 HUMAN = "human"
@@ -90,10 +90,8 @@ def _plays(value: object, where: str) -> str:
 
 def _meant(plays: str) -> str:
     """What was probably meant by what plays nobody; empty if nobody knows."""
-    near = difflib.get_close_matches(plays.lower(), (HUMAN, "random", "idle"), n=1)
-    if near:
-        return f"; did you mean {near[0]}?"
-    return f"; a class of agent.py is {AGENT_PLAYER}{plays}" if _CLASS.fullmatch(plays) else ""
+    as_class = f"; a class of agent.py is {AGENT_PLAYER}{plays}" if _CLASS.fullmatch(plays) else ""
+    return did_you_mean(plays, (HUMAN, "random", "idle")) or as_class
 
 
 def _one(check: values.Check, value: object, where: str) -> Any:

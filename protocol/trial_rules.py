@@ -6,11 +6,11 @@ values that it compares is wrong by itself.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterator
 
 from protocol import values
 from protocol.players import GYM_PLAYER
+from protocol.similar import did_you_mean
 from protocol.trial import Trial
 from protocol.values import Problem
 
@@ -45,9 +45,8 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
     for section, path, action in named:
         if action in names:
             continue
-        near = difflib.get_close_matches(action, names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"the actions are {values.printable(', '.join(names), 100)}"
-        sentence = f"there is no action {values.show(action)} in actionSpace; {hint}"
+        hint = did_you_mean(action, names) or f"; the actions are {values.printable(', '.join(names), 100)}"
+        sentence = f"there is no action {values.show(action)} in actionSpace{hint}"
         yield Problem((section, *path), sentence, ("actionSpace", section))
 
 

@@ -8,7 +8,6 @@ them too.
 
 from __future__ import annotations
 
-import difflib
 import re
 from typing import Annotated
 
@@ -23,6 +22,7 @@ from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
 from protocol import values
 from protocol.session import MOST_PLAYERS
+from protocol.similar import did_you_mean
 from protocol.trial import Trial
 from protocol.trial_keys import names
 from protocol.trial_sections import Scene, Ui
@@ -186,8 +186,7 @@ def text_name(value: object) -> str:
     """The name of one of our texts (`hippodrome/model/texts.py`)."""
     if isinstance(value, str) and value in ENGLISH:
         return value
-    near = difflib.get_close_matches(str(value), ENGLISH, n=1)
-    raise ValueError(f"unknown text; {f'did you mean {near[0]}?' if near else 'docs/texts.md lists all'}")
+    raise ValueError(f"unknown text{did_you_mean(str(value), ENGLISH) or '; docs/texts.md lists all'}")
 
 
 def own_text(value: object) -> str:

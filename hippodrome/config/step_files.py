@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from hippodrome.config import layout
+from protocol.similar import SIMILAR_FILES, did_you_mean
 
 CLOSING = Path(__file__).with_name("pages") / "hippodrome-the-end.html"
 """The page that ends a study which has no pages (`hippo.CLOSING_PAGE`)."""
 LIMIT_BYTES = 1024 * 1024
 
-_SIMILAR = 0.75  # how alike two names must be for one to be a slip of the other
 _VERSION = re.compile(r"(.+)-(?:0|[1-9][0-9]{0,5})")
 
 
@@ -55,11 +54,7 @@ class StepFolder:
 
     def _nearest(self, wanted: str) -> str:
         """The page that was meant, if one has nearly that name: as config.yml names it, without -k and .html."""
-        folded = {name.lower(): name for name in self._pages()}
-        near = difflib.get_close_matches(wanted.lower(), folded, n=1, cutoff=_SIMILAR)
-        if near:
-            return f"; did you mean {folded[near[0]]}?"
-        return "" if self.names else ", which is empty"
+        return did_you_mean(wanted, self._pages(), SIMILAR_FILES) or ("" if self.names else ", which is empty")
 
     def _pages(self) -> list[str]:
         """What may stand in config.yml: the names of all pages, one for all versions of a page."""

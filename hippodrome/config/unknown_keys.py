@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
-
 from hippodrome.config.diagnostics import Keys, where_of
 from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
+from protocol.similar import nearest
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""
@@ -30,7 +29,7 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
         place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
     for home in (section, *_ELSEWHERE):
-        near = _nearest(key, home, 0.6 if home == section else 0.8)
+        near = nearest(key, sorted(NAMES[home]))
         if near:
             meant = (*home, near)
             question = f"did you mean {near if home == section else where_of(meant)}?"
@@ -47,7 +46,7 @@ def meant_for(path: Keys) -> Keys | None:
     if home is not None:
         return (*home, key)
     for home in (section, *_ELSEWHERE):
-        near = _nearest(key, home, _LIKELY if home == section else _LIKELY_ELSEWHERE)
+        near = nearest(key, sorted(NAMES[home]), _LIKELY if home == section else _LIKELY_ELSEWHERE)
         if near:
             return (*home, near)
     return None
@@ -59,9 +58,3 @@ def _home(key: str, section: Keys) -> Keys | None:
         return STEPS
     texts = TEXTS if key in ENGLISH and section in _AROUND_TEXTS else None
     return next((home for home, known in _ELSEWHERE.items() if key in known), texts)
-
-
-def _nearest(key: str, home: Keys, cutoff: float) -> str | None:
-    names = {name.lower(): name for name in sorted(NAMES[home])}
-    near = difflib.get_close_matches(key.lower(), names, n=1, cutoff=cutoff)
-    return names[near[0]] if near else None

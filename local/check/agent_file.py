@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import warnings
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.config.layout import AGENT
 from hippodrome.model.matching import MATCH
 from local.check.wording import short
+from protocol.similar import did_you_mean
 from trial.agent.callback_names import NAMES
 
 
@@ -64,8 +64,8 @@ def _functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
 def _nearly_a_callback(name: str) -> str:
     if name in NAMES or not name.startswith("on_"):
         return ""
-    near = difflib.get_close_matches(name, NAMES, n=1, cutoff=0.7)
-    return f"{name} is no callback, so it is never called; did you mean {near[0]}?" if near else ""
+    hint = did_you_mean(name, NAMES)
+    return f"{name} is no callback, so it is never called{hint}" if hint else ""
 
 
 def line_of(path: Path, method: str) -> int | None:

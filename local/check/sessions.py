@@ -11,7 +11,8 @@ from hippodrome.config.folder import read_source
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.model.matching import field_of
 from local.check.earlier_answers import EarlierAnswers, source_of
-from local.check.wording import nearest, short
+from local.check.wording import short
+from protocol.similar import did_you_mean
 
 
 def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
@@ -39,7 +40,7 @@ def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
     if field in names or re.search(rf"""["'`]{re.escape(field)}["'`]""", text):
         return _too_alike(earlier, folder, config, field)
     there = f"; there are the fields {short(', '.join(names))}" if names else ", and none asks anything"
-    said = f"no page before the game asks {short(field)}{nearest(field, names) or there}"
+    said = f"no page before the game asks {short(field)}{did_you_mean(field, names) or there}"
     return read_source(folder).diagnostic(sessions.MATCHING, said)
 
 

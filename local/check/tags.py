@@ -11,7 +11,8 @@ from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments
 from hippodrome.participants.files import KINDS
 from local.check import spans
-from local.check.wording import nearest, short
+from local.check.wording import short
+from protocol.similar import SIMILAR_FILES, did_you_mean
 
 _HANDLER = re.compile(r"on[a-z]{3,}")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
@@ -122,7 +123,7 @@ class Tags(HTMLParser):
         elif name.startswith("."):
             message = f"{short(name)} is not found: its name must not begin with a dot"
         elif name not in self._names:
-            message = f"there is no {short(name)} in {self._folder}/{nearest(name, self._names)}"
+            message = f"there is no {short(name)} in {self._folder}/{did_you_mean(name, self._names, SIMILAR_FILES)}"
         else:
             return
         self._remark(message)

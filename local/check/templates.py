@@ -12,8 +12,9 @@ from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments, sandbox
 from hippodrome.participants.sandbox import FragmentError
 from local.check.earlier_answers import EarlierAnswers
-from local.check.wording import nearest, short
+from local.check.wording import short
 from protocol.answer import UNMATCHED
+from protocol.similar import did_you_mean
 
 VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
 
@@ -42,7 +43,7 @@ def check_template(
     for name in parsed.find_all(nodes.Name):
         if name.name in strangers:
             strangers.remove(name.name)
-            message = f"nothing is shown: there is no value {short(name.name)}{nearest(name.name, VALUES)}"
+            message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
     for group in groups:
         for answers in earlier.answers(group):
@@ -71,7 +72,7 @@ def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[D
     ):
         for node in parsed.find_all(node_type):
             if node.name not in known:
-                message = f"there is no {kind} {short(node.name)} in Jinja{nearest(node.name, known)}"
+                message = f"there is no {kind} {short(node.name)} in Jinja{did_you_mean(node.name, known)}"
                 yield Diagnostic(label, node.lineno, "", message)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from protocol.similar import nearest
 from trial.agent import callbacks, environments, signatures
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
@@ -130,13 +131,13 @@ def _missing(methods: Any) -> list[str]:
 
 def _meant(module: Any) -> str:
     """A question about the class of the file whose name is nearly `Agent`; empty if there is none."""
-    classes = {name.lower(): name for name, found in vars(module).items() if isinstance(found, type)}
-    near = difflib.get_close_matches("agent", classes, n=1, cutoff=0.75)
-    return f"; is {classes[near[0]]} meant to be Agent?" if near else ""
+    near = nearest("Agent", (name for name, found in vars(module).items() if isinstance(found, type)))
+    return f"; is {near} meant to be Agent?" if near else ""
 
 
 def _nearly(name: str, made: type) -> list[str]:
     """A method of the class whose name differs in a letter."""
+    # The agent is refused for it, so it must be more alike than what a message asks about (`protocol/similar.py`).
     others = [other for other in dir(made) if not other.startswith("_") and callable(getattr(made, other, None))]
     return difflib.get_close_matches(name, set(others) - set(_METHODS), n=1, cutoff=0.88)
 

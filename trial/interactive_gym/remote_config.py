@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, Self
 
+from protocol.similar import did_you_mean
 from trial.interactive_gym import options
 
 
@@ -28,7 +28,7 @@ class RemoteConfig:
             self.given.add(name)
 
     def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"RemoteConfig has no option {name}{_similar(name, tuple(options.BY_NAME))}")
+        raise AttributeError(f"RemoteConfig has no option {name}{did_you_mean(name, options.BY_NAME)}")
 
     def environment(self, *values: Any, **named: Any) -> Self:
         """The environment."""
@@ -90,7 +90,7 @@ class RemoteConfig:
         given = dict(zip(known, values, strict=False))
         for name, value in named.items():
             if name not in known:
-                raise TypeError(f"{method}() has no option {name}{_similar(name, known)}")
+                raise TypeError(f"{method}() has no option {name}{did_you_mean(name, known)}")
             given[name] = value
         for name, value in given.items():
             if value is None:
@@ -102,8 +102,3 @@ class RemoteConfig:
         if "action_mapping" in given:
             self.__dict__["game_has_composite_actions"] = any(isinstance(key, tuple) for key in self.action_mapping)
         return self
-
-
-def _similar(name: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {near[0]}?" if near else ""

@@ -5,11 +5,11 @@ A `GymScene` is a `RemoteConfig` whose texts have other names.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
+from protocol.similar import did_you_mean
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
 
@@ -157,6 +157,5 @@ def game_of(config: Any) -> Any:
 
 def __getattr__(name: str) -> Any:
     known = ("GymScene", "StaticScene", "StartScene", "EndScene", "CompletionCodeScene", "Stager", "ExperimentConfig")
-    near = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {near[0]}?" if near else "; its questions are written as a page of steps/ (docs/pages.md)"
+    hint = did_you_mean(name, known) or "; its questions are written as a page of steps/ (docs/pages.md)"
     raise AttributeError(f"there is no scene {name} here{hint}")
