@@ -30,7 +30,6 @@ from protocol.session import is_session_id
 MAX_WAITING = 4 * PARALLEL  # participants listed and not yet written down
 COMMIT_EVERY = 2  # seconds: as much work may have to be done again after a power cut
 LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
-_PIECE = 1024 * 1024  # bytes
 
 
 @dataclass

@@ -12,7 +12,7 @@ import hashlib
 import io
 import sys
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -254,8 +254,3 @@ def _parse(text: str, where: str) -> ast.Module:
 
 def _module(path: str) -> str:
     return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-
-
-def sizes(built: Iterable[Function]) -> Mapping[str, int]:
-    """The zips' sizes in bytes."""
-    return {function.name: len(function.pack()) for function in built}

@@ -88,7 +88,6 @@ class Prices(NamedTuple):
     metric_month: Price = Price(0.30, "metric-month; ten are free", "aws.amazon.com/cloudwatch/pricing")
     ecr_gb_month: Price = Price(0.10, "GB-month", "aws.amazon.com/ecr/pricing", False)
     out_gb: Price = Price(0.09, "GB to the Internet; 100 GB a month free", "aws.amazon.com/ec2/pricing/on-demand")
-    build_minute: Price = Price(0.005, "minute of general1.small", "aws.amazon.com/codebuild/pricing", False)
     explorer_request: Price = Price(
         0.01, "request to Cost Explorer", "aws.amazon.com/aws-cost-management/pricing", False
     )

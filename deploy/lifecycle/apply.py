@@ -15,7 +15,6 @@ from console.formatting import count, duration
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
-from deploy.code.packages import Target
 from deploy.core import options, register_function
 from deploy.core.finding import Finding
 from deploy.core.project_folder import Study
@@ -70,8 +69,6 @@ def apply(
     stack: str,
     settings: Settings,
     request: ApplyRequest = ApplyRequest(),
-    *,
-    target: Target | None = None,
 ) -> Outcome:
     """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
 
@@ -79,7 +76,7 @@ def apply(
     """
     began = time.monotonic()
     Stack(account, stack).settle()
-    prepared = _without_remains(_prepare(account, stack, settings, request, target))
+    prepared = _without_remains(_prepare(account, stack, settings, request))
     if not request.wrong and prepared.unchanged():
         return _nothing(account, stack, began)
     preflight.check(prepared, request.study, request.wrong, anyway=request.anyway)
@@ -102,12 +99,10 @@ def apply(
     return executor.retry(once, wait_for_role, ROLE_TRIES)
 
 
-def _prepare(
-    account: Account, stack: str, settings: Settings, request: ApplyRequest, target: Target | None
-) -> Prepared:
+def _prepare(account: Account, stack: str, settings: Settings, request: ApplyRequest) -> Prepared:
     """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
     try:
-        return prepare(account, stack, settings, target)
+        return prepare(account, stack, settings)
     except Problem as problem:
         if states.action_for(Stack(account, stack).status) is states.Action.UPDATE:
             raise

@@ -12,7 +12,6 @@ from rich.text import Text
 from console import screen
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, open_account
-from deploy.code.packages import Target
 from deploy.code.template import Template
 from deploy.core import options
 from deploy.core.finding import Finding
@@ -233,15 +232,13 @@ def show(plan: Plan, answer: bool = False) -> None:
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
-def plan(
-    account: Account, stack: str, settings: Settings, *, target: Target | None = None, study: Study | None = None
-) -> Plan:
+def plan(account: Account, stack: str, settings: Settings, *, study: Study | None = None) -> Plan:
     """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
 
     Raises `Problem`.
     """
     began = time.monotonic()
-    prepared = prepare(account, stack, settings, target)
+    prepared = prepare(account, stack, settings)
     if prepared.existing is None:
         found = of_creation(prepared.template, prepared.parameters)
         findings = preflight.look_at(preflight.InstallationCheck(prepared, study))

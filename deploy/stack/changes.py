@@ -79,7 +79,7 @@ def _same_text(stored: str, ours: str) -> bool:
     return re.sub(r"[^\x00-\x7f]", "?", stored).strip() == re.sub(r"[^\x00-\x7f]", "?", ours).strip()
 
 
-def prepare(account: Account, name: str, settings: Settings, target: Target | None = None) -> Prepared:
+def prepare(account: Account, name: str, settings: Settings) -> Prepared:
     """Build the functions, read the stack, decide on the parameters. Changes nothing in AWS. Raises `Problem`."""
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
@@ -87,7 +87,7 @@ def prepare(account: Account, name: str, settings: Settings, target: Target | No
     parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name, _subnets(found))
     if wrong := [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]:
         raise Problem("The installation cannot be made like this.", "Correct the options that are named.", wrong)
-    functions = build.functions(target or Target.from_env())
+    functions = build.functions(Target.from_env())
     template = source.with_code(functions)
     used = [function for function in functions if function.name in source.functions]
     return Prepared(account, stack, found, template, used, parameters, bucket)

@@ -22,14 +22,19 @@ STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-actio
 
 
 class BadForm(Exception):
-    """The form is refused. `status` is the HTTP status, `text` the reason.
+    """The form is refused. `status` is the HTTP status, `text` the reason, in English."""
 
-    `name` is that of the text (`hippodrome/model/texts.py`) if the form of a page can be refused so; else it is empty.
-    """
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status, self.text = status, text
 
-    def __init__(self, status: int, text: str = "", name: str = "") -> None:
-        self.status, self.text, self.name = status, text or ENGLISH[name], name
-        super().__init__(self.text)
+
+class BadPageForm(BadForm):
+    """The same of a form that one of our pages can send. A study has words of its own for the text called `name`."""
+
+    def __init__(self, status: int, name: str) -> None:
+        super().__init__(status, ENGLISH[name])
+        self.name = name
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,9 @@ class Form:
 def read(request: Request) -> Form:
     """Return the form in a request. Raises `BadForm`."""
     if request.body is None:
-        raise BadForm(400, name="formUnread")
+        raise BadPageForm(400, "formUnread")
     if len(request.body) > MAX_BODY:
-        raise BadForm(413, name="formTooLong")
+        raise BadPageForm(413, "formTooLong")
     if request.content_type == FORM:
         fields = _urlencoded(request.body)
     elif request.content_type == JSON:

@@ -37,12 +37,9 @@ class Html(str):
     __slots__ = ()
 
 
-def message_page(
-    title: str, text: str, *, link: str | None = None, link_text: str | None = None, lang: str = IN_ENGLISH.language
-) -> Page:
+def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
     """A page with one sentence, such as an error."""
     nonce = secrets.token_urlsafe(16)
-    go = fill("link", link=link, text=link_text or IN_ENGLISH["goOn"]) if link else Html()
     page = fill(
         "frame.html",
         lang=lang,
@@ -53,7 +50,7 @@ def message_page(
         body="message",
         data=Html(),
         header=Html(),
-        main=fill("message", title=title, text=text, link=go),
+        main=fill("message", title=title, text=text),
         footer=Html(),
         script=Html(),
     )
@@ -66,7 +63,7 @@ def form_message(title: str, text: str, *, step: str = "", ticket: str = "", als
     The hidden fields before it name `step`; if it is empty, such a form answers none, and gets the page that is due.
     """
     fields = fill("named", step=step, ticket=ticket)
-    return fields + also + fill("message", title=title, text=text, link=Html())
+    return fields + also + fill("message", title=title, text=text)
 
 
 def style(kind: str | None = None) -> str:
@@ -182,8 +179,7 @@ $named$content
 $content
 </fieldset>""",
     "restart": '<input type="hidden" name="hippodrome-action" value="restart">\n',
-    "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$link</div>',
-    "link": '<p><a class="button" href="$link">$text</a></p>\n',
+    "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n</div>',
     "reading": """
 <section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>
 <p class="result" id="reading-score"></p>

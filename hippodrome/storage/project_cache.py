@@ -42,9 +42,9 @@ class ProjectCache:
         """All registered projects, without their secrets, at most `fresh` old."""
         return self._list(fresh).projects
 
-    def ids(self, fresh: timedelta = FRESH) -> list[str]:
+    def ids(self) -> list[str]:
         """The ids of all registered projects, also of those whose entries cannot be read."""
-        listed = self._list(fresh)
+        listed = self._list(FRESH)
         return sorted({project.id for project in listed.projects} | {e.id for e in listed.unreadable if e.id})
 
     def _list(self, fresh: timedelta) -> MasterList:

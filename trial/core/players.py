@@ -64,9 +64,9 @@ class View(NamedTuple):
     """Which actions are possible now, for those players for which the environment says so."""
 
 
-def alone(action_space: tuple[str, ...], idle: str | None = None) -> tuple[Player, ...]:
-    """The players of an environment that has one, who is a human. Raises PlayersError."""
-    return (Player(PLAYER, action_space, HUMAN, _idle(PLAYER, action_space, idle)),)
+def alone(action_space: tuple[str, ...]) -> tuple[Player, ...]:
+    """The players of an environment that has one, who is a human."""
+    return (Player(PLAYER, action_space, HUMAN, _idle(PLAYER, action_space, None)),)
 
 
 def who_plays(config: Trial, action_spaces: Mapping[str, tuple[str, ...]], group: int | None) -> tuple[Player, ...]:
