@@ -8,7 +8,6 @@ step).
 from __future__ import annotations
 
 import secrets
-from datetime import timedelta
 from typing import Any
 
 from hippodrome import http
@@ -181,8 +180,8 @@ class Journey:
 
     def _poll(self, request: Request, project: Project, user_id: str) -> Response:
         """The state of the server, for the waiting page: one read of its record. With sessions see `SharedGame`."""
-        if request.has_query("ticket") and not project.has_sessions:  # a page for several: this list is older
-            project = self._project_cache.live_project(project.id, timedelta(0)) or project
+        if request.has_query("ticket"):  # only a page for several has one
+            project = self._project_cache.live_project(project.id, fits=lambda listed: listed.has_sessions) or project
         step = project.step(request.query_value("poll"))
         if project.has_sessions:
             return http.as_json(200, self._poll_together(request, project, user_id, step))

@@ -50,9 +50,8 @@ class Start:
         # A warm server must run what is registered now; the registration may be seconds old.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
         of_session = is_session_id(message.user_id)
-        project = self._services.project_cache.live_project(message.project_id, fresh)
-        if of_session and not (project and project.has_sessions):  # the list may be older than it
-            project = self._services.project_cache.live_project(message.project_id, timedelta(0))
+        fits = _has_sessions if of_session else None
+        project = self._services.project_cache.live_project(message.project_id, fresh, fits=fits)
         if project is None or (of_session and not project.has_sessions):
             self._cancel_start(message)
             return
@@ -85,10 +84,8 @@ class Start:
         if not players:
             stored = self._repository.server(ids.server_label(project.id, message.user_id))
             players = stored.server.players if stored else 0
-        found = project.for_session(players)
-        if found is None:  # the number may have been registered since the list was read
-            now = self._services.project_cache.live_project(project.id, timedelta(0))
-            found = now and now.for_session(players)
+        now = self._services.project_cache.live_project(project.id, fits=lambda listed: listed.for_session(players))
+        found = now and now.for_session(players)
         if found is None:
             logger.error("nothing is registered for a session of so many players", extra={"project": project.id})
         return found or project
@@ -239,3 +236,7 @@ def _warm_environment(project: Project, record: Server, settings: Settings) -> d
     """
     last = record.deadline + lifetime_asked_for(project, settings)
     return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}
+
+
+def _has_sessions(project: Project) -> bool:
+    return project.has_sessions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -63,9 +64,17 @@ class ProjectCache:
         """Whether the project is registered but its entry cannot be read, so that it counts as closed."""
         return self._list(FRESH).is_unreadable(project_id)
 
-    def live_project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
-        """The project, at most `fresh` old, if it is live; else None."""
+    def live_project(
+        self, project_id: str, fresh: timedelta = FRESH, *, fits: Callable[[Project], object] | None = None
+    ) -> Project | None:
+        """The project, at most `fresh` old, if it is live; else None.
+
+        `fits` tells whether a message or a request can be about the project as it is listed. If not, the list may be
+        older than the message: it is read again, and the project is returned as it is then, whether it fits or not.
+        """
         project = self.project(project_id, fresh)
+        if fits and not (project and project.live and fits(project)):
+            project = self.project(project_id, timedelta(0))
         return project if project and project.live else None
 
     def page(self, project: Project, file: str) -> str | None:
