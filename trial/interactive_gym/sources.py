@@ -27,6 +27,8 @@ _SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's 
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
 _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _TAKEN = {"agent", "trial", "protocol"}
+_OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
+"""Python imports these itself as it starts; Debian's and Ubuntu's stand outside its folders (`/etc/python3.11`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +184,9 @@ def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) ->
     came_from = file.parents[len(parts) - 1]
     if came_from in (root, _HIPPODROME) or any(came_from.is_relative_to(folder) for folder in _installed()):
         return None
-    if parts[0] in _TAKEN or parts[0] in metadata.packages_distributions() or not _ours(file, came_from, target):
+    if parts[0] in {*_TAKEN, *_OF_THE_MACHINE, *metadata.packages_distributions()}:
+        return None
+    if not _ours(file, came_from, target):
         return None
     return file.relative_to(came_from).as_posix()
 

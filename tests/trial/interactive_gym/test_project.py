@@ -155,6 +155,7 @@ def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
 def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> None:
     package = tmp_path / "examples" / "car"
     write(package, ALONE.replace("import helper", "from examples.car import helper"))
+    (tmp_path / "sitecustomize.py").write_text("")  # Python imports it as it starts
     env = {**environment(), "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     done = subprocess.run(
         [sys.executable, str(package / "experiment.py")], env=env, capture_output=True, text=True, check=False
@@ -163,6 +164,7 @@ def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> Non
     project = package / "experiment-study"
     assert (project / "examples/car/helper.py").is_file()
     assert not list(project.rglob("site-packages")), "packages are in requirements.txt"
+    assert not list(project.rglob("sitecustomize.py")), "it is the machine's"
     assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
