@@ -13,7 +13,7 @@ from typing import Any
 from export import scrub
 from export.recording_columns import when
 from export.scrub import clean, texts
-from export.state import Person, State
+from export.state import Participant, State
 from export.table_files import Column, fit, json_text
 from hippodrome.model.project import Project
 from protocol.session import is_session_id
@@ -61,15 +61,15 @@ class Answers:
         fields: dict[tuple[str, str], Field] = {}
         links: dict[str, int] = {}
         steps: set[str] = set()
-        for person, found in self._people():
-            self.in_sessions = self.in_sessions or bool(person.membership)
+        for participant, found in self._participants():
+            self.in_sessions = self.in_sessions or bool(participant.membership)
             for step, answers in found.items():
                 steps.add(step)
                 for name, value in _fields(answers).items():
                     seen = fields.setdefault((step, name), Field(len(fields)))
                     seen.count += 1
                     seen.kinds.add(_kind(value))
-            for name in texts(person.document.get("link")):
+            for name in texts(participant.document.get("link")):
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
@@ -80,14 +80,14 @@ class Answers:
         self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
         self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK
 
-    def _people(self) -> Iterator[tuple[Person, dict[str, Mapping[str, Any]]]]:
+    def _participants(self) -> Iterator[tuple[Participant, dict[str, Mapping[str, Any]]]]:
         """Everybody, with their documents as they may be shown."""
-        for person, found in self._state.answers():
+        for participant, found in self._state.answers():
             if not self._apart:
-                yield person, found
+                yield participant, found
                 continue
-            hide = scrub.Scrub(scrub.identities(person))
-            yield person, {step: hide.value(answers) for step, answers in found.items()}
+            hide = scrub.Scrub(scrub.identities(participant))
+            yield participant, {step: hide.value(answers) for step, answers in found.items()}
             self.scrubbed += hide.found
 
     def _in_order(self, steps: set[str]) -> list[str]:
@@ -121,15 +121,20 @@ class Answers:
         """The wide table: one row per participant."""
         shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
         self.scrubbed = self.finished = 0
-        for person, found in self._people():
+        for participant, found in self._participants():
             fields = {step: _fields(answers) for step, answers in found.items()}
-            link = texts(person.document.get("link"))
+            link = texts(participant.document.get("link"))
             finished = self._finished(found)
             self.finished += bool(finished)
-            row: list[Any] = [person.number, _group(person.document), when(person.document.get("arrived")), finished]
-            row += _membership(person) if self.in_sessions else ()
+            row: list[Any] = [
+                participant.number,
+                _group(participant.document),
+                when(participant.document.get("arrived")),
+                finished,
+            ]
+            row += _membership(participant) if self.in_sessions else ()
             if not self._apart:
-                row.append(scrub.completion_code(person))
+                row.append(scrub.completion_code(participant))
                 row += [clean(link[name]) if name in link else None for name in self.links]
             row += [
                 fit(fields[step][name], column.type) if name in fields.get(step, ()) else None
@@ -164,12 +169,12 @@ class Answers:
     def long_rows(self) -> Iterator[list[Any]]:
         """The long table: one row per text that was sent; of a list one for each."""
         order = {step: place for place, step in enumerate(self.steps)}
-        for person, found in self._people():
+        for participant, found in self._participants():
             for step in sorted(found, key=lambda step: order[step]):
                 answers = found[step]
                 page = answers.get("page")
                 fixed = [
-                    person.number,
+                    participant.number,
                     step,
                     clean(page) if isinstance(page, str) else None,
                     _group(answers),
@@ -184,9 +189,9 @@ class Answers:
 _MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "truth"), Column("waited", "number"))
 
 
-def _membership(person: Person) -> list[Any]:
+def _membership(participant: Participant) -> list[Any]:
     """In which session a participant plays and at which seat, or that in none; seconds that they waited for others."""
-    about = person.membership
+    about = participant.membership
     session, seat, unmatched = about.get("session"), about.get("seat"), about.get("unmatched")
     fits = isinstance(seat, int) and not isinstance(seat, bool) and seat >= 0 and is_session_id(session)
     truth = unmatched if isinstance(unmatched, bool) else None

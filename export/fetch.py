@@ -23,7 +23,7 @@ from export.keys import Item, Kind
 from export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
 from export.recording_columns import when
 from export.source import PARALLEL, Gone, Source, TooLarge
-from export.state import File, Kept, Person, State
+from export.state import File, Kept, Participant, State
 from protocol import session as sessions
 from protocol.session import is_session_id
 
@@ -36,7 +36,7 @@ LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
 class Work:
     """What one worker is to fetch for one participant or one session."""
 
-    owner: Person | Members | None
+    owner: Participant | Members | None
     fetch: list[Item]
     seen: list[str]
     then: Unit | None = None  # what follows when the session's own document is here
@@ -45,7 +45,7 @@ class Work:
     def user(self) -> str:
         """The id of the participant or of the session."""
         match self.owner:
-            case Person(user=user):
+            case Participant(user=user):
                 return user
             case Members(session=session):
                 return session
@@ -109,7 +109,7 @@ class Fetcher:
 
         try:
             for unit in units(self._project, lines(self._source, self._project, self._state)):
-                while unit.is_session and any(isinstance(work.owner, Person) for work in running.values()):
+                while unit.is_session and any(isinstance(work.owner, Participant) for work in running.values()):
                     collect()  # who plays there has to be known first
                 begin(self._work(unit, tally))
                 while len(running) >= MAX_WAITING:
@@ -129,7 +129,7 @@ class Fetcher:
 
     def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
         """What is to be done for a unit. Of a session first its own document; the rest when its members are `known`."""
-        owner: Person | Members | None = known
+        owner: Participant | Members | None = known
         then = None
         if unit.is_session and known is None:
             about, rest = list[Item](), list[Item]()
@@ -184,14 +184,14 @@ class Fetcher:
                     self._document(item, owner, file)
             except Gone:
                 continue  # the next run sees what has become of it
-            if isinstance(owner, Person) and item.kind is Kind.PARTICIPANT:
+            if isinstance(owner, Participant) and item.kind is Kind.PARTICIPANT:
                 owner = owner._replace(document=file.document or {})
-            if isinstance(owner, Person) and item.kind is Kind.MEMBERSHIP:
+            if isinstance(owner, Participant) and item.kind is Kind.MEMBERSHIP:
                 owner = owner._replace(membership=file.document or {})
             made.append(file)
         return made
 
-    def _document(self, item: Item, owner: Person | Members, file: File) -> None:
+    def _document(self, item: Item, owner: Participant | Members, file: File) -> None:
         try:
             body = self._source.read(item.listed.key, LARGEST_DOCUMENT)
         except TooLarge:
@@ -211,10 +211,10 @@ class Fetcher:
         file.document = found
         file.problems += _doubts(item, found)
 
-    def _recording(self, item: Item, owner: Person | Members, file: File) -> None:
+    def _recording(self, item: Item, owner: Participant | Members, file: File) -> None:
         attempt = keys.attempt(self._project, item.user, item.server)
         place = str(attempt) if attempt is not None else f"other-{self._token(item.server)}"
-        if isinstance(owner, Person):
+        if isinstance(owner, Participant):
             whose, theirs, people = {"participant": owner.number}, scrub.identities(owner), None
         else:
             whose, theirs, people = {"session": owner.session}, dict(owner.identities), owner.people
@@ -261,9 +261,9 @@ class Fetcher:
         return Kept(path, size, digest)
 
 
-def _folder(owner: Person | Members) -> str:
+def _folder(owner: Participant | Members) -> str:
     """The name of a participant's or a session's folder among ours."""
-    return owner.folder if isinstance(owner, Person) else owner.session
+    return owner.folder if isinstance(owner, Participant) else owner.session
 
 
 def forget_gone(state: State, folder: Path) -> int:
@@ -276,7 +276,7 @@ def forget_gone(state: State, folder: Path) -> int:
                 remove_empty((folder / old).parent, folder)
             state.forget(key, user, kind, step)
             count += 1
-        state.forget_people()
+        state.forget_participants()
     return count
 
 

@@ -88,9 +88,9 @@ def members(state: State, session: str) -> Members:
     people: dict[int, str] = {}
     identities: dict[str, str] = {}
     for member in seated:
-        if person := state.present(member.user_id):
-            people[member.seat] = person.number
-            identities |= scrub.identities(person)
+        if participant := state.present(member.user_id):
+            people[member.seat] = participant.number
+            identities |= scrub.identities(participant)
     told = json.dumps([version, sorted(people.items()), sorted(identities.items())])
     mark = hashlib.blake2b(told.encode("utf-8", "replace"), digest_size=8).hexdigest()
     return Members(session, f"~{mark}", people, identities)

@@ -71,7 +71,7 @@ class Known(NamedTuple):
     raw: str | None
 
 
-class Person(NamedTuple):
+class Participant(NamedTuple):
     """A participant: the id, the number that stands for it, the folder's name, and participant.json.
 
     `membership` says in which session they play (`session.json` of their folder); empty if in none.
@@ -124,16 +124,16 @@ class State:
 
     # -- participants
 
-    def person(self, user: str) -> Person | None:
+    def participant(self, user: str) -> Participant | None:
         row = self._db.execute(
             "SELECT user, number, folder, document, membership FROM people WHERE user=?", (user,)
         ).fetchone()
-        return _person(row) if row else None
+        return _participant(row) if row else None
 
-    def present(self, user: str) -> Person | None:
+    def present(self, user: str) -> Participant | None:
         """The participant, if the source still has something of them."""
         seen = self._db.execute("SELECT 1 FROM participants WHERE user=? AND seen=?", (user, self.run)).fetchone()
-        return self.person(user) if seen else None
+        return self.participant(user) if seen else None
 
     def session(self, session: str) -> Mapping[str, Any]:
         """The document of a session; empty if it is not known."""
@@ -144,9 +144,9 @@ class State:
         """Whether anything of sessions is known here."""
         return self._db.execute("SELECT 1 FROM files WHERE kind IN ('session', 'membership')").fetchone() is not None
 
-    def find_or_add(self, user: str, apart: bool, number: str = "") -> Person:
+    def find_or_add(self, user: str, apart: bool, number: str = "") -> Participant:
         """The participant. A new one gets this number; else a random one if ids are kept `apart`, or their id."""
-        known = self.person(user)
+        known = self.participant(user)
         if known:
             return known
         while True:
@@ -159,7 +159,7 @@ class State:
             except sqlite3.IntegrityError:
                 number = ""  # the same number twice: one in 20 million million
                 continue
-            return Person(user, number, self._folder_of(user), {})
+            return Participant(user, number, self._folder_of(user), {})
 
     def _folder_of(self, user: str) -> str:
         return str(self._db.execute("SELECT folder FROM participants WHERE user=?", (user,)).fetchone()[0])
@@ -173,11 +173,11 @@ class State:
             name = f"{base}~{count}"
         return name
 
-    def people(self) -> Iterator[Person]:
+    def participants(self) -> Iterator[Participant]:
         """Everybody who was seen in the last run, in the order of their numbers."""
         query = "SELECT user, number, folder, document, membership FROM people WHERE seen=? ORDER BY number"
         for row in self._db.execute(query, (self.run,)):
-            yield _person(row)
+            yield _participant(row)
 
     # -- runs
 
@@ -273,7 +273,7 @@ class State:
         if kind in _OF_SESSIONS:
             self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
 
-    def forget_people(self) -> int:
+    def forget_participants(self) -> int:
         """Those who were not seen in the last run: their numbers too. How many there were."""
         return self._db.execute("DELETE FROM participants WHERE seen<>?", (self.run,)).rowcount
 
@@ -292,26 +292,26 @@ class State:
         for row in self._db.execute("SELECT raw, raw_bytes, raw_sha256 FROM files WHERE raw IS NOT NULL ORDER BY raw"):
             yield Kept(*row)
 
-    def answers(self) -> Iterator[tuple[Person, dict[str, Mapping[str, Any]]]]:
+    def answers(self) -> Iterator[tuple[Participant, dict[str, Mapping[str, Any]]]]:
         """Everybody in the order of their numbers, each with the documents of their answers by step."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, a.step, a.document FROM people p"
             " LEFT JOIN answers a ON a.user = p.user WHERE p.seen=? ORDER BY p.number, a.step",
             (self.run,),
         )
-        person: Person | None = None
+        participant: Participant | None = None
         found: dict[str, Mapping[str, Any]] = {}
         for row in rows:
-            if person is None or row[0] != person.user:
-                if person is not None:
-                    yield person, found
-                person, found = _person(row[:5]), {}
+            if participant is None or row[0] != participant.user:
+                if participant is not None:
+                    yield participant, found
+                participant, found = _participant(row[:5]), {}
             if row[5] is not None:
                 found[row[5]] = json.loads(row[6])
-        if person is not None:
-            yield person, found
+        if participant is not None:
+            yield participant, found
 
-    def episodes(self) -> Iterator[tuple[Person | None, str, Mapping[str, Any]]]:
+    def episodes(self) -> Iterator[tuple[Participant | None, str, Mapping[str, Any]]]:
         """Every episode with its participant and its file, in the order of numbers and files; first those of sessions.
 
         A session's episode has no participant here; it says `session` and, by player, the `people`'s numbers.
@@ -322,9 +322,9 @@ class State:
             " WHERE f.path IS NOT NULL ORDER BY p.number, f.path, e.place"
         )
         for row in rows:
-            yield _person(row[:5]) if row[0] else None, row[5], json.loads(row[6])
+            yield _participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
 
-    def problems(self) -> Iterator[tuple[Person | None, str, str]]:
+    def problems(self) -> Iterator[tuple[Participant | None, str, str]]:
         """Who, which file, what is wrong with it."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, f.key, f.problems FROM files f"
@@ -332,7 +332,7 @@ class State:
         )
         for row in rows:
             for problem in json.loads(row[6]):
-                yield _person(row[:5]) if row[0] else None, row[5], problem
+                yield _participant(row[:5]) if row[0] else None, row[5], problem
 
     def counts(self) -> dict[str, int]:
         one = self._db.execute
@@ -357,8 +357,10 @@ class State:
         return digest.hexdigest()
 
 
-def _person(row: Any) -> Person:
-    return Person(row[0], row[1], row[2], json.loads(row[3]) if row[3] else {}, json.loads(row[4]) if row[4] else {})
+def _participant(row: Any) -> Participant:
+    return Participant(
+        row[0], row[1], row[2], json.loads(row[3]) if row[3] else {}, json.loads(row[4]) if row[4] else {}
+    )
 
 
 def _json(document: Mapping[str, Any] | None) -> str | None:

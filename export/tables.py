@@ -17,7 +17,7 @@ from typing import Any
 from export import scrub
 from export.recording_columns import MOST_PLAYERS, as_number, when
 from export.scrub import clean, texts
-from export.state import Person, State
+from export.state import Participant, State
 from export.table_files import BATCH, Column, fit
 from protocol.keys import sessions_folder
 from protocol.session import is_session_id
@@ -66,8 +66,8 @@ def episodes(state: State, players: Sequence[str], in_sessions: bool = False) ->
 
     An episode of a session has a row for each human player, with their own score.
     """
-    for person, path, found in state.episodes():
-        for number, player, score in _whose(person, found):
+    for participant, path, found in state.episodes():
+        for number, player, score in _whose(participant, found):
             yield [
                 number,
                 found["step"],
@@ -99,14 +99,16 @@ def _in_session(found: Mapping[str, Any], player: str | None) -> list[Any]:
     return [found.get("session"), clean(player), None if steps is None else steps.get(player, 0)]
 
 
-def _whose(person: Person | None, found: Mapping[str, Any]) -> list[tuple[str | None, str | None, float | None]]:
+def _whose(
+    participant: Participant | None, found: Mapping[str, Any]
+) -> list[tuple[str | None, str | None, float | None]]:
     """Whose an episode is: number, player and score. A session's is each human player's.
 
     The number is missing if the participant was erased, or if no participant ever played this player.
     """
     people = found.get("people")
-    if person is not None or not people:
-        return [(person.number if person else None, None, found["score"])]
+    if participant is not None or not people:
+        return [(participant.number if participant else None, None, found["score"])]
     scores = found.get("scores", {})
     return [(number, player, scores.get(player)) for player, number in people.items()]
 
@@ -138,10 +140,10 @@ def callbacks(state: State, folder: Path, in_sessions: bool = False) -> Iterator
 
     In a session, a line has the participant whose player it names, if it names one.
     """
-    for person, first, path, row in _lines(state, folder, "callbacks", ("callback",)):
+    for participant, first, path, row in _lines(state, folder, "callbacks", ("callback",)):
         more = _more(row)
         player = more.get("player") if isinstance(more.get("player"), str) else None
-        number = person.number if person else first.get("people", {}).get(player)
+        number = participant.number if participant else first.get("people", {}).get(player)
         yield [
             number,
             first["step"],
@@ -203,7 +205,7 @@ def _seen(more: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
 
 def _lines(
     state: State, folder: Path, has: str, kinds: Sequence[str]
-) -> Iterator[tuple[Person | None, Mapping[str, Any], str, Mapping[str, Any]]]:
+) -> Iterator[tuple[Participant | None, Mapping[str, Any], str, Mapping[str, Any]]]:
     """The lines of these kinds, of the recordings in one of whose episodes `has` stands.
 
     Whose the recording is, what is known of its first episode, its file, and the line.
@@ -215,10 +217,10 @@ def _lines(
         rows = list(several)
         if not any(found.get(has) for _, _, found in rows):
             continue
-        person, _, first = rows[0]
+        participant, _, first = rows[0]
         with pq.ParquetFile(folder / path) as file:
             for batch in file.iter_batches(batch_size=BATCH, columns=wanted):
-                yield from ((person, first, path, row) for row in batch.to_pylist() if row["kind"] in kinds)
+                yield from ((participant, first, path, row) for row in batch.to_pylist() if row["kind"] in kinds)
 
 
 def _more(row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -251,12 +253,12 @@ def identities(state: State, links: Sequence[str]) -> tuple[list[Column], Iterat
     columns += [Column(f"link.{clean(name)}") for name in links]
 
     def rows() -> Iterator[list[Any]]:
-        for person in state.people():
-            link = texts(person.document.get("link"))
+        for participant in state.participants():
+            link = texts(participant.document.get("link"))
             yield [
-                person.number,
-                person.user,
-                scrub.completion_code(person),
+                participant.number,
+                participant.user,
+                scrub.completion_code(participant),
                 *(clean(link[name]) if name in link else None for name in links),
             ]
 
@@ -268,14 +270,14 @@ PROBLEMS = (Column("participant"), Column("file"), Column("problem"))
 
 def problems(state: State, project: str, apart: bool) -> Iterator[list[Any]]:
     """What could not be read as it should be, with the file's key; without ids where they are apart."""
-    for person, key, problem in state.problems():
+    for participant, key, problem in state.problems():
         shown = key.removeprefix(f"{project}/users/")
         if apart and key.startswith(sessions_folder(project)):
             yield [None, _of_session(key.removeprefix(f"{project}/")), problem]
             continue
         if apart:
-            shown = _without_ids(shown, person, project)
-        yield [person.number if person else None, clean(shown), problem]
+            shown = _without_ids(shown, participant, project)
+        yield [participant.number if participant else None, clean(shown), problem]
 
 
 def _of_session(key: str) -> str:
@@ -291,15 +293,17 @@ def _of_session(key: str) -> str:
 _RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:trial|episode)[0-9-]*\.jsonl\.gz")
 
 
-def _without_ids(key: str, person: Person | None, project: str) -> str:
+def _without_ids(key: str, participant: Participant | None, project: str) -> str:
     """A key without ids: known parts stay, others are left out."""
-    if person is None:
+    if participant is None:
         return "(somewhere in users/)"
     parts = key.split("/")
     match parts[1:]:
         case ["participant.json"]:
             rest = "participant.json"
-        case ["answers", name] if re.fullmatch(r"[A-Za-z0-9_-]{1,64}\.json", name) and name != f"{person.user}.json":
+        case ["answers", name] if (
+            re.fullmatch(r"[A-Za-z0-9_-]{1,64}\.json", name) and name != f"{participant.user}.json"
+        ):
             rest = f"answers/{name}"
         case ["session.json"]:
             rest = "session.json"
@@ -307,5 +311,5 @@ def _without_ids(key: str, person: Person | None, project: str) -> str:
             rest = f"trials/(server)/{name}"
         case _:
             rest = "(another file)"
-    hide = scrub.Scrub(scrub.identities(person))
-    return f"{person.number}/{hide.text(rest)}"
+    hide = scrub.Scrub(scrub.identities(participant))
+    return f"{participant.number}/{hide.text(rest)}"

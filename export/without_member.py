@@ -1,4 +1,4 @@
-"""Takes what one member alone has sent out of a session's recording, for the erasure of that person.
+"""Takes what one member alone has sent out of a session's recording, for the erasure of that participant.
 
 What goes: their messages (with their feedback and key presses), when they pressed, what their keys asked for, their
 round trips, the lines on their presence, what callbacks recorded on their feedback, how the game ended for them, and

@@ -78,7 +78,7 @@ def count_participants(
     Other files and ids that are not well formed are not counted.
     """
     found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
-    for user_id, entries in people(documents, project.id):
+    for user_id, entries in folders(documents, project.id):
         arrived: datetime | None = None
         seen: list[Entry] = []
         for entry in entries:  # recordings sort after what we look for; the rest of the group is skipped unread
@@ -99,7 +99,7 @@ def count_participants(
     return found
 
 
-def people(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:
+def folders(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:
     """The well-formed ids below a project's folder, each with the entries of that folder, lazily and in key order."""
     prefix = f"{project_id}/users/"
     for user_id, entries in itertools.groupby(

@@ -45,11 +45,11 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Erase everything about one person: documents in all their versions, recordings, their server and its traces.
+    """Erase everything about one participant: documents in all their versions, recordings, their server and its traces.
 
     This cannot be undone. The receipt says what was deleted, when and by whom, and that a last listing found nothing;
-    it names the person by a salted hash; with the id, the hash can be checked. Afterwards run `data` again in each
-    folder that holds the downloaded study: it removes the person there.
+    it names the participant by a salted hash; with the id, the hash can be checked. Afterwards run `data` again in each
+    folder that holds the downloaded study: it removes the participant there.
     """
     from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 
@@ -71,7 +71,7 @@ def command(
         return Exit.CHANGES if any(found.values()) else Exit.DONE
     if any(found.values()):
         here = [name for name, one in found.items() if one]
-        screen.confirm(f"Erase this person for good from {', '.join(here)}?", yes)
+        screen.confirm(f"Erase this participant for good from {', '.join(here)}?", yes)
     began, whole = datetime.now(UTC), False
     target = receipt or _new_receipt(began)
     if target.exists() or not target.parent.is_dir():
@@ -91,12 +91,12 @@ def command(
         screen.success(f"Everything is gone. The receipt: {target}")
         screen.info("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
     else:
-        screen.success(f"There is nothing of this person. The receipt: {target}")
+        screen.success(f"There is nothing of this participant. The receipt: {target}")
     return Exit.DONE
 
 
 def _new_receipt(began: datetime) -> Path:
-    """A file in this folder that does not exist: a script may erase several people in one second."""
+    """A file in this folder that does not exist: a script may erase several participants in one second."""
     name = f"erased-{began:%Y%m%dT%H%M%SZ}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
     return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
@@ -115,11 +115,11 @@ def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: boo
 
     def confirm(files: int, sessions: int) -> None:
         what = f"{count(files, 'file')}" + (f", and their part of {count(sessions, 'session')}" if sessions else "")
-        screen.confirm(f"Erase this person for good from {data} ({what})?", yes)
+        screen.confirm(f"Erase this participant for good from {data} ({what})?", yes)
 
     done, unreadable, found = folder_eraser.erase(data, project, user, dry_run=dry_run, confirm=confirm)
     for key in unreadable:
-        screen.warning(f"{key} cannot be read, and may name this person: look at it yourself.")
+        screen.warning(f"{key} cannot be read, and may name this participant: look at it yourself.")
     for path in done.mentioned if done else ():
         screen.warning(f".hippodrome/{path} still names them: delete it; `make run` does without it.")
     if json:
@@ -130,9 +130,9 @@ def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: boo
         screen.success(f"{count(done.files, 'file')} deleted, {count(done.rewritten, 'recording')} written anew.")
         screen.info("  Where this study was converted, run `python -m deploy data` again: it removes them there.")
     elif found and not json:
-        screen.result(f"{count(found, 'document')} of this person in {data}.")
+        screen.result(f"{count(found, 'document')} of this participant in {data}.")
     elif not found:
-        screen.success(f"There is nothing of this person in {data}.")
+        screen.success(f"There is nothing of this participant in {data}.")
     return Exit.CHANGES if dry_run and found else Exit.DONE
 
 
@@ -186,7 +186,7 @@ def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
         screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
         _warn_of_others(found)
     elif dry_run:
-        screen.result(f"There is nothing of this person in {', '.join(found) or 'any project'}.")
+        screen.result(f"There is nothing of this participant in {', '.join(found) or 'any project'}.")
 
 
 def _warn_of_others(found: Mapping[str, Found]) -> None:

@@ -38,7 +38,7 @@ class Erased:
 
     files: int = 0
     rewritten: int = 0
-    mentioned: Sequence[str] = ()  # files of `.hippodrome/` that still name the person
+    mentioned: Sequence[str] = ()  # files of `.hippodrome/` that still name the participant
 
 
 class FolderEraser:
@@ -82,7 +82,7 @@ class FolderEraser:
 
     @property
     def unreadable(self) -> list[str]:
-        """Documents that may name the person and cannot be read."""
+        """Documents that may name the participant and cannot be read."""
         return [*self._sessions.unreadable, *self._lobby.unreadable]
 
     def _own(self) -> list[Version]:
@@ -145,7 +145,7 @@ class FolderEraser:
             )
 
     def _mentioned(self) -> list[str]:
-        """Files of `.hippodrome/` that name the person: messages and tasks of the study's functions."""
+        """Files of `.hippodrome/` that name the participant: messages and tasks of the study's functions."""
         state = self._state / self._folder.root.name
         told = [self._label.encode(), f'"{self._user}"'.encode(), f"/users/{self._user}".encode()]
         return [

@@ -1,4 +1,4 @@
-"""Takes one person out of a project's lobby: the entries of who waits, its decisions, and what `match` was asked."""
+"""Takes one participant out of a project's lobby: the entries of who waits, the decisions, the questions to `match`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from protocol.keys import groups_folder, questions_folder
 
 
 class LobbyEraser:
-    """Takes one person out of one project's lobby. May be interrupted anywhere and called again."""
+    """Takes one participant out of one project's lobby. May be interrupted anywhere and called again."""
 
     def __init__(self, storage: Storage, project: str, user: str) -> None:
         self._storage = storage
@@ -21,7 +21,7 @@ class LobbyEraser:
         self._label = ids.server_label(project, user)
         self._decisions = decisions.key(project)
         self.unreadable: list[str] = []
-        """Documents that name the person and cannot be read."""
+        """Documents that name the participant and cannot be read."""
 
     def look(self) -> list[Version]:
         """Their entries, and the documents that name them: that of decisions, and those of the function `match`."""

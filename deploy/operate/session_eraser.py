@@ -1,9 +1,9 @@
-"""Takes one person out of the sessions in which they played with others.
+"""Takes one participant out of the sessions in which they played with others.
 
-A session's documents are those of all its members. So its recordings are written anew without what the person alone
-has sent (`export/without_member.py`), and every older version is deleted; then its document is written anew, with an
-empty id at their seat. That document leads to the rest, so it is the last one that changes: a run that was cut off
-anywhere finds the session again. If all members are erased, everything of the session is deleted.
+A session's documents are those of all its members. So each recording is written anew without what this participant
+alone has sent (`export/without_member.py`), and its older versions are deleted. Then the session's document is written
+anew, with an empty id at their seat. It leads to the recordings, so it changes last: a run that was cut off anywhere
+finds the session again. When all members are erased, everything of the session is deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RECORDING = ".jsonl.gz"
 
 @dataclass(frozen=True)
 class FoundSession:
-    """A session whose document names the person, in any version. `others`: whether other members stay in it."""
+    """A session whose document names the participant, in any version. `others`: whether other members stay in it."""
 
     id: str
     seat: int
@@ -33,7 +33,7 @@ class FoundSession:
 
 
 class SessionEraser:
-    """Takes one person out of one project's sessions. May be interrupted anywhere and called again."""
+    """Takes one participant out of one project's sessions. May be interrupted anywhere and called again."""
 
     def __init__(self, storage: Storage, project: str, user: str) -> None:
         self._storage = storage
@@ -42,12 +42,12 @@ class SessionEraser:
         self.rewritten = 0
         """Recordings that were written anew."""
         self.unreadable: list[str] = []
-        """Documents that may name the person and cannot be read."""
+        """Documents that may name the participant and cannot be read."""
 
     # -- looking
 
     def sessions(self) -> list[FoundSession]:
-        """The sessions whose documents name the person."""
+        """The sessions whose documents name the participant."""
         documents: dict[str, list[Version]] = {}
         there = set()
         folder = sessions_folder(self._project)
@@ -82,7 +82,7 @@ class SessionEraser:
             found[session] = FoundSession(session, member.seat, others and (before is None or before.others))
 
     def _membership(self) -> FoundSession | None:
-        """What the person's own document says, where the session's is lost."""
+        """What the participant's own document says, where the session's is lost."""
         try:
             for version in self._storage.versions_of(membership_key(self._project, self._user)):
                 if not version.marker:
@@ -108,7 +108,7 @@ class SessionEraser:
             self.delete_session(found, note)
 
     def take_out(self, found: FoundSession, note: Note) -> None:
-        """Write the session's recordings without the person, and delete what they were before."""
+        """Write the session's recordings without the participant, and delete what they were before."""
         folder = session_folder(self._project, found.id)
         for key in dict.fromkeys(version.key for version in self._storage.versions(folder)):
             if key.endswith(_RECORDING):
@@ -117,7 +117,7 @@ class SessionEraser:
         self._storage.delete([*self._storage.uploads(folder)], note)
 
     def take_name(self, found: FoundSession, note: Note) -> None:
-        """Write the session's document without the person's id, the last one of all that is done."""
+        """Write the session's document without the participant's id, the last one of all that is done."""
         key = session_key(self._project, found.id)
         last = newest(self._storage, key)
         if last is None:

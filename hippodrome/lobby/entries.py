@@ -37,7 +37,7 @@ _DONE = re.compile(r"(s[a-z2-7]{20}|s\.[0-9a-f]{20})\.done")
 _NAME = re.compile(r"(s[a-z2-7]{20})\.(?:(way)|(yes|left)\.(.+)|([0-9]{13})\.(-|[0-9a-f]{10}))")
 
 
-class Person(Record, frozen=True, omit_defaults=False):
+class WaitingDocument(Record, frozen=True, omit_defaults=False):
     """What stands in the document of a participant who waits."""
 
     user_id: str
@@ -189,15 +189,15 @@ def seconds_since(joined: int, now: datetime) -> float:
     return max(0, milliseconds(now) - joined) / 1000
 
 
-def person(body: bytes) -> Person | None:
+def read_body(body: bytes) -> WaitingDocument | None:
     """Who waits, by the document's bytes; None if they say nothing."""
     try:
-        found = from_json(body, Person)
+        found = from_json(body, WaitingDocument)
     except (msgspec.DecodeError, RecursionError):
         return None
     return found if ids.is_user_id(found.user_id) else None
 
 
-def body(found: Person) -> bytes:
+def body(found: WaitingDocument) -> bytes:
     """The bytes of a document."""
     return to_json(found)

@@ -32,7 +32,7 @@ from typing import Any
 from hippodrome.lobby import entries as folder
 from hippodrome.lobby import matchmaking, questions, rules, servers_ahead, traits
 from hippodrome.lobby.decisions import Decisions, Formed, Proposal, Unmatched
-from hippodrome.lobby.entries import Entries, Person, Waiting
+from hippodrome.lobby.entries import Entries, Waiting, WaitingDocument
 from hippodrome.lobby.lookups import Lookups
 from hippodrome.lobby.matcher import Matcher
 from hippodrome.lobby.repair import Repair
@@ -205,7 +205,7 @@ class Lobby:
             entries = self._confirm(project, me, proposal, entries)
         wished: Sequence[Sequence[str]] = ()
         if project.asks_match:
-            come = partial(_person, me)
+            come = partial(_candidate, me)
             wished = self._matcher.wished(project, me.label, come, known, entries)
         proposals = self._lookups.proposals_to_form(known, entries, me.label)
         servers = self._lookups.servers(project, known, me.label, proposals)
@@ -297,7 +297,7 @@ class Lobby:
             found = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
         one = Waiting(found.label, found.joined, found.trait, now)
         present = folder.waiting_key(project.id, one)
-        self._documents.put(present, folder.body(Person(me.user_id, me.group)))
+        self._documents.put(present, folder.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != present and ".yes." not in key)
         self._store.delete(others)  # that they had left, were under way, or opened two pages at once
         return entries.with_waiting(one)
@@ -313,9 +313,9 @@ class Lobby:
         return entries.with_waiting(own) if own and me.label not in {*entries.waiting, *entries.left} else entries
 
 
-def _person(me: _Asking) -> questions.Person:
+def _candidate(me: _Asking) -> questions.Candidate:
     """The participant who asks, as the function `match` is told."""
-    return questions.person(me.label, me.group, dict(me.answers()))
+    return questions.candidate(me.label, me.group, dict(me.answers()))
 
 
 def _due(label: str, known: Decisions, before: Decisions, after: Decisions) -> Decisions:

@@ -130,13 +130,15 @@ class Lookups:
         """The participant who waits, as a member; None if they have left or have a membership. Errors are returned."""
         try:
             found = self._platform.documents.get(folder.waiting_key(project.id, one))
-            person = folder.person(found.body) if found else None
-            if person is None or ids.server_label(project.id, person.user_id) != one.label:
+            written = folder.read_body(found.body) if found else None
+            if written is None or ids.server_label(project.id, written.user_id) != one.label:
                 return None
-            membership = self._repository.membership(project.id, person.user_id)
+            membership = self._repository.membership(project.id, written.user_id)
         except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
             failure("a participant who waits cannot be read", error, project=project.id)
             return error
         if membership:
             return None
-        return Matched(one.label, person.user_id, person.group, folder.seconds_since(one.joined, self._platform.now()))
+        return Matched(
+            one.label, written.user_id, written.group, folder.seconds_since(one.joined, self._platform.now())
+        )

@@ -12,7 +12,7 @@ from datetime import timedelta
 from hippodrome.lobby import questions, rules
 from hippodrome.lobby.decisions import Decisions
 from hippodrome.lobby.entries import Entries
-from hippodrome.lobby.questions import Answer, Person, Question
+from hippodrome.lobby.questions import Answer, Candidate, Question
 from hippodrome.log import failure, logger
 from hippodrome.model.project import Project
 from hippodrome.ports import Platform
@@ -36,7 +36,7 @@ class Matcher:
         self,
         project: Project,
         label: str,
-        come: Callable[[], Person],
+        come: Callable[[], Candidate],
         document: Decisions,
         entries: Entries,
     ) -> Sequence[Sequence[str]]:
@@ -52,14 +52,14 @@ class Matcher:
         labels = {one.label for one in free}
         chosen = [each for each in answer.sessions if labels.issuperset(each)] if answer else []
         matched = {one for each in chosen for one in each}
-        new: Person | None = None
-        if label in entries.waiting and label not in question.people() and not questions.is_full(question):
+        new: Candidate | None = None
+        if label in entries.waiting and label not in question.candidates() and not questions.is_full(question):
             new = come()
 
         def change(current: Question) -> Question:
-            late = current.people().keys() - question.people().keys()  # who came after the listing was made
+            late = current.candidates().keys() - question.candidates().keys()  # who came after the listing was made
             if new is not None:
-                current = questions.with_person(current, new)
+                current = questions.with_candidate(current, new)
             return questions.next_question(
                 current,
                 project,

@@ -4,7 +4,7 @@ The researcher's code runs on servers alone. So who waits is written into a docu
 which servers without members look at. Each question has an id, and its answer a document of its own,
 `{projectId}/lobby/groups/{id}.json`, which the first of them creates. A question stays as it is until it is answered,
 or for `ANSWERED_WITHIN`. A participant who comes meanwhile stands beside it, for the next question. So an answer fits
-what the document still says, however many people come.
+what the document still says, however many participants come.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST_ANSWERS = 16 * 1024
 """Bytes of one participant's answers. Larger ones are left out."""
 
 
-class Person(Record, frozen=True):
+class Candidate(Record, frozen=True):
     """A participant who waits, as `match` is told. `id` is their label; `waited` is in seconds."""
 
     id: str
@@ -48,10 +48,10 @@ class Question(Record, frozen=True):
     id: str = ""
     players: int = 0
     asked: datetime | None = None
-    waiting: tuple[Person, ...] = ()
-    came: tuple[Person, ...] = ()
+    waiting: tuple[Candidate, ...] = ()
+    came: tuple[Candidate, ...] = ()
 
-    def people(self) -> dict[str, Person]:
+    def candidates(self) -> dict[str, Candidate]:
         """All participants who stand here, by label."""
         return {each.id: each for each in (*self.waiting, *self.came)}
 
@@ -68,15 +68,15 @@ class Answer:
     problem: str = ""
 
 
-def person(label: str, group: int | None, answers: dict[str, Any]) -> Person:
+def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
     """A participant as they come. Answers that are too large are left out."""
-    found = Person(label, group=group, answers=answers)
-    return found if len(to_json(found)) <= MOST_ANSWERS else Person(label, group=group)
+    found = Candidate(label, group=group, answers=answers)
+    return found if len(to_json(found)) <= MOST_ANSWERS else Candidate(label, group=group)
 
 
-def with_person(question: Question, one: Person) -> Question:
+def with_candidate(question: Question, one: Candidate) -> Question:
     """The document with this participant, for the next question; unchanged if `MOST_CAME` stand in it already."""
-    if one.id in question.people() or is_full(question):
+    if one.id in question.candidates() or is_full(question):
         return question
     return msgspec.structs.replace(question, came=(*question.came, one))
 
@@ -121,14 +121,16 @@ def next_question(
     `waiting`: the labels of all who wait; a participant who is not among them is forgotten. `matched`: those whom the
     answer to `question` matches; they are asked about again only if they stay free.
     """
-    people = {label: each for label, each in question.people().items() if label in waiting}
-    asked = sorted((one for one in free if one.label in people and one.label not in matched), key=lambda one: one.order)
+    candidates = {label: each for label, each in question.candidates().items() if label in waiting}
+    asked = sorted(
+        (one for one in free if one.label in candidates and one.label not in matched), key=lambda one: one.order
+    )
     asked = asked[:MOST_WAITING]
     if not _is_due(question, project, {one.label for one in asked}, answered=answered, now=now):
         return question
-    told = tuple(msgspec.structs.replace(people[one.label], waited=_waited(one, now)) for one in asked)
+    told = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)
     labels = {each.id for each in told}
-    rest = tuple(msgspec.structs.replace(each, waited=0) for label, each in people.items() if label not in labels)
+    rest = tuple(msgspec.structs.replace(each, waited=0) for label, each in candidates.items() if label not in labels)
     made = Question(players=project.players, asked=now, waiting=told, came=rest)
     return msgspec.structs.replace(made, id=hashlib.sha256(to_json(made)).hexdigest()[:20])
 

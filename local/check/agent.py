@@ -88,7 +88,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
 
 
 def _question(folder: Path, config: Config) -> dict[str, Any]:
-    """Made-up people for the function `match`, who have answered the pages before the game.
+    """Made-up participants for the function `match`, who have answered the pages before the game.
 
     They choose at random; the last of them answer what the first have answered.
     """

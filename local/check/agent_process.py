@@ -149,7 +149,7 @@ def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: Progress
 
 
 def _match(adapter: AgentAdapter, question: dict[str, Any], progress: Progress) -> None:
-    """Ask the function `match` about made-up people. Raises AgentError, and what `match` raises."""
+    """Ask the function `match` about made-up participants. Raises AgentError, and what `match` raises."""
     function = match.function_of(adapter.agent_module)
     if function is None:
         inside = (

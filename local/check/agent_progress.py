@@ -38,7 +38,7 @@ class Progress:
         self._file: io.FileIO | None = None
         self.episodes = self.steps = 0
         self.matched: int | None = None
-        """How many sessions `match` made of made-up people, if it was asked."""
+        """How many sessions `match` made of made-up participants, if it was asked."""
         self.action: Any = 0  # or by player
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []

@@ -295,9 +295,8 @@ class AgentReport:
         """A function `match` that puts nobody into a session. Told once, of the first group."""
         if self._group or self._report.get("matched") != 0:
             return []
-        said = (
-            f"match() made no session of {3 * self._config.project.players} made-up participants: such people wait on"
-        )
+        made_up = 3 * self._config.project.players
+        said = f"match() made no session of {made_up} made-up participants: such participants wait on"
         return [self._at(self._place_of("match"), said, remark=True)]
 
     def _place_of(self, method: str) -> tuple[str, int | None]:

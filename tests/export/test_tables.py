@@ -20,7 +20,7 @@ from export import table_files, tables
 from export.answers import MAX_LINK, Answers
 from export.keys import Kind, Listed, read
 from export.scrub import Scrub, clean, identities
-from export.state import File, Person, State
+from export.state import File, Participant, State
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
 from trial.recordings.recording import line
@@ -278,7 +278,7 @@ def test_an_identity_leaves_every_text_and_every_json(identity: str, before: str
 
 def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
     document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
-    known = identities(Person("user-0001", "p1", "p1", document))
+    known = identities(Participant("user-0001", "p1", "p1", document))
     hide = Scrub(known)
     code = participant("user-0001")["completionCode"]
     assert (

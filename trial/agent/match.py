@@ -30,7 +30,7 @@ def in_class(agent: Any) -> bool:
     return callable(getattr(agent, NAME, None))
 
 
-def people(question: Mapping[str, Any]) -> list[dict[str, Any]]:
+def candidates(question: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What `match` is given: a dict for each participant who waits, in the order in which they came."""
     return [{"waited": 0, "group": None, "answers": {}} | each for each in json.loads(json.dumps(question["waiting"]))]
 
@@ -40,7 +40,7 @@ def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[l
 
     A group holds ids, or the dicts themselves. Raises BadGroups if no groups were returned, and what `match` raises.
     """
-    waiting, players = people(question), question["players"]
+    waiting, players = candidates(question), question["players"]
     there = {each["id"] for each in waiting}
     more = {"players": players} if signatures.names(function, "players") else {}
     returned = function(waiting, **more)

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import secrets
 import uuid
-from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -52,13 +51,12 @@ from trial.recordings.recorder import Recorder
 from trial.recordings.recording import Line
 from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
+from trial.server.callbacks import TrialCallbacks
 from trial.server.started import Started, Table
 from trial.settings import Settings
 from trial.wire.connection import Connection
 
 log = logging.getLogger("trial")
-
-_MOVES = 4  # moves that wait until callbacks are told; of more, a leave and the return after it cancel out
 
 
 class TrialLoop:
@@ -88,9 +86,13 @@ class TrialLoop:
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls: Calls
-        self._callbacks: Callbacks | None = None
-        self._recorded = 0  # lines of callbacks by the end of the last piece of work
-        self._moves: deque[TellMoved] = deque()  # the first is being told
+        self._callbacks = TrialCallbacks(
+            worker,
+            settings.step_seconds,
+            self._write,
+            is_open=lambda: self._recorder.is_open,
+            is_over=lambda: self.core.done,
+        )
         self._places = Places(self._acted)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -108,7 +110,7 @@ class TrialLoop:
             SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score, effect.outcome),
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: self._write_line,
-            TellMoved: self._tell_moved,
+            TellMoved: self._callbacks.tell_moved,
             RecordLine: self._record_line,
             OpenRecording: self._open_recording,
             CloseRecording: lambda _: self._recorder.close(),
@@ -123,7 +125,7 @@ class TrialLoop:
     @property
     def stuck(self) -> bool:
         """A callback of the agent or a policy has not returned, and may never."""
-        return self._places.busy or (self._callbacks is not None and self._callbacks.busy)
+        return self._places.busy or self._callbacks.busy
 
     def begin(self, agent_ready: Awaitable[Started | None]) -> asyncio.Future[None]:
         """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
@@ -260,10 +262,9 @@ class TrialLoop:
         if not self._done.done() and error is not None:
             self._done.set_exception(error)
 
-    def _called(self, call: Call, found: tuple[Any, int] | None, error: Exception | None) -> None:
-        result, self._recorded = found or (None, self._recorded_now())
+    def _called(self, call: Call, result: Any, error: Exception | None) -> None:
         if not isinstance(call, StepCall) or error is not None:
-            self._write_callbacks()  # before the episode's end, with which its recording may be closed
+            self._callbacks.write_lines()  # before the episode's end, with which its recording may be closed
         if error is not None:
             self._do(self.core.call_failed, call, error)
         else:
@@ -282,8 +283,7 @@ class TrialLoop:
             self.ready.set()
         if core.done and not self._done.done():
             self._done.set_result(None)
-            if self._callbacks:
-                self._callbacks.close()
+            self._callbacks.close()
             self._places.close()
         if self._timer is not None:
             self._timer.cancel()
@@ -294,27 +294,15 @@ class TrialLoop:
         self._do(self.core.advance)
 
     def _call(self, call: Call) -> None:
-        self._on_agent(partial(self._calls.run, call), call.limit, partial(self._called, call))
-
-    def _on_agent(
-        self, work: Callable[[], Any], limit: float, done: Callable[[tuple[Any, int] | None, Exception | None], None]
-    ) -> None:
-        """Do `work` on the agent's thread; `done` gets its result with the number of lines of callbacks by then.
-
-        The thread may be at the next piece of work when `done` is called. The lines of that one stay behind.
-        """
-        self._worker.submit(lambda: (work(), self._recorded_now()), limit, done)
-
-    def _recorded_now(self) -> int:
-        return self._callbacks.recorded if self._callbacks else 0
+        self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._called, call))
 
     def _find_callbacks(self, started: Started, players: Sequence[Player]) -> None:
         """The agent has started: from now on its callbacks are called, if it has some."""
-        settings, loop, agent = self._settings, self._loop, started.agent
+        settings, agent = self._settings, started.agent
         if not started.callbacks:
             return
         self.core.callbacks = True
-        self._callbacks = self._calls.callbacks = Callbacks(
+        self._calls.callbacks = Callbacks(
             started.callbacks,
             About(
                 self.core.id,
@@ -330,8 +318,9 @@ class TrialLoop:
                 "the callback %s failed\n%s", name, report(error, settings.agent_dir, settings.private)
             ),
             hide=self._hide,
-            late=lambda recorded: _soon(loop, lambda: self._write_late(recorded)),
+            late=self._callbacks.late,
         )
+        self._callbacks.begin(self._calls.callbacks)
 
     def _record_line(self, effect: RecordLine) -> None:
         fields = effect.fields
@@ -342,49 +331,7 @@ class TrialLoop:
     def _write_line(self, effect: WriteLine) -> None:
         """Write the line of a step or a reset, and then what callbacks recorded during it."""
         self._write(effect.line)
-        self._write_callbacks()
-
-    def _write_late(self, recorded: int) -> None:
-        """Write the lines of a callback for which the game did not wait."""
-        self._recorded = max(self._recorded, recorded)
-        self._write_callbacks()
-
-    def _write_callbacks(self) -> None:
-        """Write what callbacks recorded by the end of the last piece of work, if a recording is open."""
-        if self._callbacks and self._recorder.is_open:
-            for line in self._callbacks.take(self._recorded):
-                self._write(line)
-
-    def _tell_moved(self, effect: TellMoved) -> None:
-        """On the agent's thread, between two calls, so that the callback sees the environment at rest.
-
-        One move after the other, with calls in between. If many wait, a participant who left and returned did not move.
-        """
-        moves = self._moves
-        if not self._callbacks:
-            return
-        if effect.callback == "on_return" and len(moves) >= _MOVES:
-            before = max((index for index, move in enumerate(moves) if move.player == effect.player), default=0)
-            if before > 0 and moves[before].callback == "on_leave":
-                del moves[before]
-                return
-        moves.append(effect)
-        if len(moves) == 1:
-            self._tell_next_move()
-
-    def _tell_next_move(self) -> None:
-        callbacks, move = self._callbacks, self._moves[0]
-        assert callbacks is not None
-        self._on_agent(
-            lambda: callbacks.player_moved(move.callback, move.player), self._settings.step_seconds, self._told_move
-        )
-
-    def _told_move(self, found: tuple[None, int] | None, _: Exception | None) -> None:
-        self._recorded = found[1] if found else self._recorded_now()
-        self._write_callbacks()
-        self._moves.popleft()
-        if self._moves and not self.core.done:
-            self._tell_next_move()
+        self._callbacks.write_lines()
 
     def _send_state(self, effect: SendState) -> None:
         connection: Any = effect.connection
@@ -449,9 +396,3 @@ class TrialLoop:
         else:
             self._logged.add(text)
             log.error("the agent failed\n%s", text)
-
-
-def _soon(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
-    """Call it on the event loop, from another thread, unless the loop has ended."""
-    with contextlib.suppress(RuntimeError):
-        loop.call_soon_threadsafe(function)

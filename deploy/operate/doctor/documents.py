@@ -42,7 +42,7 @@ def documents(context: CheckContext) -> Iterator[Finding]:
     """The list of projects, what is written about servers and slots, and participants' records."""
     found = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
-        found += [*_shared(context.platform.documents, project), *_people(context.platform.documents, project)]
+        found += [*_shared(context.platform.documents, project), *_participants(context.platform.documents, project)]
         found += _sessions(context.platform.documents, project) if project.has_sessions else ()
     yield from found or [good("documents", "All can be read.")]
 
@@ -126,10 +126,10 @@ def _sessions(there: Documents, project: Project) -> Iterator[Finding]:
         )
 
 
-def _people(there: Documents, project: Project) -> Iterator[Finding]:
+def _participants(there: Documents, project: Project) -> Iterator[Finding]:
     entries = (
         entry
-        for user, those in participants.people(there, project.id)
+        for user, those in participants.folders(there, project.id)
         for entry in those
         if entry.key == participant_key(project.id, user)
     )

@@ -1,4 +1,4 @@
-"""`deploy erase`: nothing of one person stays, in any version; everybody else's stays as it is; the receipt says so."""
+"""`deploy erase`: nothing of one participant stays, in any version; everybody else's stays as it is; the receipt says so."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def versions(world: Installed, prefix: str = "") -> dict[str, int]:
 
 
 def mentioned(world: Installed, user: str) -> list[str]:
-    """Every key, server and timer that belongs to the person."""
+    """Every key, server and timer that belongs to the participant."""
     label = ids.server_label("maze", user)
     keys = [key for key in versions(world) if key.startswith(f"maze/users/{user}/") or label in key]
     tasks = [task.name for task in world.platform.tasks.list() if label in task.name]
@@ -169,7 +169,7 @@ def test_a_second_time_there_is_nothing_and_that_is_said(world: Installed, capsy
     before = versions(world)
     again = run(world, capsys, "--receipt", "again.json")
     assert again.code == Exit.DONE
-    assert "nothing of this person" in again.err
+    assert "nothing of this participant" in again.err
     assert versions(world) == before
     assert json.loads(Path("again.json").read_text())["projects"][0]["deleted"] == {}
 
@@ -182,7 +182,7 @@ def test_nobody_is_asked_for_a_typing_mistake_and_nothing_is_made_for_it(world: 
     assert world.run(capsys, "erase", ANN, "--project", "maze", "--everywhere").code == Exit.FAILED
     assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # no config.yml here
     dry = world.run(capsys, "erase", "no-such-person", "--project", "maze", "--dry-run")
-    assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this person in maze.\n")
+    assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this participant in maze.\n")
 
 
 def test_a_project_that_nobody_knows_is_no_erasure(world: Installed, capsys: Any) -> None:
@@ -250,7 +250,7 @@ def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys
 
 
 class Thief:
-    """Has a presigned request that the person's server got at the last moment, and uses it at its last moment."""
+    """Has a presigned request that the participant's server got at the last moment, and uses it at its last moment."""
 
     def __init__(self, world: Installed) -> None:
         self.world = world

@@ -87,7 +87,7 @@ def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(machine: Machin
     assert from_json(after[decisions.key("maze")], Decisions).unmatched == ()
     assert not (machine.data / "maze/users" / ANN).exists()
     again = machine.erase("--yes")
-    assert (again.code, "nothing of this person" in again.err) == (Exit.DONE, True)
+    assert (again.code, "nothing of this participant" in again.err) == (Exit.DONE, True)
     assert machine.contents() == after
 
 

@@ -170,7 +170,7 @@ def test_a_second_time_there_is_nothing_and_nothing_changes(world: Installed, tm
     before = contents(world)
     again = erase(world, capsys, ANN)
     assert again.code == Exit.DONE
-    assert "nothing of this person" in again.err
+    assert "nothing of this participant" in again.err
     assert contents(world) == before
 
 
@@ -323,8 +323,8 @@ def test_who_waits_in_the_lobby_leaves_it(world: Installed, capsys: Any) -> None
     world.participant(ANN, answered=1)
     for name in (f"{LABEL}.1790000000000.-", f"{LABEL}.yes.{SID}", f"{LABEL}.left.1790000000000", f"{LABEL}.way"):
         for _ in range(2):
-            world.put(f"_lobby/maze/{name}", to_json(entries.Person(ANN)))
-    world.put(f"_lobby/maze/{other}.1790000000000.-", to_json(entries.Person(BOB)))
+            world.put(f"_lobby/maze/{name}", to_json(entries.WaitingDocument(ANN)))
+    world.put(f"_lobby/maze/{other}.1790000000000.-", to_json(entries.WaitingDocument(BOB)))
     decided = Decisions(
         3,
         open=(Ahead("s.1", now, LABEL),),

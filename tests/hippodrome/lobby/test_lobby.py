@@ -261,7 +261,7 @@ def test_a_member_who_is_back_by_a_late_request_is_not_formed_even_if_they_seem_
     first = room.session("ann")
     room.lobby.repair(room.project)  # the document has forgotten her
     one = folder.Waiting(room.label("ann"), folder.milliseconds(room.platform.now()), "-", room.platform.now())
-    room.platform.documents.put(folder.waiting_key("maze", one), folder.body(folder.Person("ann")))
+    room.platform.documents.put(folder.waiting_key("maze", one), folder.body(folder.WaitingDocument("ann")))
     room.visit("cem")
     [proposal] = room.document().proposed
     room.platform.documents.put(folder.confirmation_key("maze", room.label("ann"), proposal.id), b"")

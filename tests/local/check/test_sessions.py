@@ -248,7 +248,7 @@ def test_a_player_without_keys_is_remarked_on_where_players_have_keys_of_their_o
         ("return None", "match() must return a list of groups, and returned NoneType"),
         ("return ['made-up-0']", "each group that match() returns must be a list of ids; one is str"),
         ("return [waiting[:3]]", "match() made a group of 3, and project.players is 2"),
-        ("return []", "remark: match() made no session of 6 made-up participants: such people wait on"),
+        ("return []", "remark: match() made no session of 6 made-up participants: such participants wait on"),
         ("return [nobody]", "match() fails: NameError: name 'nobody' is not defined"),
     ],
 )

@@ -144,7 +144,7 @@ def remove(
     """
     told("removing the copy of the study from the list")
     unregister(platform.documents, project_id)
-    known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.people(platform.documents, project_id))])
+    known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.folders(platform.documents, project_id))])
     known |= dict.fromkeys(_sessions_ahead(platform.documents, project_id))
     if users is None:
         records = Records(platform.documents).since()

@@ -1,0 +1,116 @@
+"""The callbacks of a trial beside its game: who comes, leaves and returns, and lines that stand in order.
+
+The methods of `TrialCallbacks` are called on the event loop. What they submit runs on the agent's thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from trial.agent.callbacks import Callbacks
+from trial.agent.worker import Worker
+from trial.core.effects import TellMoved
+from trial.recordings.recording import Line
+
+_MOVES = 4  # moves that wait until callbacks are told; of more, a leave and the return after it cancel out
+
+
+class TrialCallbacks:
+    """Tells the agent's callbacks who has come, left or returned, and writes the lines that callbacks recorded."""
+
+    def __init__(
+        self,
+        worker: Worker,
+        limit: float,
+        write: Callable[[Line], None],
+        *,
+        is_open: Callable[[], bool],
+        is_over: Callable[[], bool],
+    ) -> None:
+        """`limit`: seconds for one move. `write` writes a line while a recording `is_open`. `is_over`: the trial."""
+        self._worker = worker
+        self._limit = limit
+        self._is_over = is_over
+        self._write = write
+        self._is_open = is_open
+        self._loop = asyncio.get_running_loop()
+        self._callbacks: Callbacks | None = None
+        self._recorded = 0  # lines of callbacks by the end of the last piece of work
+        self._moves: deque[TellMoved] = deque()  # the first is being told
+
+    @property
+    def busy(self) -> bool:
+        """A callback has not returned, and may never."""
+        return self._callbacks is not None and self._callbacks.busy
+
+    def begin(self, callbacks: Callbacks) -> None:
+        """The agent has started: these are its callbacks."""
+        self._callbacks = callbacks
+
+    def close(self) -> None:
+        """The trial is over: the callbacks' thread ends."""
+        if self._callbacks:
+            self._callbacks.close()
+
+    def on_agent(self, work: Callable[[], Any], limit: float, done: Callable[[Any, Exception | None], None]) -> None:
+        """Do `work` on the agent's thread; `done` gets its result, or None and its error.
+
+        The thread may be at the next piece of work when `done` is called. Lines that callbacks recorded during that one
+        are not written yet.
+        """
+
+        def finished(found: tuple[Any, int] | None, error: Exception | None) -> None:
+            result, self._recorded = found or (None, self._recorded_now())
+            done(result, error)
+
+        self._worker.submit(lambda: (work(), self._recorded_now()), limit, finished)
+
+    def write_lines(self) -> None:
+        """Write what callbacks recorded by the end of the last piece of work, if a recording is open."""
+        if self._callbacks and self._is_open():
+            for line in self._callbacks.take(self._recorded):
+                self._write(line)
+
+    def late(self, recorded: int) -> None:
+        """A callback for which the game did not wait has returned: write its lines. Called on the callbacks' thread."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._write_late, recorded)
+
+    def tell_moved(self, effect: TellMoved) -> None:
+        """Tell a callback on the agent's thread, between two calls, so that it sees the environment at rest.
+
+        One move after the other, with calls in between. If many wait, a participant who left and returned did not move.
+        """
+        moves = self._moves
+        if not self._callbacks:
+            return
+        if effect.callback == "on_return" and len(moves) >= _MOVES:
+            before = max((index for index, move in enumerate(moves) if move.player == effect.player), default=0)
+            if before > 0 and moves[before].callback == "on_leave":
+                del moves[before]
+                return
+        moves.append(effect)
+        if len(moves) == 1:
+            self._tell_next_move()
+
+    def _tell_next_move(self) -> None:
+        callbacks, move = self._callbacks, self._moves[0]
+        assert callbacks is not None
+        self.on_agent(lambda: callbacks.player_moved(move.callback, move.player), self._limit, self._told_move)
+
+    def _told_move(self, _result: object, _error: Exception | None) -> None:
+        self.write_lines()
+        self._moves.popleft()
+        if self._moves and not self._is_over():
+            self._tell_next_move()
+
+    def _write_late(self, recorded: int) -> None:
+        self._recorded = max(self._recorded, recorded)
+        self.write_lines()
+
+    def _recorded_now(self) -> int:
+        return self._callbacks.recorded if self._callbacks else 0
