@@ -39,7 +39,7 @@ COMMANDS = {  # each is the function `command` of its module, and its docstring 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; its exit code (`console.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
+    """Run one command; return its exit code (`console.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
         wanted = [arguments[0]] if arguments[0] in COMMANDS else list(COMMANDS)
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _app(names: Sequence[str]) -> typer.Typer:
-    """The commands of these names. Only the one that is run is imported: all of them take their time."""
+    """The commands of these names. Only the one that is run is imported, because each import takes its time."""
     app = typer.Typer(
         help="Hippodrome on AWS: one installation for everybody's studies, and a server for each participant.",
         add_completion=False,

@@ -50,7 +50,7 @@ class Account:
     """An account in a region, with the credentials that boto3 finds (environment, profile, SSO)."""
 
     def __init__(self, core: botocore.session.Session, region: str) -> None:
-        """`core` has the credentials."""
+        """`core` is the botocore session, which has the credentials."""
         self._core = core
         self._session = boto3.Session(botocore_session=core, region_name=region)
         self.region = region
@@ -66,7 +66,7 @@ class Account:
             return self._clients[key]
 
     def fail_fast_client(self, service: str) -> Any:
-        """A client that asks once and waits for seconds: for what is only a hint."""
+        """A client that tries once and gives up after seconds, for calls that only give a hint."""
         with self._making:
             return self._session.client(service, region_name=self.region, config=_FAIL_FAST)
 
@@ -76,7 +76,7 @@ class Account:
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
-        """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.core.explain` makes a sentence of."""
+        """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.core.explain` makes sentences of."""
         return dict(self.client("sts").get_caller_identity())
 
     @property
@@ -107,7 +107,7 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
 
 @dataclass(frozen=True)
 class Installation:
-    """A stack of ours that stands: its name, and its outputs under their names in `infra/template.yml`."""
+    """A stack of ours that exists: its name, and its outputs under their names in `infra/template.yml`."""
 
     stack: str
     region: str
@@ -117,7 +117,7 @@ class Installation:
 
     @classmethod
     def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
-        """That of a described stack, whatever state it is in."""
+        """The installation of a described stack, whatever state the stack is in."""
         outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
         return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
@@ -203,7 +203,7 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def elsewhere(account: Account, stack: str) -> str:
-    """Which other regions have the code of an installation of that name; "" if there are none, or S3 cannot be asked.
+    """The other regions that have the code of an installation of that name; "" if none has, or S3 cannot be asked.
 
     S3 lists the account's buckets of all regions.
     """
@@ -218,7 +218,7 @@ def elsewhere(account: Account, stack: str) -> str:
 
 
 def find_installation(account: Account, stack: str = STACK) -> Installation:
-    """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or in the making."""
+    """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or being made."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(

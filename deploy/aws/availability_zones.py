@@ -19,9 +19,10 @@ PARAMETERS = ("ZoneA", "ZoneB")
 
 
 def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str] = ()) -> dict[str, str]:
-    """The template's parameters: those that stand, else the zones of the subnets that stand, else two that run Fargate.
+    """The template's parameters for zones: those of the stack, else of its subnets, else two that run Fargate.
 
-    `subnets` are those of the installation's own network, if it has one. Raises `Problem` if a region has no two zones.
+    `previous` are the stack's parameters, `subnets` those of the installation's own network, if it has one. Raises
+    `Problem` if a region has no two zones.
     """
     if all(previous.get(name) for name in PARAMETERS):
         return {name: previous[name] for name in PARAMETERS}

@@ -19,14 +19,14 @@ Record = tuple[str, str]  # tag and value
 
 @dataclass(frozen=True)
 class Caa:
-    """The records that count for a name: those of `where`, the nearest upwards that has any; "" if none has."""
+    """The records that apply to a name: those of `where`, the nearest domain upwards that has any; "" if none has."""
 
     where: str = ""
     records: tuple[Record, ...] = ()
     certain: bool = True  # False: DNS could not be asked
 
     def forbidding(self, authorities: Sequence[str], *, wildcard: bool, acme: bool = False) -> list[Record]:
-        """The records that keep all these authorities from issuing; none if one of them may.
+        """The records that keep all these authorities from issuing; none if one of them may issue.
 
         For a wildcard `issuewild` counts instead of `issue`, where there is any (section 4.3). `acme`: by DNS-01.
         """
@@ -37,7 +37,7 @@ class Caa:
 
 
 def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
-    """The records that count for a name (section 3: up the tree, to the first name that has some).
+    """The records that apply to a name (section 3: up the tree, to the first name that has some).
 
     `known`: whether a name exists; those that do not have no records, and DNS is not asked for them
     (`deploy.aws.hosted_zone.exists` says why). Raises nothing that `known` does not raise.

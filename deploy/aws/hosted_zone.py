@@ -29,12 +29,12 @@ class Zone:
     name_servers: tuple[str, ...]
 
     def holds(self, domain: str) -> bool:
-        """Whether records of that domain lie in it."""
+        """Whether records of that domain belong into this zone."""
         return domain == self.domain or domain.endswith(f".{self.domain}")
 
 
 def clean_domain(domain: str) -> str:
-    """The domain in lower case without a final dot. Raises `Problem` if it is none."""
+    """The domain in lower case without a final dot. Raises `Problem` if it is no domain."""
     found = domain.strip().rstrip(".").lower()
     if not _DOMAIN.fullmatch(found):
         raise Problem(f"{domain!r} is not a domain.", "Give one such as example.org.")
@@ -90,7 +90,7 @@ def read_zone(account: Account, zone_id: str) -> Zone:
 
 
 def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
-    """The record that decides where `name` leads (A, AAAA or CNAME), or None."""
+    """The zone's A, AAAA or CNAME record of `name`; None if there is none."""
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="10"
     )

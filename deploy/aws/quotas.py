@@ -31,7 +31,7 @@ VPCS = Quota("vpc", "L-F678F1CE")
 
 
 def applied(account: Account, quota: Quota) -> float | None:
-    """The quota's value for this account, else AWS's default; None if neither is told. Raises botocore's errors."""
+    """The quota's value for this account, else AWS's default; None if AWS tells neither. Raises botocore's errors."""
     client: Any = account.client("service-quotas")
     for ask in (client.get_service_quota, client.get_aws_default_service_quota):
         try:
@@ -45,7 +45,7 @@ def applied(account: Account, quota: Quota) -> float | None:
 
 
 def request(account: Account, quota: Quota, wanted: float) -> str:
-    """The command that asks AWS for that much (its Service Quotas console does, too); it takes hours to days."""
+    """The command that asks AWS for a higher value (the Service Quotas console does, too). AWS takes hours to days."""
     return (
         f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
         f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"
@@ -53,5 +53,5 @@ def request(account: Account, quota: Quota, wanted: float) -> str:
 
 
 def ask_for(account: Account, quota: Quota, wanted: float) -> str:
-    """`request`, as what to do about a quota that is too small."""
+    """`request`, as the advice for a quota that is too small."""
     return f"Ask for more: {request(account, quota, wanted)}"

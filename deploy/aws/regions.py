@@ -43,7 +43,7 @@ ca-central-1 no more, earlier ones did: these two zones are right either way.
 
 
 def check(region: str) -> None:
-    """Raises `Problem` if the region is none that Hippodrome can be installed in."""
+    """Raise `Problem` if Hippodrome cannot be installed in this region."""
     if region in SUPPORTED:
         return
     near = [name for name in SUPPORTED if name.partition("-")[0] == region.partition("-")[0]]

@@ -17,27 +17,27 @@ _VENDED = "/aws/vendedlogs/hippodrome/{}/"
 
 
 def prefix(stack: str) -> str:
-    """What the names of its task definitions, functions and queues begin with; those of other stacks may, too."""
+    """How the names of the stack's task definitions, functions and queues begin. Other stacks' may begin so, too."""
     return f"{stack}-"
 
 
 def function(stack: str, name: str) -> str:
-    """The function that runs the handler `name` in `lambdas/`."""
+    """The name of the function that runs the handler `name` in `lambdas/`."""
     return f"{stack}-{name}"
 
 
 def family(stack: str, project_id: str) -> str:
-    """The task definition of a project: what all its revisions share."""
+    """The task definition family of a project, which all its revisions share."""
     return f"{stack}-{project_id}"
 
 
 def bucket_prefix(stack: str) -> str:
-    """What the names of its buckets begin with."""
+    """How the names of the stack's buckets begin."""
     return prefix(stack).lower()
 
 
 def code_bucket(stack: str, account_id: str, region: str) -> str:
-    """The bucket where its functions' zips and templates lie."""
+    """The bucket for the zips of the stack's functions and for its templates."""
     return f"{stack}-code-{account_id}-{region}".lower()
 
 
@@ -48,7 +48,7 @@ def code_bucket_region(stack: str, bucket: str) -> str | None:
 
 
 def log_prefixes(stack: str) -> tuple[str, ...]:
-    """What the names of all its log groups begin with."""
+    """How the names of all the stack's log groups begin."""
     return _OURS.format(stack), _VENDED.format(stack)
 
 
@@ -58,5 +58,5 @@ def log_group(stack: str, source: str) -> str:
 
 
 def log_source(stack: str, group: str) -> str:
-    """The source of a log group by its name."""
+    """The source of a log group, by the group's name: a function's name, `trial`, `image` or `api`."""
     return group.removeprefix(_OURS.format(stack)).removeprefix(_VENDED.format(stack))

@@ -54,7 +54,7 @@ class VersionedBucket:
                 yield Version(line["Key"], line["VersionId"], marker=True, latest=line["IsLatest"])
 
     def versions_of(self, key: str) -> Iterator[Version]:
-        """Those of one object."""
+        """Every version and delete marker of one object."""
         return (version for version in self.versions(key) if version.key == key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
@@ -64,12 +64,12 @@ class VersionedBucket:
                 yield Version(line["Key"], "", upload=line["UploadId"])
 
     def folders(self) -> Iterator[str]:
-        """The first parts of the keys of everything that has a version, without the slash."""
+        """The first parts of all keys that have a version, without the slash."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Delimiter="/", **self._bucket):
             yield from (line["Prefix"].removesuffix("/") for line in page.get("CommonPrefixes", ()))
 
     def read(self, version: Version) -> bytes:
-        """The content of a version; empty if it is gone, or is none."""
+        """The content of a version; empty if it is gone or is a delete marker."""
         try:
             return bytes(self._get(version)["Body"].read())
         except ClientError as error:
@@ -78,18 +78,18 @@ class VersionedBucket:
             raise
 
     def fetch(self, version: Version, to: Path) -> None:
-        """The content of a version, into a file."""
+        """Write the content of a version into a file."""
         with to.open("wb") as file:
             for piece in self._get(version)["Body"].iter_chunks(_PIECE):
                 file.write(piece)
 
     def store(self, key: str, file: Path) -> None:
-        """A new version of an object, in one PUT: no recording is larger than that takes."""
+        """Store a file as a new version of an object, in one PUT, which is enough for the largest recording."""
         with file.open("rb") as body:
             self._s3.put_object(Key=key, Body=body, **self._bucket)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """A new version of a small object if its newest one still is `before`; whether it was."""
+        """Store a new version of a small object if its newest one still is `before`; return whether it was."""
         try:
             found = self._s3.get_object(Key=key, **self._bucket)
             if found["Body"].read() != before:
@@ -105,7 +105,7 @@ class VersionedBucket:
         return self._s3.get_object(Key=version.key, VersionId=version.id, **self._bucket)
 
     def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None] = lambda _: None) -> int:
-        """Delete these for good; return how many. `note` gets those of each call that are deleted.
+        """Delete these versions for good; return how many. `note` gets the versions of each call.
 
         Raises `Problem` if S3 refuses some of them.
         """
@@ -116,7 +116,7 @@ class VersionedBucket:
         return deleted
 
     def empty(self, note: Callable[[Sequence[Version]], None] = lambda _: None) -> None:
-        """Delete every version, until a listing finds none. Raises `Problem` if S3 refuses some of them."""
+        """Delete every version until a listing finds none. Raises `Problem` if S3 refuses to delete some."""
         while self.delete(self.versions(), note):
             pass
 

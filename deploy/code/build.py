@@ -53,7 +53,7 @@ class Function:
 
     @property
     def key(self) -> str:
-        """Its object in the code bucket."""
+        """The key of its zip in the code bucket."""
         return f"{self.name}-{self.digest[:16]}.zip"
 
     def pack(self) -> bytes:
@@ -146,7 +146,7 @@ class _Tree:
         return Source(self._body(path).decode(), path.name == "__init__.py") if path else None
 
     def files(self, module: str) -> Iterator[ZipMember]:
-        """The module's own file, and what it reads at run time."""
+        """The module's own file, and the files that it reads at run time."""
         path = self._path(module)
         if path:
             yield self._member(path)
@@ -176,7 +176,7 @@ class _Tree:
 
 @dataclass(frozen=True)
 class Closure:
-    """Modules reached from somewhere: those of ours, and the names they import from elsewhere."""
+    """All modules that some modules import, directly or through others: ours, and the names of others."""
 
     inside: frozenset[str]
     outside: frozenset[str]

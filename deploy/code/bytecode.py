@@ -26,7 +26,7 @@ compileall.compile_dir(folder, quiet=2, stripdir=folder, prependdir=where, inval
 
 @functools.cache
 def compiler(version: str) -> str | None:
-    """A Python of that version ("3.13") on this machine, or None."""
+    """The path of a Python of that version ("3.13") on this machine, or None."""
     if version == f"{sys.version_info.major}.{sys.version_info.minor}":
         return sys.executable
     managed = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
@@ -35,7 +35,7 @@ def compiler(version: str) -> str | None:
 
 
 def _is(place: str, version: str) -> bool:
-    """Whether it is CPython of that version, and not a version manager's stand-in."""
+    """Whether the program is CPython of that version, and not the placeholder of a version manager."""
     asked = [place, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
     answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - found above
     return answer.stdout.strip() == f"{version} cpython"
@@ -69,5 +69,5 @@ def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, b
 
 
 def _source(bytecode: Path) -> str:
-    """`a/b.py` of `a/__pycache__/b.cpython-313.pyc`."""
+    """The source file of a bytecode file: `a/b.py` for `a/__pycache__/b.cpython-313.pyc`."""
     return bytecode.parent.parent.joinpath(bytecode.name.rsplit(".", 2)[0] + ".py").as_posix()

@@ -54,12 +54,12 @@ class Target:
 
     @classmethod
     def here(cls) -> Target:
-        """The running interpreter."""
+        """The target that is the running interpreter."""
         return cls(f"{sys.version_info.major}.{sys.version_info.minor}", platform.machine().lower(), local=True)
 
     @classmethod
     def from_env(cls) -> Target:
-        """Lambda, unless HIPPODROME_TARGET is `here`."""
+        """Lambda's platform; this machine if HIPPODROME_TARGET is `here`."""
         wanted = os.environ.get("HIPPODROME_TARGET", "")
         if wanted not in {"", "here", "lambda"}:
             raise Problem(f"HIPPODROME_TARGET is {wanted!r}.", "It may be `here`, `lambda` or unset.")
@@ -70,7 +70,7 @@ class Target:
 
     @property
     def pip_options(self) -> list[str]:
-        """What pip needs to choose wheels for this target instead of for itself."""
+        """The options with which pip chooses wheels for this target."""
         if self.local:
             return []
         tags = [f"manylinux_2_{minor}_{self.machine}" for minor in _GLIBC] + [f"manylinux2014_{self.machine}"]
@@ -79,7 +79,7 @@ class Target:
 
     @property
     def markers(self) -> dict[str, str]:
-        """The values of environment markers (PEP 508) there."""
+        """The values of environment markers (PEP 508) on this target."""
         from packaging.markers import default_environment
 
         found = {key: str(value) for key, value in default_environment().items()} | {"extra": ""}
@@ -121,7 +121,7 @@ class ZipMember:
     load: Callable[[], bytes]
 
     def read(self) -> bytes:
-        """Its bytes. Raises `Problem` if they are not those that were hashed."""
+        """The file's bytes. Raises `Problem` if their hash is not `sha256`."""
         body = self.load()
         if hashlib.sha256(body).hexdigest() != self.sha256:
             raise Problem(f"{self.name} changed while it was packed.", "Run the same command again.")
@@ -129,14 +129,14 @@ class ZipMember:
 
 
 class Wheel:
-    """A wheel in the cache, its RECORD checked when it came in."""
+    """A wheel in the cache. Its files were compared with RECORD when it was downloaded."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @cached_property
     def members(self) -> Mapping[str, ZipMember]:
-        """What of it goes into a zip, by name there."""
+        """The files that go into a zip, by their names there."""
         found = {}
         for name, digest in self._record.items():
             place = _place(name)
@@ -146,12 +146,12 @@ class Wheel:
 
     @cached_property
     def modules(self) -> set[str]:
-        """The names that `import` finds at its top level."""
+        """The names of its top-level modules."""
         tops = {PurePosixPath(name).parts[0] for name in self.members}
         return {top.split(".")[0] for top in tops if "." not in top or top.endswith((".py", ".so", ".pyd"))}
 
     def needs(self, target: Target) -> set[str]:
-        """The distributions it needs on that target, by normalized name; extras are not followed."""
+        """The distributions that it needs on that target, by normalized name. Extras are not followed."""
         from packaging.requirements import Requirement
         from packaging.utils import canonicalize_name
 
@@ -229,14 +229,14 @@ class WheelCache:
         self._wheels: dict[str, Wheel] = {}
 
     def wheels(self, names: Iterable[str]) -> dict[str, Wheel]:
-        """The wheels of these distributions. Raises `Problem` if one is not pinned, or cannot be had."""
+        """The wheels of these distributions. Raises `Problem` if one is not pinned, or cannot be downloaded."""
         pins = [self._pin(name) for name in sorted(names)]
         if missing := [pin for pin in pins if not self._find(pin)]:
             self._download(missing)
         return {pin.name: self._wheels[pin.name] for pin in pins}
 
     def closure(self, names: Iterable[str]) -> set[str]:
-        """These distributions and all that they need, without what Lambda's runtime has."""
+        """These distributions and all that they need, except for those that Lambda's runtime has."""
         found: set[str] = set()
         wanted = set(names) - IN_RUNTIME
         while new := wanted - found:
@@ -246,7 +246,7 @@ class WheelCache:
 
     @cached_property
     def owners(self) -> dict[str, str]:
-        """Which distribution a top-level module belongs to, over all that is pinned."""
+        """To which distribution each top-level module belongs, for all pinned distributions."""
         return {module: name for name, wheel in self.wheels(self.pins).items() for module in wheel.modules}
 
     def _pin(self, name: str) -> Pin:
@@ -334,7 +334,7 @@ class WheelCache:
 
 
 def cache_folder() -> Path:
-    """Where this user's caches are kept on this platform; nothing there is missed when it is deleted."""
+    """The folder for this user's caches on this platform. It may be deleted at any time."""
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
@@ -355,7 +355,7 @@ ALSO = ("acme", "cryptography", "josepy")  # of deploy.txt, what functions impor
 
 
 def lock() -> str:
-    """The text of `packages.txt`: direct requirements as they are pinned, the others as they are installed here."""
+    """The text of `packages.txt`: direct requirements as they are pinned, the others in the versions installed here."""
     direct = read_pins(ROOT / "requirements" / "lambdas.txt")
     deploy = read_pins(ROOT / "requirements" / "deploy.txt")
     pins = direct | {name: deploy[name] for name in ALSO if name in deploy}

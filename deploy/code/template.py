@@ -34,7 +34,7 @@ class Template:
             raise Problem(f"{path.name} cannot be read: {error.strerror}.") from None
 
     def with_code(self, functions: Iterable[Function]) -> Template:
-        """The template with `<function>.zip` replaced by the keys of these zips. Raises `Problem` if one is missing."""
+        """The template with each `<function>.zip` replaced by its zip's key. Raises `Problem` if one is missing."""
         keys = {function.name: function.key for function in functions}
         missing: set[str] = set()
 
@@ -50,12 +50,12 @@ class Template:
 
     @property
     def functions(self) -> set[str]:
-        """The functions whose zips it names."""
+        """The functions whose zips the template names."""
         return {found[3] for found in _KEY.finditer(self.text)}
 
     @cached_property
     def body(self) -> Mapping[str, Any]:
-        """Its content; `!Ref x` reads as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}."""
+        """The content; `!Ref x` reads as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}."""
         try:
             found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:
@@ -66,14 +66,14 @@ class Template:
 
     @property
     def defaults(self) -> dict[str, str | None]:
-        """Its parameters; None for one that has no default."""
+        """The parameters with their defaults; None for one that has no default."""
         return {
             name: str(spec["Default"]) if "Default" in spec else None
             for name, spec in self.body.get("Parameters", {}).items()
         }
 
     def refused(self, parameters: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-        """The parameters whose values CloudFormation would not take, and what they must be; those unknown here pass."""
+        """The parameters whose values CloudFormation would refuse, each with what it must be. Unknown ones pass."""
         for name, spec in self.body.get("Parameters", {}).items():
             value = parameters.get(name, "")
             allowed = [str(one) for one in spec.get("AllowedValues", ())]

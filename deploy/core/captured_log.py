@@ -23,7 +23,7 @@ class Failures(logging.Handler):
 
 @contextmanager
 def functions_log() -> Iterator[Failures]:
-    """Within the block, what `hippodrome` logs goes to the `Failures` instead of stdout, which is for answers."""
+    """Within the block, errors that `hippodrome` logs go to the `Failures`; stdout is for answers alone."""
     from hippodrome.log import logger  # noqa: PLC0415 - Powertools, which most commands do without
 
     handler = logger.registered_handler

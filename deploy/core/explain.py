@@ -35,7 +35,7 @@ _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "
 
 
 def problem_from(error: BaseException) -> Problem | None:
-    """The sentence for an error of AWS, of the network or of a missing package; None if it is another."""
+    """The problem that explains an error of AWS, of the network or of a missing package; None for other errors."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, boto.ClientError):

@@ -18,7 +18,7 @@ AT_ONCE = 8  # checks under way
 
 
 class Mark(StrEnum):
-    """How it stands."""
+    """Whether a line is good, to be looked at, or bad."""
 
     GOOD = "good"
     LOOK = "look"  # works, but should be looked at; or could not be checked
@@ -55,7 +55,7 @@ def bad(check: str, text: str, advice: str = "") -> Finding:
 
 
 def show(findings: Iterable[Finding], console: Console) -> None:
-    """The lines, as they are read by people."""
+    """Print the findings, a line for each."""
     for finding in findings:
         mark = Text(f"{finding.mark.sign} ", style=STYLES[finding.mark])
         console.print(mark + Text(f"{finding.check}: {finding.text}"))

@@ -21,5 +21,5 @@ def removal_steps(platform: Platform, left: Resources) -> list[Step]:
 
 
 def cluster_steps(platform: Platform, left: Resources) -> list[Step]:
-    """Delete the clusters; ECS refuses while a task in one is ending."""
+    """Delete the clusters. ECS refuses while a task in a cluster is ending."""
     return [step(platform.tasks.delete_cluster, cluster) for cluster in left.clusters]

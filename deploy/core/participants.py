@@ -53,13 +53,13 @@ def registered_projects(documents: Documents, unread: list[UnreadableEntry] | No
 
 
 def unreadable(entry: UnreadableEntry) -> str:
-    """What is wrong with an entry of the list of projects."""
+    """A sentence on an entry of the list of projects that cannot be read."""
     whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
     return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
 
 
 def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
-    """All of them, or the one that was asked for. Raises `Problem` if it is not registered."""
+    """All these projects, or the one that was asked for. Raises `Problem` if that one is not registered."""
     projects = list(projects)
     if wanted is None:
         return projects
@@ -100,7 +100,7 @@ def count_participants(
 
 
 def folders(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:
-    """The well-formed ids below a project's folder, each with the entries of that folder, lazily and in key order."""
+    """The well-formed ids of a project's participants, each with the entries of its folder, lazily and in key order."""
     prefix = f"{project_id}/users/"
     for user_id, entries in itertools.groupby(
         documents.list(prefix), key=lambda entry: entry.key.removeprefix(prefix).partition("/")[0]

@@ -74,17 +74,17 @@ def uses_aws(folder: Path) -> bool:
 
 
 def may_use_aws(folder: Path) -> bool:
-    """Whether config.yml leaves that to deploying: it has awsSetup, but no useAWS."""
+    """Whether config.yml leaves it to `deploy` whether the study is on AWS: it has awsSetup, but no useAWS."""
     return _said(folder, "useAWS") is None and _said(folder, "awsSetup") is not None
 
 
 def keeps_off_aws(config: Config) -> bool:
-    """Whether it says `useAWS: false` explicitly. If the key is left out, deploying decides."""
+    """Whether config.yml says `useAWS: false`. Without the key, `deploy` decides."""
     return config.project.given("useAWS") and not config.project.use_aws
 
 
 def _said(folder: Path, key: str) -> Any:
-    """The value of this key in the section `project` of config.yml; None if there is none."""
+    """The value of this key in the section `project` of config.yml; None if the key is missing."""
     try:
         return read_source(folder).adapted.at(("project", key))
     except ConfigErrors:
@@ -92,7 +92,7 @@ def _said(folder: Path, key: str) -> Any:
 
 
 def reopened(project: Project, live: bool) -> dict[str, Any]:
-    """The stored registration of a project, with another `live`."""
+    """The stored registration of a project, with this value of `live`."""
     known = msgspec.to_builtins(project)
     ours = {"salt", "secret", "version"}
     kept = {key: value for key, value in known.items() if value is not None and key not in ours}
@@ -110,7 +110,7 @@ def _here(installation: Installation) -> dict[str, str]:
 
 
 def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
-    """An empty id: on one machine the project is called like its folder."""
+    """A mistake if the id is empty, which on one machine stands for the folder's name."""
     given: Any = read_source(folder).parsed.values.get("project")
     if isinstance(given, dict) and given.get("id") in (None, ""):
         yield (
@@ -159,7 +159,7 @@ def _disagreements(config: Config, installation: Installation) -> Iterator[tuple
 
 
 def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
-    """What the installation has of its own, and does no harm: its bucket's name, and how long servers may run."""
+    """Values of the project that have no effect here: the bucket's name, and a time longer than servers may run."""
     most = int(installation["MaxRuntime"])
     if config.project.max_runtime > most:
         yield (

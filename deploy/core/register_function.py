@@ -15,7 +15,7 @@ from hippodrome.model.project import MASTER_LIST, read_list
 
 
 def ask(account: Account, installation: Installation, event: Mapping[str, Any]) -> dict[str, Any]:
-    """Call the function and return its answer; empty if that is no object. Raises `Problem` if it failed."""
+    """Call the function and return its answer; empty if that is no object. Raises `Problem` if the function failed."""
     reply = account.client("lambda").invoke(
         FunctionName=installation["RegisterFunction"], Payload=json.dumps(event).encode()
     )

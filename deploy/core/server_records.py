@@ -18,7 +18,7 @@ SLACK = timedelta(hours=1)  # how long a server may outlive its deadline until a
 
 
 class Records:
-    """The records of all servers, kept between two looks: a second look reads only what has changed."""
+    """The records of all servers. They are kept between two looks, so that a second one reads only what has changed."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -26,17 +26,17 @@ class Records:
 
     @property
     def unreadable(self) -> int:
-        """How many documents that should be records of servers are none."""
+        """How many documents among the records cannot be read as a record."""
         return len(self.unreadable_labels)
 
     @property
     def unreadable_labels(self) -> list[str]:
-        """Under which labels those lie."""
+        """The labels of the records that cannot be read."""
         keys = sorted(key for key, (_, record) in self._kept.items() if record is None)
         return [key.removeprefix(RECORDS).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
-        """The records written at `moment` (aware) or later, all without it. `advance` is told how many of how many."""
+        """The records written at `moment` (aware) or later; all without it. `advance`: so many of so many are read."""
         wanted = [
             entry
             for entry in self._documents.list(RECORDS)
@@ -104,7 +104,7 @@ def _is_record(key: str) -> bool:
 
 
 def runs(record: Server) -> list[PastAttempt]:
-    """Every attempt that a record knows of, oldest first."""
+    """Every attempt that a record holds, oldest first."""
     return [*record.earlier, past_attempt(record)]
 
 

@@ -25,7 +25,7 @@ PAUSE = 3.0  # seconds between two looks
 
 @dataclass(frozen=True)
 class Step:
-    """One instruction of a plan: an operation, and what it is called with."""
+    """One instruction of a plan: an operation and its arguments."""
 
     operation: Callable[..., object]
     arguments: tuple[Any, ...] = ()
@@ -46,7 +46,7 @@ class Executor:
         self._clock = clock
 
     def sleep(self, seconds: float) -> None:
-        """Pause."""
+        """Wait for so many seconds."""
         (self._given_sleep or time.sleep)(seconds)
 
     def execute(self, steps: Sequence[Step], note: Callable[[Exception], None] | None = None) -> None:
@@ -126,7 +126,7 @@ class Executor:
 
 
 class _Timer:
-    """How long something takes: by the clock, or by what was slept where that is more, as with a test's `sleep`."""
+    """Measures seconds: those on the clock, or those that were slept if they are more, as with a test's `sleep`."""
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
         self._clock = clock

@@ -24,7 +24,7 @@ class StudySelection:
 
 
 def project_id(given: str | None) -> str:
-    """`--project`, or the id in this folder's config.yml. Raises `Problem` if there is neither, or it is no id."""
+    """`--project`, or the id in this folder's config.yml. Raises `Problem` if there is neither, or if it is no id."""
     return selected(given).id
 
 

@@ -33,7 +33,7 @@ class Billed:
 
     @property
     def asking(self) -> float:
-        """What asking has cost."""
+        """What the question to Cost Explorer has cost, in US dollars."""
         return self.requests * Prices().explorer_request.usd
 
 
@@ -65,7 +65,7 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
 
 
 def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:
-    """The bill, or why there is none to be had, with what to do: what was asked for beside it is worth showing."""
+    """The bill; or None and the reason, with what to do. The rest of a command's answer is shown in any case."""
     try:
         return billed(account, stack, start, end), ""
     except Exception as error:

@@ -168,7 +168,7 @@ def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
 
 
 def _show_warm(waiting: Sequence[Warm]) -> None:
-    """What warm servers cost for as long as their studies are live; how long that is, is not known."""
+    """Print what warm servers cost in an hour: for how long their studies are live is not known."""
     rows: list[Sequence[object]] = []
     for one in waiting:
         size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
@@ -270,7 +270,7 @@ def _notes(found: Any, unreadable: int) -> list[str]:
 
 
 def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
-    """From the first server on, or the first of this month; else why there is none."""
+    """The bill from the day of the first server on, or from the first of this month; or None, and why there is none."""
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
     # Cost Explorer remembers about a year.
     start: date = max(first.date(), (now - timedelta(days=364)).date())

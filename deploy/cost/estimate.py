@@ -43,7 +43,7 @@ DNS_QUERIES = Range(4, 10, 40)
 
 
 class Line(NamedTuple):
-    """One line of the estimate: what, how much of it (likely), and what it costs."""
+    """One line of the estimate: what is billed, the likely amount of it, and what it costs."""
 
     what: str
     amount: str
@@ -52,7 +52,7 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """What there is to know of a study before it is held."""
+    """What is known of a study before it is held."""
 
     participants: int
     steps: int
@@ -80,7 +80,7 @@ class Study:
 
     @property
     def lobby_polls(self) -> Range:
-        """Requests of all who wait in a lobby for others."""
+        """Requests of all participants while they wait in the lobby."""
         if not self.games or not self.has_sessions:
             return Range()
         most = self.patience / 2
@@ -93,7 +93,7 @@ class Study:
 
     @property
     def server_minutes(self) -> Range:
-        """A participant's server, from the request to the end."""
+        """Minutes of one server, from the request to its end."""
         if not self.games:
             return Range()
         if self.minutes is not None:
@@ -102,7 +102,7 @@ class Study:
 
 
 def study_lines(study: Study, prices: Prices) -> list[Line]:
-    """What the participants cost; nothing of it is billed without participants."""
+    """What is billed because of participants."""
     return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
 
 
@@ -134,7 +134,7 @@ class Warm(NamedTuple):
 
 
 def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> Warm:
-    """A warm server costs what one costs that is played on: the machine and its public address."""
+    """What a project's warm servers cost. One costs as much as one that is played on: machine and public address."""
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
     return Warm(project_id, servers, cpu, memory, spot, on_demand)
 
@@ -197,7 +197,7 @@ def _page_requests(study: Study) -> Range:
 
 @dataclass(frozen=True)
 class FixedResources:
-    """What an installation has with and without participants: counted in `infra/template.yml`."""
+    """What an installation has whether there are participants or not, as counted in `infra/template.yml`."""
 
     queues: int = 3  # that a function listens to
     alarms: int = 24
@@ -207,7 +207,7 @@ class FixedResources:
 
     @classmethod
     def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> FixedResources:
-        """Counted in a template's resources."""
+        """The resources of a template, counted."""
         kinds = [str(resource.get("Type")) for resource in resources.values()]
         return cls(
             queues=kinds.count("AWS::Lambda::EventSourceMapping"),
@@ -217,7 +217,7 @@ class FixedResources:
 
 
 def month_lines(prices: Prices, fixed: FixedResources) -> list[Line]:
-    """What a month without participants costs. The high end is without free tiers."""
+    """What a month without participants costs. The high figure is without free tiers."""
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0
@@ -248,7 +248,7 @@ def _fixed(what: str, count: int, price: float, free: float) -> Line:
 
 
 def assumptions(study: Study) -> list[str]:
-    """What the figures rest on, in sentences."""
+    """What the estimate assumes, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
     found = [
@@ -287,5 +287,5 @@ def assumptions(study: Study) -> list[str]:
 
 
 def total(lines: list[Line]) -> Usd:
-    """The sum."""
+    """The sum of the lines."""
     return sum((line.usd for line in lines), Usd())

@@ -39,12 +39,12 @@ class Range:
         return Range(self.low + other.low, self.likely + other.likely, self.high + other.high)
 
     def __mul__(self, times: Range | float) -> Range:
-        """By a number, or each of the three by its own."""
+        """Multiply by a number, or each of the three figures by that of another range."""
         by = times if isinstance(times, Range) else Range.exactly(times)
         return Range(self.low * by.low, self.likely * by.likely, self.high * by.high)
 
     def as_json(self) -> dict[str, float]:
-        """To a hundredth of a cent."""
+        """The three figures, rounded to a hundredth of a cent."""
         return {"low": round(self.low, 4), "likely": round(self.likely, 4), "high": round(self.high, 4)}
 
 
@@ -52,7 +52,7 @@ Usd = Range  # in US dollars
 
 
 class Price(NamedTuple):
-    """What one `unit` costs, and where that stands."""
+    """What one `unit` costs, and the page that says so."""
 
     usd: float
     unit: str
@@ -61,7 +61,7 @@ class Price(NamedTuple):
 
 
 class Prices(NamedTuple):
-    """The table. `region` is where it holds."""
+    """The table of prices, in the region `region`."""
 
     # Fargate, Linux on x86; from the download of the image to the end of the task, by the second, a minute at least.
     vcpu_hour: Price = Price(0.04048, "vCPU-hour", "aws.amazon.com/fargate/pricing; AmazonECS USE1-Fargate-vCPU-Hours")
@@ -109,7 +109,7 @@ class Prices(NamedTuple):
         return Usd(low, likely, high)
 
     def note(self, region: str) -> str:
-        """What to say of these prices for an installation in `region`."""
+        """A sentence on how far these prices hold for an installation in `region`."""
         if self.region == region:
             return f"List prices of {self.region}, {self.date}, without taxes and credits."
         return (
@@ -119,7 +119,7 @@ class Prices(NamedTuple):
 
 
 def current(client: Any, region: str, today: str) -> Prices:
-    """The table with Fargate's prices of `region` as AWS gives them today; the rest as it stands.
+    """The table with today's prices of Fargate in `region`, as AWS gives them; the other prices stay.
 
     `client` is one of the Price List API, which lives in us-east-1 and costs nothing. Raises LookupError if the answer
     has no such prices.

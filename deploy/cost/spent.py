@@ -15,7 +15,7 @@ Size = tuple[float, float]  # vCPU, GB
 
 @dataclass
 class Spent:
-    """A sum over servers."""
+    """The sum of what servers cost."""
 
     usd: Usd = field(default_factory=Usd)
     hours: float = 0.0  # of servers
@@ -34,7 +34,7 @@ class Spent:
 def spent(
     records: Iterable[Server], prices: Prices, now: datetime, sizes: dict[str, Size], since: datetime | None = None
 ) -> Spent:
-    """What these servers cost up to now, or from `since` on.
+    """What these servers have cost until now, or since `since`.
 
     Fargate bills from the download of the image, which begins seconds after the request and is not on record: so from
     the request on. A warm server is two records: its own says how long it waited, and that of the participant who took

@@ -43,7 +43,7 @@ def _hint(python: str | None) -> None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an apply came to: whether it changed something, how long it took (seconds), and the stack's outputs."""
+    """The result of an apply: whether it changed something, how many seconds it took, and the stack's outputs."""
 
     changed: bool
     seconds: float
@@ -53,9 +53,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ApplyRequest:
-    """How to apply: the `study` that is to come there, what is known to be `wrong` already, and the answers given.
+    """What to apply for: the `study` to put there, findings that are `wrong` already, and the administrator's answers.
 
-    `yes`: to the question whether something may be lost. `anyway`: go on although something is in the way.
+    `yes` agrees to the loss of something. `anyway`: go on although something is in the way.
     """
 
     study: Study | None = None
@@ -70,7 +70,7 @@ def apply(
     settings: Settings,
     request: ApplyRequest = ApplyRequest(),
 ) -> Outcome:
-    """Bring the stack to what template and settings say, showing what is done. May be repeated after any interruption.
+    """Bring the stack to what template and settings say, and print what is done. May be repeated after an interruption.
 
     Looks first whether anything is in the way, and asks before anything is lost. Raises `Problem`.
     """

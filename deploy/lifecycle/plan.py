@@ -71,7 +71,7 @@ _STYLES = {
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of a resource: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
+    """What happens to a resource: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
 
     action: str
     name: str  # the function's file name in lambdas/, or the logical id
@@ -83,7 +83,7 @@ class Change:
 
     @property
     def danger(self) -> str:
-        """A sentence, if something is lost or left behind by this; else ""."""
+        """A sentence on what this change loses or leaves behind; "" if nothing."""
         if self.type not in STATEFUL or self.action not in {"replace", "may replace", "remove"}:
             return ""
         holds = STATEFUL[self.type]
@@ -107,11 +107,11 @@ class Plan:
 
     @property
     def dangers(self) -> list[str]:
-        """What the administrator has to agree to."""
+        """What is lost or left behind, to which the administrator has to agree."""
         return [change.danger for change in self.changes if change.danger]
 
     def as_json(self) -> dict[str, Any]:
-        """For scripts."""
+        """The plan as JSON data, for scripts."""
         return {
             "stack": self.stack,
             "region": self.region,
@@ -149,7 +149,7 @@ def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> li
 
 
 def of_creation(template: Template, parameters: Mapping[str, str]) -> list[Change]:
-    """What a new stack of this template holds."""
+    """The changes that a new stack of this template makes."""
     files = template.function_names()
     return [
         Change("create", files.get(name, name), resource["Type"], name)
@@ -223,7 +223,7 @@ def _called(kind: str) -> str:
 
 
 def show(plan: Plan, answer: bool = False) -> None:
-    """Print it: as the command's answer, or as what is going to happen."""
+    """Print the plan: to stdout if it is the command's `answer`, else to stderr, as what is going to happen."""
     console = screen.out if answer else screen.err
     for line, style in lines(plan):
         console.print(Text(line, style=style))
@@ -268,13 +268,13 @@ def plan(account: Account, stack: str, settings: Settings, *, study: Study | Non
 
 
 def new_site(prepared: Prepared) -> str:
-    """The host that participants will open, if it is another than before."""
+    """The host name that participants will open, if it changes; else ""."""
     hosts = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
     return hosts[1] if hosts[0] != hosts[1] else ""
 
 
 def run(account: Account, stack: str, settings: Settings, as_json: bool, study: Study | None = None) -> int:
-    """Make the plan and print it, and what would be in its way; the command's exit code."""
+    """Make the plan, print it and what would be in its way, and return the command's exit code."""
     found = plan(account, stack, settings, study=study)
     if as_json:
         screen.result_json(found.as_json())

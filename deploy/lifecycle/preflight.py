@@ -46,7 +46,7 @@ class InstallationCheck:
 def check(
     prepared: Prepared, study: Study | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
 ) -> None:
-    """Look at all that is new, and show what is wrong, with what is known to be `wrong` already.
+    """Check all that is new, and show what is wrong, also what is known to be `wrong` already.
 
     Raises `Problem` if anything is in the way, unless `anyway`.
     """
@@ -54,17 +54,17 @@ def check(
 
 
 def check_account(account: Account, wrong: Sequence[Finding], study: Study | None = None) -> None:
-    """Raises `Problem` after showing what is wrong already, and what else is in the way of a first installation."""
+    """Check the account before a first installation; show what is wrong, also what is known. Raises `Problem`."""
     _stop([*wrong, *examine((account, study), _OF_ACCOUNT)])
 
 
 def of_problem(name: str, problem: Problem) -> Finding:
-    """What stopped something, as a line of the list."""
+    """A problem as a line of the list of findings."""
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
 def look_at(checked: InstallationCheck) -> list[Finding]:
-    """Everything that is not as it should be, what is in the way last. Nothing is changed."""
+    """All findings that are not good; those that are in the way come last. Nothing is changed."""
     before, after = checked.prepared.before, checked.prepared.parameters
     found: list[Finding] = []
     checks: dict[str, Callable[[InstallationCheck], Iterable[Finding]]] = {}
@@ -82,7 +82,7 @@ def look_at(checked: InstallationCheck) -> list[Finding]:
 
 
 def _bad_last(found: Iterable[Finding]) -> list[Finding]:
-    """Many long remarks below it would scroll what is in the way off the screen."""
+    """The findings with the bad ones at the end, so that long remarks do not scroll them off the screen."""
     return sorted(found, key=lambda one: one.mark is Mark.BAD)
 
 
@@ -326,9 +326,9 @@ def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def make_ecs_role(account: Account) -> bool:
-    """ECS's service-linked role: in an account that never used ECS, the first cluster of a template fails without it.
+    """Make ECS's service-linked role if the account has none: without it, a template's first cluster fails.
 
-    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Whether it was made just now: IAM makes it known
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Return whether it was made now: IAM makes it known
     some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
     """
     try:

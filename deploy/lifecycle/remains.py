@@ -26,7 +26,7 @@ OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not curre
 
 
 def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Remains:
-    """List what there is after a removal. Waits for what AWS goes on listing for a while.
+    """List what exists after a removal. Waits for what AWS still lists for a while after it was deleted.
 
     `remembered`: what CloudFormation says that the installation had.
     """
@@ -134,7 +134,7 @@ class Remains:
             yield "AWS's own role", "kept", "nothing", role
 
     def conclude(self, place: str) -> int:
-        """Say what stays, and what to do about it. Raises `Problem` if something is left that should be gone.
+        """Print what stays and what to do; return the exit code. Raises `Problem` if something is left by mistake.
 
         `place` are the options with which other commands find this account and region.
         """

@@ -35,7 +35,7 @@ _GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
 @dataclass(frozen=True)
 class Found:
-    """What there is of an installation."""
+    """What exists of an installation."""
 
     stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
     things: Sequence[ListedResource]  # what the commands made beside it, and what it left
@@ -49,7 +49,7 @@ class Found:
 
 
 class Removal:
-    """Removes an installation; every step may be repeated, and finds done what is done."""
+    """Removes an installation. Every step may be repeated; what is done already counts as done."""
 
     def __init__(self, account: Account, name: str, executor: Executor | None = None) -> None:
         self.account = account
@@ -62,7 +62,7 @@ class Removal:
         self.kept: list[tuple[Validation, str]] = []  # records that stay, and what uses them
 
     def look(self) -> Found:
-        """Return what there is; change nothing."""
+        """Return what exists; change nothing."""
         described = self._stack.describe()
         things = [
             ListedResource("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)
@@ -95,7 +95,7 @@ class Removal:
         return steps + ([step(self._data_buckets)] if data else [])
 
     def run(self, found: Found, data: bool) -> None:
-        """Remove it all; the data only with `data`. Raises `Problem` when something is in the way."""
+        """Remove everything; the data only with `data`. Raises `Problem` when something is in the way."""
         self.executor.execute(self.plan(found, data))
 
     def _data(self) -> list[str]:

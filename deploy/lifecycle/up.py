@@ -27,7 +27,7 @@ from hippodrome.config import ConfigErrors, layout, read_project
 
 
 def may_apply(account: Account, stack: str) -> bool:
-    """Whether these credentials are an administrator's. Without an installation they count as one's."""
+    """Whether these are an administrator's credentials. Without an installation, any credentials count as such."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         return True

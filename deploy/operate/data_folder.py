@@ -37,7 +37,7 @@ class DataFolder:
             yield self._version(key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """None: a file appears whole."""
+        """Nothing: on one machine a file appears whole."""
         return iter(())
 
     def read(self, version: Version) -> bytes:
@@ -51,18 +51,18 @@ class DataFolder:
         shutil.copyfile(self.root / version.key, to)
 
     def store(self, key: str, file: Path) -> None:
-        """Put a file's content in the place of another's, on the disk before it has the name."""
+        """Replace a file's content by that of `file`. The new content is on the disk before the name leads to it."""
         self._put(key, file)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Put a small document in the place of `before`; whether that was there."""
+        """Write a small document if it still is `before`; return whether it was."""
         if (self.root / key).read_bytes() != before:
             return False
         self._put(key, after)
         return True
 
     def delete(self, versions: Iterable[Version], note: Note = lambda _: None) -> int:
-        """Delete these files, and the folders that are empty then."""
+        """Delete these files, and folders that become empty."""
         gone = list(versions)
         for each in gone:
             path = self.root / each.key

@@ -128,7 +128,7 @@ def command(
 
 
 def credentials(account: Account) -> Iterator[Finding]:
-    """Whose credentials these are, and where. Raises what makes a sentence if AWS does not accept them."""
+    """Whose credentials these are, and the region. Raises botocore's errors if AWS does not accept them."""
     identity = account.identity
     name = identity["Arn"].rpartition(":")[2]
     if name == "root":
@@ -141,7 +141,7 @@ def credentials(account: Account) -> Iterator[Finding]:
 
 
 def installation_state(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
-    """The installation, and whether it is whole and of this version."""
+    """The installation (None if it is missing), and whether it is whole and of this version."""
     try:
         installation = find_installation(account, stack)
     except Problem as problem:

@@ -21,7 +21,7 @@ PATIENCE = 10  # seconds for the site
 
 
 def zone(context: CheckContext) -> Iterator[Finding]:
-    """The hosted zone is there, holds the domain, and the Internet is sent to it."""
+    """The hosted zone exists, holds the domain, and the Internet's DNS leads to it."""
     domain = context.installation["RootDomain"]
     try:
         found = read_zone(context.account, context.installation["HostedZoneId"])
@@ -97,7 +97,7 @@ def site(context: CheckContext) -> Iterator[Finding]:
 
 
 def fetch(address: str) -> int:
-    """The status of an HTTPS answer; errors are answers too. Raises OSError and ValueError when there is none."""
+    """The status of the answer to an HTTPS request; 4xx and 5xx count as answers. Raises OSError or ValueError."""
     if not address.startswith("https://"):
         raise ValueError(address)
     try:

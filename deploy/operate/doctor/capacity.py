@@ -20,7 +20,7 @@ HEADROOM = 4  # standard deviations above the mean: requests come at random, and
 
 
 def fargate(context: CheckContext) -> Iterator[Finding]:
-    """vCPUs on Spot and on demand, against servers at once times their vCPUs, and warm ones besides."""
+    """vCPU quotas, Spot and on demand, compared with what all servers at once need, warm ones included."""
     cpu = context.cpu or (0 if context.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")

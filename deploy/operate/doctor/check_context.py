@@ -19,7 +19,7 @@ from hippodrome.model.project import Project
 
 @dataclass
 class CheckContext:
-    """The installation to check. `delegation` and `fetch` query DNS and the site; None: do not query."""
+    """The installation to check. `delegation` and `fetch` query DNS and the site; if None, these are not queried."""
 
     account: Account
     installation: Installation
@@ -56,12 +56,12 @@ class CheckContext:
 
     @cached_property
     def players(self) -> int:
-        """The most participants who share a server of these projects."""
+        """The largest number of participants who share a server of these projects."""
         return max((p.players for p in self.projects if p.game_steps), default=1)
 
     @cached_property
     def warm(self) -> int:
-        """The number of warm servers. For each one that is assigned, another is started."""
+        """How many warm servers these projects keep. When one is assigned, another is started."""
         return sum(p.warm_servers for p in self.projects)
 
     @cached_property

@@ -39,7 +39,7 @@ OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 
 def documents(context: CheckContext) -> Iterator[Finding]:
-    """The list of projects, what is written about servers and slots, and participants' records."""
+    """The list of projects, documents of servers and slots, participants' records: those that cannot be read."""
     found = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
         found += [*_shared(context.platform.documents, project), *_participants(context.platform.documents, project)]
@@ -167,7 +167,7 @@ def _can_be_read(there: Documents, key: str, read: Callable[[bytes], object]) ->
 
 
 def step_pages(context: CheckContext) -> Iterator[Finding]:
-    """Every page of the projects is there and renders for a participant without any data."""
+    """The pages of the projects that are missing, or do not render for a participant without any data."""
     wrong = [finding for project in context.projects for finding in _pages(context.platform.documents, project)]
     yield from wrong or [good("pages", "All are there and can be shown.")]
 

@@ -21,7 +21,7 @@ AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
 def projects(context: CheckContext) -> Iterator[Finding]:
-    """Every live project that plays, or the one that is asked about."""
+    """For each live project with a game, or the one that is asked about: can its servers start?"""
     if not context.projects:
         yield look(
             "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."

@@ -51,7 +51,7 @@ class StateTimes:
 
 
 class Rehearsal:
-    """One server without a participant. `told` gets what is going on.
+    """Starts and stops one server without a participant. `told` is called with each thing that happens.
 
     In a project with sessions it is a session's server. Its session has a document, so that the sweep does not take it
     for one that was started ahead in vain.
@@ -81,9 +81,9 @@ class Rehearsal:
         self._record: Server | None = None
 
     def run(self) -> list[Finding]:
-        """Start it, wait until it is ready, stop it, look that nothing is left.
+        """Start the server, wait until it is ready, stop it, and check that nothing is left.
 
-        After Ctrl-C too: then `left` says what was found, and the exception goes on.
+        If Ctrl-C interrupts it, it cleans up as well; then `left` says what was found, and the exception goes on.
         """
         found: list[Finding] = []
         try:
@@ -245,5 +245,5 @@ def _why(record: Server) -> str:
 
 
 def project_for(context: CheckContext) -> Project | None:
-    """Whose server is rehearsed: a live project that plays."""
+    """The project whose server is rehearsed: a live one with a game; None if there is none."""
     return next((p for p in context.projects if p.live and p.game_steps and p.task_definition), None)

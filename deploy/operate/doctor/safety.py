@@ -16,7 +16,7 @@ APPLY = "Run `python -m deploy apply`: it puts this right."
 
 
 def bucket(context: CheckContext) -> Iterator[Finding]:
-    """Ours, closed to the public, versioned, and only over TLS."""
+    """The bucket belongs to this account, is closed to the public, keeps versions, and answers over TLS alone."""
     name, client = context.installation["Bucket"], context.account.client("s3")
     try:
         client.head_bucket(Bucket=name, ExpectedBucketOwner=context.account.id)

@@ -27,7 +27,7 @@ QUIET = 30.0  # seconds between two lines about what is going on, where there is
 def played(
     context: CheckContext, bots: int, *, minutes: int, yes: bool, file: Path | None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Ask, rehearse, write the transcript; its lines, and the transcript. Raises `Problem` if the answer is no."""
+    """Ask, rehearse, write the transcript; return findings and transcript. Raises `Problem` if the answer is no."""
     project = project_for(context)
     if project is None:
         return [bad(CHECK, "No live project has a game: there is nothing to play.", "Register one with --live.")], {}

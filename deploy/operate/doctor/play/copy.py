@@ -38,7 +38,7 @@ CONTROLS = ("left", "right", "up", "down", "start", "pause")  # the controls of 
 
 
 class Copy:
-    """One copy. `project` is set by `make`."""
+    """The copy of one study. `make` sets `project`."""
 
     def __init__(self, account: Account, installation: Installation, platform: Platform) -> None:
         self.id = f"rehearsal-{secrets.token_hex(16)}"
@@ -87,7 +87,7 @@ class Copy:
 
 
 def changed(project: Project, new_id: str) -> Project:
-    """The study for bots: each bot gets a signed link and a server, and may stop the game."""
+    """The study as bots play it: each bot gets a signed link and a server of its own, and may stop the game."""
     ui = project.trial.get("ui") or dict.fromkeys(CONTROLS, True)
     return msgspec.structs.replace(
         project,

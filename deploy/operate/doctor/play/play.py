@@ -30,18 +30,18 @@ DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 
 
 def expected(project: Project, bots: int) -> Usd:
-    """What it will cost."""
+    """What the rehearsal will cost."""
     return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
 
 
 def site(context: CheckContext, project_id: str) -> OneSite:
-    """Where the bots may go: this installation's site, and its servers by their names."""
+    """The addresses that bots may open: this installation's site, and its servers by their names."""
     servers = context.platform.settings.game_sources.split()
     return OneSite(context.installation["Site"], servers, project_id, tls=addresses.authorities())
 
 
 class Play:
-    """One rehearsal. `told` hears what is going on; `transcript` has what was proven."""
+    """One rehearsal. `told` is called with each thing that happens; `transcript` says what was proven."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Play:
         self._timer: upkeep.Timer | None = None
 
     def run(self) -> Transcript:
-        """All parts, and away again. Ctrl-C goes on as KeyboardInterrupt when everything is removed."""
+        """Run all parts, then remove everything. After Ctrl-C too: then KeyboardInterrupt goes on."""
         self._part("erased", self._tidy_up)
         try:
             if self._part("study", self._make):
@@ -111,7 +111,7 @@ class Play:
         self._part("times", lambda: upkeep.times(self._scene, self._records()))
 
     def _part(self, key: str, part: Callable[[], None]) -> bool:
-        """Whether it came to its end; if not, a line says why, and what to do."""
+        """Run one part; return whether it came to its end. If not, a line says why, and what to do."""
         try:
             part()
         except CheckFailed as failed:

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass
 class Scene:
-    """Everything that a part needs. `until` is when all must be over, by `clock`."""
+    """What every part needs. By the time `until` of `clock`, all must be over."""
 
     context: CheckContext
     copy: Copy
@@ -48,7 +48,7 @@ class Scene:
         return max(self.until - self.clock(), 0.0)
 
     def bot(self, name: str, play: float) -> Bot:
-        """A new bot, with its signed link. Its id will not be shown."""
+        """A new bot with its signed link. The transcript hides its id."""
         user = self.copy.user(name)
         self.transcript.hide(user)
         patience = min(BOT_PATIENCE, self.left())
@@ -56,7 +56,7 @@ class Scene:
         return Bot(self.copy.link(user), user, random, play=play, patience=patience, where=self.where)
 
     def server(self, user: str) -> Server | None:
-        """The record of a bot's server, or of its session's. Its token and names will not be shown."""
+        """The record of a bot's server, or of its session's server. The transcript hides its token and names."""
         membership = self.repository.membership(self.copy.id, user) if self.copy.players > 1 else None
         found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
         if found is not None:
@@ -64,7 +64,7 @@ class Scene:
         return found
 
     def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: CheckFailed) -> T:
-        """What `look` gives, as soon as it gives something. Raises `failed` after that time, or when all is to end."""
+        """Call `look` until it returns something; return that. Raises `failed` after so many seconds, or at `until`."""
         began = self.clock()
         while (found := look()) is None:
             spent = self.clock() - began

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Stage(NamedTuple):
-    """What is measured, and how long the simulation assumes it takes: usually (from, to), and at most."""
+    """A stage that is measured, and its seconds in the simulation: usually (from, to), and at most."""
 
     what: str
     usual: tuple[float, float]

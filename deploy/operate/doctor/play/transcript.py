@@ -46,7 +46,7 @@ LONGEST = 1_000  # characters of a line: some are a server's own words, whatever
 
 @dataclass(frozen=True)
 class Line:
-    """One line: its key, how it stands, when it was said (seconds from the beginning), and what was measured."""
+    """One line: its key, its mark, when it was said (seconds from the beginning), and what was measured."""
 
     key: str
     mark: Mark
@@ -57,7 +57,7 @@ class Line:
 
 
 class Transcript:
-    """The lines so far. Whatever is said goes through `clean` first."""
+    """The lines until now. Every text goes through `clean` first."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.lines: list[Line] = []
@@ -66,11 +66,11 @@ class Transcript:
         self._secrets: set[str] = set()
 
     def hide(self, *secrets: str | None) -> None:
-        """Never show these: ids, tokens, names and addresses that no pattern knows."""
+        """Hide these ids, tokens, names and addresses from now on, which no pattern would find."""
         self._secrets.update(secret for secret in secrets if secret)
 
     def clean(self, text: str) -> str:
-        """The text without ids, tokens, and anything that tells the account.
+        """The text without ids, tokens, and anything that reveals the account.
 
         Nothing in it commands a terminal: a study's agent may have written a part of it.
         """
@@ -82,7 +82,7 @@ class Transcript:
         return text if len(text) <= LONGEST else f"{text[:LONGEST]} {HIDDEN}"
 
     def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
-        """A line more. KeyError for one that is not among `LINES`."""
+        """Add a line. Raises KeyError for one that is not among `LINES`."""
         LINES[key]
         at = round(self._clock() - self._began, 1)
         self.lines.append(Line(key, mark, self.clean(text), self.clean(advice), at, seconds))

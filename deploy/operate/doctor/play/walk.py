@@ -37,7 +37,7 @@ LOGS = "See `python -m deploy logs --errors`."
 
 
 class Walk:
-    """Bots through the copy; afterwards each method says a line of what came of it."""
+    """Sends bots through the copy. After that, each method adds a line on one result."""
 
     def __init__(self, scene: Scene, bots: int) -> None:
         self._scene = scene
@@ -54,13 +54,13 @@ class Walk:
 
     @property
     def ran(self) -> list[Server]:
-        """The servers, each once."""
+        """The servers that ran, each once."""
         return each_once(self.records.values())
 
     # Links
 
     def links(self) -> None:
-        """A link without a signature, and one with another participant's, are refused; the site says HSTS."""
+        """A link without a signature is refused, and one with another participant's signature; the site sends HSTS."""
         scene = self._scene
         own, other = scene.copy.link(self.bots[0].account.user_id), scene.copy.link(self.victim.account.user_id)
         unsigned = own.partition("&signature=")[0]
@@ -98,7 +98,7 @@ class Walk:
     # Walking
 
     def run(self) -> None:
-        """Send them all, and kill one's task. KeyboardInterrupt ends them."""
+        """Send all bots, and kill the task of one. KeyboardInterrupt ends them."""
         interruptible(self._walk())
 
     async def _walk(self) -> None:
@@ -138,7 +138,7 @@ class Walk:
     # What came of it
 
     def pages(self) -> None:
-        """Everybody came to the last page."""
+        """Every bot came to the last page."""
         accounts = [bot.account for bot in self.all]
         for account in accounts:
             self._scene.transcript.hide(account.code, account.user_id)
@@ -150,7 +150,7 @@ class Walk:
         self._scene.transcript.bad("pages", f"{finished} of {len(accounts)} bots finished: {why}.", LOGS)
 
     def servers(self) -> None:
-        """Each had a server that came to be ready; how, and how long that took."""
+        """Every bot got a server that became ready; says how, and after how many seconds."""
         transcript = self._scene.transcript
         found = {bot: self._scene.server(bot.account.user_id) for bot in self.all}
         self.records = {bot.account.user_id: record for bot, record in found.items() if record}
@@ -171,7 +171,7 @@ class Walk:
         )
 
     def games(self) -> None:
-        """They played: frames came, and each game came to its end."""
+        """The bots played: frames came, and each game came to its end."""
         plays = [play for bot in self.bots for play in bot.account.plays]
         frames, done = sum(play.frames for play in plays), sum(play.done for play in plays)
         if plays and done == len(plays) and frames:
@@ -282,12 +282,12 @@ class Walk:
 
 
 def each_once(records: Iterable[Server]) -> list[Server]:
-    """Without repetitions: the members of a session have one server together."""
+    """The servers without repetitions, since the members of a session share one."""
     return list({record.label: record for record in records}.values())
 
 
 def left(scene: Scene, user: str) -> list[str]:
-    """What is still there of a bot's server; nothing if it never had one."""
+    """What is left of a bot's server; nothing if the bot never had one."""
     record = scene.server(user)
     if record is None:
         return []
