@@ -72,7 +72,7 @@ class Documents(Protocol):
         """Replace the version with this ETag; return the new ETag. Raises `Conflict` if another version is present."""
 
     def put(self, key: str, body: bytes) -> None:
-        """Write a document, whatever is there: of several writers the last one's stays. For what says "still here"."""
+        """Write a document, whatever is there: the last of several writers wins. For entries that say "still here"."""
 
     def list(self, prefix: str) -> Iterator[Entry]:
         """All documents whose key begins with `prefix`, in key order."""
@@ -241,7 +241,7 @@ class Settings:
 
     @property
     def game_scheme(self) -> str:
-        """`wss`, or `ws` where trial servers have no TLS."""
+        """The scheme of trial servers' addresses: `wss`, or `ws` where they have no TLS."""
         return self.game_sources.partition(":")[0] or "wss"
 
     @classmethod

@@ -71,7 +71,7 @@ class Route53Dns:
         return change
 
     def in_sync(self, change: str) -> bool:
-        """One GetChange; none for "" (nothing had to change)."""
+        """One GetChange for each id in `change`; none for "", when nothing had to change."""
         try:
             return all(
                 self._client().get_change(Id=part)["ChangeInfo"]["Status"] == "INSYNC"

@@ -85,7 +85,7 @@ class S3Documents:
         self._put(key, body, {})
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Lazy, 1,000 keys a request."""
+        """One request for each 1,000 keys, sent when the keys before were taken."""
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
         for page in pages:
             for line in page.get("Contents", ()):

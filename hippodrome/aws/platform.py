@@ -65,7 +65,7 @@ class AwsPlatform:
 
     @cached_property
     def documents(self) -> S3Documents:
-        """Needs `BUCKET`."""
+        """The documents on S3. Needs `BUCKET`."""
         from hippodrome.aws.documents import S3Documents
 
         return S3Documents(lambda: self._client("s3"), self._needs("documents")("BUCKET"))
@@ -85,7 +85,7 @@ class AwsPlatform:
 
     @cached_property
     def tasks(self) -> EcsTasks:
-        """Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `SIGN_URL` to run them."""
+        """The servers on ECS. Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `SIGN_URL` to run them."""
         from hippodrome.aws.tasks import EcsTasks
 
         return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))
@@ -100,14 +100,14 @@ class AwsPlatform:
 
     @cached_property
     def timers(self) -> SchedulerTimers:
-        """Needs `SCHEDULE_GROUP`; `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN` to set timers."""
+        """The timers. Needs `SCHEDULE_GROUP`; to set one, `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN`, too."""
         from hippodrome.aws.timers import SchedulerTimers
 
         return SchedulerTimers(lambda: self._client("scheduler"), self._needs("timers"), self.now)
 
     @cached_property
     def bus(self) -> SnsBus:
-        """Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `send_delayed`."""
+        """The topics. Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `send_delayed`."""
         from hippodrome.aws.bus import SnsBus
 
         return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
@@ -123,7 +123,7 @@ class AwsPlatform:
         return datetime.now(UTC)
 
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
-        """On at most `MAX_THREADS` threads: a batch mostly waits for the network."""
+        """Uses at most `MAX_THREADS` threads, since the calls of a batch mostly wait for the network."""
         if len(acts) < 2:
             return [act() for act in acts]
         from concurrent.futures import ThreadPoolExecutor

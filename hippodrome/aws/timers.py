@@ -59,7 +59,7 @@ class SchedulerTimers:
                 raise
 
     def list(self) -> Iterator[str]:
-        """100 a request."""
+        """One request for each 100 timers."""
         pages = self._client().get_paginator("list_schedules").paginate(GroupName=self._need("SCHEDULE_GROUP"))
         for page in pages:
             for schedule in page["Schedules"]:

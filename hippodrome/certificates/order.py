@@ -115,7 +115,7 @@ def order(request: OrderRequest, publish: Callable[[list[str], float], None], te
 
 
 def read_stored(privkey: bytes) -> StoredCertificate | None:
-    """The certificate in `privkey.pem`; None if it is not ours. A damaged one has no names and has expired."""
+    """The certificate in `privkey.pem`; None if we did not order it. A damaged one has no names and has expired."""
     origin, _, rest = privkey.partition(b"\n")
     directory = origin.decode(errors="replace").strip()
     if not directory.startswith(_ORIGIN):
@@ -132,7 +132,7 @@ def read_or_expired(chain: bytes, directory: str = "") -> StoredCertificate:
 
 
 def chain_of(privkey: bytes) -> bytes:
-    """The chain in `privkey.pem`."""
+    """The chain of certificates (PEM) in `privkey.pem`."""
     return privkey[privkey.index(b"-----BEGIN CERTIFICATE") :]
 
 

@@ -122,7 +122,7 @@ class Renewal:
         return self._decide(state, stored, wanted)
 
     def obtain(self, wanted: RenewalRequest) -> Outcome:
-        """Order if it is due. Raises OrderFailed and what the ports raise; the certificate in use stays then."""
+        """Order if it is due. Raises OrderFailed and what the ports raise; the present certificate stays then."""
         token = secrets.token_hex(8)
         decision, before, stored = self._decide_and_claim(wanted, token)
         if decision.verdict is not Verdict.ORDER:

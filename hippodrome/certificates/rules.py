@@ -165,7 +165,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether to order, why in words, and when the answer may change."""
+    """Whether to order, the reason in words, and when this may change."""
 
     verdict: Verdict
     why: str
@@ -262,7 +262,7 @@ def without_challenges(state: State, values: Sequence[str]) -> State:
 
 
 def unclaimed(state: State) -> State:
-    """The run has ended without a result to remember (Ctrl-C)."""
+    """The run was interrupted (Ctrl-C) and has no result: another run may order."""
     return msgspec.structs.replace(state, claim="", claimed=None)
 
 

@@ -19,7 +19,7 @@ from hippodrome.config.texts_file import texts_file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line. Returns the exit status: 1 if there are mistakes."""
+    """Run the command line; return the exit status: 1 if there are mistakes."""
     parser = argparse.ArgumentParser(prog="python -m hippodrome.config", description="Check a project's config.yml.")
     commands = parser.add_subparsers(dest="command", required=True)
     check = commands.add_parser("check", help="print every mistake in a project folder")

@@ -51,7 +51,7 @@ class Import(NamedTuple):
 
 
 def may_run_on_aws(config: Config) -> bool:
-    """Whether the study may come to AWS: it says so, or leaves that open and says how large its servers are."""
+    """Whether the study may run on AWS: it has `useAWS: true`, or no useAWS, but a `cpu` in awsSetup."""
     project = config.project
     return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
 
@@ -145,7 +145,7 @@ def _unknown(image: _Image) -> str:
 
 
 def wanted(name: str) -> str:
-    """The line for requirements.txt that brings a top-level module as it is installed here; empty if it is not."""
+    """The line for requirements.txt that brings this top-level module in the version here; empty if it is not here."""
     distributions = sorted(set(_distributions().get(name, ())))
     return f"{distributions[0]}=={metadata.version(distributions[0])}" if distributions else ""
 

@@ -58,7 +58,7 @@ class Config:
         game_pages: Iterable[StepFiles] = (),
         remarks: Iterable[Diagnostic] = (),
     ) -> Config:
-        """What was checked and found free of mistakes."""
+        """The project whose values were checked and found free of mistakes."""
         project = checked.root.project
         events = resolve_events(project.events, [step.key for step in steps], project.steps)
         return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks))
@@ -89,16 +89,16 @@ class Config:
 
     @property
     def each_group(self) -> list[int | None]:
-        """The groups of participants; None alone if there are none."""
+        """The numbers of the groups of participants; only None if there are no groups."""
         return [*range(self.groups)] or [None]
 
     @property
     def own_pages(self) -> list[Path]:
-        """The files of pages that Hippodrome brings, which lie in no folder of the project."""
+        """The files of Hippodrome's own pages that the study uses. They lie in no folder of the project."""
         return [file for step in self.steps for file in step.files if file == CLOSING]
 
     def summary(self) -> str:
-        """What the project is, in a line: "6 steps, step 4 is the game (CartPole-v1), …"."""
+        """The project in one line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
         together = f" for {self.project.players} participants together" if self.project.has_sessions else ""
         parts += [f"{step_name(step.key)} is the game ({self.trial.game}){together}" for step in self.game_steps]

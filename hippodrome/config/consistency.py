@@ -18,7 +18,7 @@ from protocol.environment import PLAIN_ORIGINS
 
 
 def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
-    """Both checks of the file's sections. Paths in `invalid` yield no further mistakes."""
+    """Run both checks of the file's sections. Paths in `invalid` yield no further mistakes."""
     checked = check_values(sections, invalid)
     checks = (
         _missing,

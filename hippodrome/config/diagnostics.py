@@ -57,5 +57,5 @@ class Remark(NamedTuple):
 
 
 def in_order(problems: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """By line, each once."""
+    """The diagnostics in the order of their lines, each once."""
     return sorted(dict.fromkeys(problems), key=lambda problem: problem.line or 0)

@@ -139,7 +139,7 @@ def _remove(data: Any, path: Keys) -> None:
 
 
 def message_of(error: ErrorDetails, path: Keys) -> str:
-    """What pydantic found, in our words."""
+    """What pydantic found wrong, in our words."""
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])
     known = NAMES.get(path)

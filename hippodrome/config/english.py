@@ -19,16 +19,16 @@ _WORD = re.compile(r"[^\W\d_]+")
 
 
 def words_of(page: str) -> list[str]:
-    """The words that people read on a page, in small letters."""
+    """The words of a page's visible text, in small letters."""
     return _WORD.findall(_NO_WORDS.sub(" ", page).lower())
 
 
 def share(words: list[str]) -> float:
-    """How many of these words are common English ones, from 0 to 1."""
+    """The share of these words that are common English ones, from 0 to 1."""
     return sum(word in COMMON for word in words) / len(words)
 
 
 def is_not_english(texts: Iterable[str]) -> bool:
-    """Whether these pages and texts are surely in another language. False if there are too few words to tell."""
+    """Whether these pages and texts are certainly in another language. False if they have too few words to tell."""
     words = [word for text in texts for word in words_of(text)]
     return len(words) >= ENOUGH and share(words) < LEAST

@@ -39,13 +39,13 @@ def memory_choices(cpu: float) -> str:
 
 
 def cpu_choices() -> str:
-    """Every number of vCPUs there is, in words."""
+    """All numbers of vCPUs that Fargate offers, in words."""
     names = [f"{cpu:g}" for cpu in SIZES]
     return ", ".join(names[:-1]) + f" or {names[-1]}"
 
 
 def cpu(value: object) -> float:
-    """vCPUs of a server, one of Fargate's."""
+    """Check a number of vCPUs: it must be one that Fargate offers. Raises ValueError."""
     found = _size(value, "vcpus?")
     if found is not None and found in SIZES:
         return found
@@ -54,7 +54,7 @@ def cpu(value: object) -> float:
 
 
 def memory(value: object) -> float:
-    """GB of a server; whether it fits the vCPUs is another question."""
+    """Check a number of GB. `fits` says whether Fargate offers it with a number of vCPUs. Raises ValueError."""
     found = _size(value, "gi?b")
     if found is not None and 0.5 <= found <= 120:
         return found

@@ -35,12 +35,12 @@ class Source:
     adapted: Adapted
 
     def diagnostic(self, path: Keys, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
-        """What to say about the value at a path of our form: at its line (or another one) in the file."""
+        """A mistake or remark on the value at a path of our form, with its line in the file, or with `line`."""
         origin = self.adapted.origin(path)
         return self._diagnostic(origin, message, line, remark)
 
     def remarks(self) -> list[Diagnostic]:
-        """What was turned from HIPPO's form into ours."""
+        """A remark for each thing that was turned from HIPPO's form into ours."""
         return in_order(self._diagnostic(path, message, None, True) for path, message in self.adapted.remarks)
 
     def names(self, path: Keys) -> bool:

@@ -39,7 +39,7 @@ def project_id(event: Mapping[str, Any]) -> str | None:
 
 
 def renamed(event: Mapping[str, Any]) -> list[str]:
-    """After a failure: a sentence if the script uploads to a folder that is called otherwise than the project here."""
+    """After a failure: a sentence if the script uploads to a folder whose name is not the project's id here."""
     given, here = event.get("id"), project_id(event)
     if here is None or given == here:
         return []
@@ -61,7 +61,7 @@ def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str
 
 
 def lower_runtime(registration: dict[str, Any], most: int) -> list[str]:
-    """Set `maxRuntime` to what the installation allows if it is more, as HIPPO does; return a remark then."""
+    """Lower `maxRuntime` to what the installation allows, as HIPPO does; return a remark if it was more."""
     minutes = number_in(registration.get("maxRuntime"))
     if minutes is None or minutes <= most:
         return []

@@ -50,5 +50,5 @@ def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diag
 
 
 def canonical(name: str) -> str:
-    """The name as packages are compared by (PEP 503)."""
+    """The normalized name of a package (PEP 503), by which names are compared."""
     return re.sub(r"[-_.]+", "-", name).lower()

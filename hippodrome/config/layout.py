@@ -51,7 +51,7 @@ class Layout:
         return file.relative_to(self.folder).as_posix() if file.is_relative_to(self.folder) else file.name
 
     def problems(self) -> Iterator[Diagnostic]:
-        """What is wrong with where agent.py lies: a mistake if a game would be played without it, or a remark."""
+        """Mistakes and remarks on where agent.py lies; a mistake if a game would be played without it."""
         if self.agent is None:
             yield from self._missing_agent()
             return
@@ -96,7 +96,7 @@ class Layout:
 
 
 def find(folder: Path) -> Layout:
-    """Where the files of the project in `folder` lie. Raises ConfigErrors if it has not one config.yml."""
+    """Where the files of the project in `folder` lie. Raises ConfigErrors if it has no config.yml, or several."""
     folder = Path(folder)
     config = _config(folder)
     return Layout(folder, config, _seen_pages(folder), _agent(folder), requirements_file(folder))
@@ -120,12 +120,12 @@ def requirements_file(folder: Path) -> Path | None:
 
 
 def config_names() -> list[str]:
-    """Where a config.yml may lie, the first one first: paths from the project's folder."""
+    """The paths at which a config.yml may lie, from the project's folder. The first that exists counts."""
     return [*CONFIGS, *(f"{app}/{name}" for app in APPS for name in CONFIGS)]
 
 
 def has_config(folder: Path) -> bool:
-    """Whether there is a config.yml, be it good or not."""
+    """Whether the folder has a config.yml, with mistakes or without."""
     return any((folder / name).is_file() for name in config_names())
 
 

@@ -61,7 +61,7 @@ def project_id(value: object) -> str:
 
 
 def bucket(value: object) -> str:
-    """The name of an S3 bucket."""
+    """Check the name of an S3 bucket. Raises ValueError."""
     found = as_text(value, "the name of an S3 bucket")
     if found.startswith(("s3://", "arn:", "http")) or "/" in found:
         raise ValueError(f"must be the bucket's name alone, without s3:// or folders, not {show(found)}")
@@ -183,7 +183,7 @@ def who_with_whom(value: object) -> str | dict[str, str]:
 
 
 def text_name(value: object) -> str:
-    """The name of one of our texts (`hippodrome/model/texts.py`)."""
+    """Check the name of one of our texts (`hippodrome/model/texts.py`). Raises ValueError."""
     if isinstance(value, str) and value in ENGLISH:
         return value
     raise ValueError(f"unknown text{did_you_mean(str(value), ENGLISH) or '; docs/texts.md lists all'}")

@@ -30,14 +30,14 @@ OF_SESSIONS: tuple[Keys, ...] = (
 
 
 def no_effect(trial: Trial) -> str:
-    """What to say about each of these keys where the project has no `players`."""
+    """A sentence on each of these keys that has no effect because the project has no `players`."""
     most = max((len(humans) for _, humans in trial.humans()), default=0)
     alone = "project.players is 1, so each participant plays alone"
     return f"no effect: {alone}; write players: {max(2, most)} under project"
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
-    """What does not go together with `project.players`. Nothing if each participant plays alone."""
+    """Keys that do not go together with `project.players`. None if each participant plays alone."""
     if not checked.root.project.has_sessions or not checked.valid(PLAYERS):
         return
     yield from _humans(checked)
@@ -48,7 +48,7 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
 
 
 def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
-    """What does not go together with the number of groups, which the versions of pages make; 0 if there are none."""
+    """Keys that do not fit the number of groups, which the versions of pages make; 0 if there are none."""
     project = checked.root.project
     if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return

@@ -22,7 +22,7 @@ _SENTENCE = 3  # words that are the same in no two languages
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
-    """What is wrong with texts that are well formed by themselves: places that nothing fills, and no language."""
+    """Mistakes in texts that are well formed by themselves: places that nothing fills, and no language."""
     for name, text in checked.root.project.own_texts.items():
         if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
@@ -41,7 +41,7 @@ def _known(name: str) -> str:
 
 
 def shown_as_they_are(config: Config) -> Iterator[Remark]:
-    """What to say of texts in which participants read signs that were meant for a program."""
+    """Remarks on texts with signs that were meant for a program, and that participants would read."""
     for name, text in config.project.own_texts.items():
         if found := _HTML.search(text):
             yield Remark((*TEXTS, name), f"participants read {found[0]} as it stands here: a text is no HTML")
@@ -51,7 +51,7 @@ def shown_as_they_are(config: Config) -> Iterator[Remark]:
 
 
 def left_in_english(config: Config) -> Iterator[Remark]:
-    """What to say of a study in another language: texts of ours that its participants may read in English.
+    """Remarks on a study in another language: texts of ours that its participants may read in English.
 
     Its `texts` say which language it is in, or its pages do. If neither does, the words of both tell.
     """

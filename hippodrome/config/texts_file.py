@@ -18,7 +18,7 @@ project:
 
 
 def texts_file() -> str:
-    """The file. The language is left empty, so that `make check` asks for it."""
+    """The content of `docs/texts.en.yml`. The language is left empty, so that `make check` asks for it."""
     groups = ("".join(_group(title, texts)) for title, texts in GROUPS.items())
     return HEAD + "\n".join(groups)
 

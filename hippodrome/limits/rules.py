@@ -33,7 +33,7 @@ def participant_slots_folder(project_id: str) -> str:
 
 
 def participant_slots_key(project_id: str, shard: int) -> str:
-    """The key of one shard of them."""
+    """The key of one of the documents (shards) of participants' slots."""
     return f"{participant_slots_folder(project_id)}{shard}.json"
 
 

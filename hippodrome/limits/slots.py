@@ -95,7 +95,7 @@ class Slots:
         return [key for key, people in readable.items() if people and label in people.labels]
 
     def unreadable(self, project_id: str) -> list[str]:
-        """The keys of documents of participants' slots that cannot be read. As many calls."""
+        """The keys of documents of participants' slots that cannot be read. A call for each shard."""
         return [key for key, people in self._participant_slots(project_id).items() if people is None]
 
     def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:

@@ -19,7 +19,7 @@ LOBBIES = "_lobbies/"
 
 
 class Ahead(Record, frozen=True):
-    """A session without members, whose server was started ahead. `by`: the participant's label who was under way.
+    """A session without members, whose server was started ahead. `by`: the label of the participant it was asked for.
 
     `players`: for how many participants; its server runs the trial of that registration. 0 in documents of earlier
     versions, which do not say it.
@@ -113,7 +113,7 @@ class Decisions(Record, frozen=True):
     renewed: datetime | None = None
 
     def labels(self) -> frozenset[str]:
-        """All participants who stand here."""
+        """The labels of all participants in the document."""
         return frozenset(
             [
                 *(label for each in self.proposed for label in each.labels),
@@ -123,7 +123,7 @@ class Decisions(Record, frozen=True):
         )
 
     def labels_formed(self) -> frozenset[str]:
-        """The members of all sessions that stand here."""
+        """The labels of the members of all formed sessions in the document."""
         return frozenset(member.label for each in self.formed for member in each.members)
 
     def proposal_of(self, label: str) -> Proposal | None:
@@ -143,7 +143,7 @@ class Decisions(Record, frozen=True):
         return self.of(label) != Decisions()
 
     def of(self, label: str) -> Decisions:
-        """What is decided for good on this participant."""
+        """The part of the document that is decided for good about this participant."""
         formed, unmatched = self.formed_of(label), self.unmatched_of(label)
         has_server = formed is not None and formed.waits_for is None
         return Decisions(formed=(formed,) if formed and has_server else (), unmatched=(unmatched,) if unmatched else ())
@@ -153,12 +153,12 @@ class Decisions(Record, frozen=True):
         return sorted((each for each in self.formed if each.waits_for), key=lambda each: each.at)
 
     def for_good(self) -> Decisions:
-        """All that is decided for good."""
+        """The part of the document that is decided for good."""
         has_server = tuple(each for each in self.formed if each.waits_for is None)
         return Decisions(formed=has_server, unmatched=self.unmatched)
 
     def session_ids(self) -> frozenset[str]:
-        """The ids of all sessions that may have a server."""
+        """The ids of all sessions in the document, each of which may have a server."""
         begun = (each.session_id for each in self.proposed if each.ahead)
         return frozenset([*(each.id for each in self.open), *begun, *(each.id for each in self.formed)])
 
@@ -169,7 +169,7 @@ def key(project_id: str) -> str:
 
 
 def next_version(before: Decisions, after: Decisions) -> Decisions:
-    """`after`, as the next version of `before` if it differs."""
+    """`after`, with the next version number if it differs from `before`."""
     return before if after == before else msgspec.structs.replace(after, version=before.version + 1)
 
 

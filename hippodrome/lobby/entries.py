@@ -55,7 +55,7 @@ class Waiting:
 
     @property
     def order(self) -> tuple[int, str]:
-        """By this, the first who came is matched first."""
+        """The order in which participants are matched: who came first is matched first."""
         return self.joined, self.label
 
     def is_present(self, now: datetime) -> bool:
@@ -150,7 +150,7 @@ def folder(project_id: str) -> str:
 
 
 def prefix_of(project_id: str, label: str) -> str:
-    """What the keys of all entries of a participant begin with."""
+    """How the keys of all entries of a participant begin."""
     return f"{folder(project_id)}{label}."
 
 
@@ -180,7 +180,7 @@ def done_key(project_id: str, decided: str) -> str:
 
 
 def milliseconds(now: datetime) -> int:
-    """A time as it stands in keys."""
+    """A time as keys have it: milliseconds since 1970."""
     return int(now.timestamp() * 1000)
 
 
@@ -190,7 +190,7 @@ def seconds_since(joined: int, now: datetime) -> float:
 
 
 def read_body(body: bytes) -> WaitingDocument | None:
-    """Who waits, by the document's bytes; None if they say nothing."""
+    """Read the document of a participant who waits; None if it cannot be read."""
     try:
         found = from_json(body, WaitingDocument)
     except (msgspec.DecodeError, RecursionError):
@@ -199,5 +199,5 @@ def read_body(body: bytes) -> WaitingDocument | None:
 
 
 def body(found: WaitingDocument) -> bytes:
-    """The bytes of a document."""
+    """The document of a participant who waits, as bytes."""
     return to_json(found)

@@ -67,9 +67,10 @@ class LobbyState:
 
 @dataclass(frozen=True, slots=True)
 class NoServerYet:
-    """A participant whose session is formed, and has no server that is ready.
+    """A participant whose session is formed, and which still has no server that is ready.
 
-    `session` is the server that was started ahead for it, and `record` that server's: another may be ready sooner.
+    `session` is the id of the server that was started ahead for it, and `record` that server's record. The session may
+    get another server that was started ahead, if that is ready sooner.
     """
 
     session: str

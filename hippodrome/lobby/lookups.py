@@ -49,7 +49,7 @@ class Lookups:
         servers: Servers,
         wished: Sequence[Sequence[str]] = (),
     ) -> Run:
-        """A run that may form the sessions of these proposals, which are confirmed. Two reads for each member."""
+        """A run that may form the sessions of these confirmed proposals. Two reads for each member."""
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), self.open_for(project)
         return Run(project, known, entries, members, broken, now, open_for, servers, wished)

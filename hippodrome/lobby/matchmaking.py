@@ -19,7 +19,7 @@ PROPOSED_AT_ONCE = 50
 
 
 def patience_is_over(joined: int, project: Project, now: datetime) -> bool:
-    """Whether a participant who came then has waited long enough. To the millisecond, however late their page asks."""
+    """Whether a participant who came at this time has waited for `patience` seconds, however late their page asks."""
     return milliseconds(now) - joined >= round(project.patience * 1000)
 
 
@@ -110,7 +110,7 @@ def _short_sessions(
 
 
 def around(one: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
-    """This participant and those who may play with them, in the order of arrival; perhaps not a full session."""
+    """This participant and those who may play with them, in the order of arrival; they may be too few for a session."""
     members, most = [one], None if traits.together(project) else traits.most_of_one(project)
     for other in free:
         if len(members) == project.players:

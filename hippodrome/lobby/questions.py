@@ -43,7 +43,7 @@ class Candidate(Record, frozen=True):
 
 
 class Question(Record, frozen=True):
-    """The document. `came` are further participants, who stand in the next question."""
+    """The document that `match` is asked with. `came` are participants who came later, for the next question."""
 
     id: str = ""
     players: int = 0
@@ -52,7 +52,7 @@ class Question(Record, frozen=True):
     came: tuple[Candidate, ...] = ()
 
     def candidates(self) -> dict[str, Candidate]:
-        """All participants who stand here, by label."""
+        """All participants in the document, by label."""
         return {each.id: each for each in (*self.waiting, *self.came)}
 
 
@@ -69,7 +69,7 @@ class Answer:
 
 
 def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
-    """A participant as they come. Answers that are too large are left out."""
+    """The candidate for a participant who comes. Answers that are too large are left out."""
     found = Candidate(label, group=group, answers=answers)
     return found if len(to_json(found)) <= MOST_ANSWERS else Candidate(label, group=group)
 
@@ -82,7 +82,7 @@ def with_candidate(question: Question, one: Candidate) -> Question:
 
 
 def is_full(question: Question) -> bool:
-    """Whether nobody else is written down before the next question."""
+    """Whether the document has no room for another participant before the next question."""
     return len(question.came) >= MOST_CAME
 
 

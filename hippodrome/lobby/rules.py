@@ -52,7 +52,7 @@ def decide(
 
 
 def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
-    """Those who are there and stand in no session, in the order of arrival."""
+    """The participants who are there and in no session, in the order of arrival."""
     busy = document.labels()
     found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
     return sorted(found, key=lambda one: one.order)
@@ -69,7 +69,7 @@ def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
 
 
 def here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
-    """How many could play together with this participant, who counts; at most `players`."""
+    """How many participants could play together now: this one, and others; at most `players`."""
     proposal = document.proposal_of(label)
     if proposal is not None:
         return len(proposal.labels)
@@ -147,7 +147,7 @@ def _with_proposals(
 def form(
     document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime, seats: str = "lot"
 ) -> Decisions:
-    """Form the proposed session with these members, unless it stands no longer as it was proposed to them.
+    """Form the proposed session with these members, unless its proposal has changed since they were asked.
 
     `seats` says who plays which player (`project.seats`).
     """
@@ -178,14 +178,14 @@ def _seated(members: Sequence[Matched], lot: str, seats: str) -> tuple[Matched, 
 
 
 def give_up(document: Decisions, one: Unmatched) -> Decisions:
-    """The participant is unmatched, unless they stand in the document."""
+    """Make the participant unmatched, unless they stand in the document already."""
     if document.renewed is not None or one.label in document.labels():
         return document
     return msgspec.structs.replace(document, unmatched=(*document.unmatched, one))
 
 
 def without_done(document: Decisions, done: Collection[str]) -> Decisions:
-    """The document without those formed sessions (by id) and unmatched participants (by label) that are all written."""
+    """The document without formed sessions (by id) and unmatched participants (by label) of which all is written."""
     if not any(each.id in done for each in document.formed) and not any(
         each.label in done for each in document.unmatched
     ):

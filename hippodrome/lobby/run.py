@@ -16,24 +16,24 @@ from hippodrome.model.server import Server, State, next_attempt
 
 @dataclass(frozen=True)
 class Servers:
-    """Records of servers that were started ahead, by their sessions' ids; None where there is none."""
+    """The records of servers that were started ahead, by their sessions' ids; None for one without a record."""
 
     records: Mapping[str, Server | None]
 
     @property
     def ready(self) -> frozenset[str]:
-        """Those that can be used."""
+        """The ids of sessions whose servers are ready."""
         return frozenset(name for name, each in self.records.items() if each and each.state is State.READY)
 
     @property
     def over(self) -> frozenset[str]:
-        """Those that have ended, and are not replaced."""
+        """The ids of sessions whose servers have ended, and are not replaced."""
         closed = ((name, each) for name, each in self.records.items() if each and each.is_closed)
         return frozenset(name for name, each in closed if next_attempt(each) is None)
 
     @property
     def coming(self) -> frozenset[str]:
-        """Those that will be ready: they start, or are replaced."""
+        """The ids of sessions whose servers will be ready: they start, or are replaced."""
         return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
 
     def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:

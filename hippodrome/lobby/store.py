@@ -50,7 +50,7 @@ class LobbyStore:
             return self.change(project, lambda document: document)
 
     def change(self, project: Project, change: Callable[[Decisions], Decisions]) -> Decisions:
-        """Change the document of decisions, counting its version; return what it is now. Raises `RetryLater`."""
+        """Change the document of decisions, and count its version; return the new document. Raises `RetryLater`."""
 
         def counted(document: Decisions) -> Decisions:
             return decisions.next_version(document, change(document))
@@ -61,7 +61,7 @@ class LobbyStore:
     # Entries
 
     def entries(self, project: Project, label: str | None = None) -> Entries:
-        """Those in the lobby, or what there is of one participant. A listing.
+        """The entries of all participants in the lobby, or of one. A listing.
 
         A participant counts as under way for as long as the server that was started ahead for them can be used. So one
         who never comes costs no second server.
@@ -132,7 +132,7 @@ class LobbyStore:
         self.delete(folder.done_key(project.id, name) for name in sorted(entries.done - kept))
 
     def answer_as_unmatched(self, project: Project, user_id: str) -> None:
-        """Store the answer of each game step, which moves the participant on. An answer that is there stays."""
+        """Store the answer of each game step, which moves the participant on. An earlier answer stays."""
         answers = {"outcome": answer.UNMATCHED}
         for step in project.steps:
             if step.type.on_server:

@@ -24,7 +24,7 @@ def trait(project: Project, group: int | None, answers: Mapping[str, Any]) -> st
 
 
 def together(project: Project) -> bool:
-    """Whether only participants of one trait play together; else only those of different ones do."""
+    """Whether participants must have the same trait to play together; if not, different ones."""
     if isinstance(project.matching, dict):
         return "same" in project.matching
     return project.matching != "mixed"

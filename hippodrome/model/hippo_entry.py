@@ -23,7 +23,7 @@ _PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 
 
 def is_hippos(entry: Mapping[str, Any]) -> bool:
-    """Whether HIPPO wrote it: steps are a map there, and a list in our entries."""
+    """Whether HIPPO wrote this entry: its steps are a map, and a list in our entries."""
     return isinstance(entry.get("steps"), dict)
 
 

@@ -94,7 +94,7 @@ class TaskSeen(Record, frozen=True):
 
 
 class TaskChanged(NamedTuple):
-    """What is used of an "ECS Task State Change" event."""
+    """The fields of an "ECS Task State Change" event that are used."""
 
     task: str
     cluster: str

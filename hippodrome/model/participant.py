@@ -74,7 +74,7 @@ class Progress:
 
 
 def participant_key(project_id: str, user_id: str) -> str:
-    """What is known of a participant lies here."""
+    """The key of a participant's record."""
     return f"{participant_folder(project_id, user_id)}participant.json"
 
 

@@ -64,7 +64,7 @@ class Ssl(Record, frozen=True):
 
 
 class ForPlayers(Record, frozen=True):
-    """What was registered last for this number of players; the fields are those of `Project`.
+    """What was registered last for this number of players. The fields are those of `Project`.
 
     Servers of games with this number run it, also after another number was registered. For 1 player these are the
     servers that participants had of their own before several players were registered.
@@ -149,7 +149,7 @@ class Project(Record, frozen=True):
         return self.players > 1
 
     def following(self, before: Project | None) -> Project:
-        """This registration with what earlier ones had for other numbers of players; `before` is the one before it."""
+        """This registration, completed by what `before`, the one before it, has for other numbers of players."""
         kept = {each.players: each for each in (before.other_numbers if before else ())}
         if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})

@@ -261,7 +261,7 @@ def next_attempt(closed: Server) -> int | None:
 
 
 def plays_on(record: Server) -> bool:
-    """Whether there is a server, or the next attempt comes without a request."""
+    """Whether the server runs, or its next attempt starts without a request."""
     return not record.is_closed or next_attempt(record) is not None
 
 
@@ -317,7 +317,7 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
 
 def with_default_name(server: Server) -> Server:
-    """The zone refuses its DNS name: it gets its default one."""
+    """The record with the default DNS name, because the zone refuses the present one."""
     return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
 
@@ -341,7 +341,7 @@ def reserving(server: Server, warm_server: Server) -> Server:
 
 
 def without_warm_server(server: Server, own: Server) -> Server:
-    """The reserved warm server was gone: start a server of its own. `own` is the record that `new_attempt` makes.
+    """The record of a server of their own, because the reserved warm server was gone.
 
     The nonce stays: a task may have been started with secrets that are derived from it.
     """

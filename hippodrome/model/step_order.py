@@ -8,7 +8,7 @@ FINAL = "finalStep"
 
 
 def ordered(keys: Iterable[str]) -> list[str]:
-    """By number, finalStep last."""
+    """The keys of steps in their order: by number, finalStep last."""
     return sorted(keys, key=lambda key: (key == FINAL, 0 if key == FINAL else int(key)))
 
 
@@ -19,7 +19,7 @@ def visited(keys: list[str], pages: Mapping[str, str]) -> list[str]:
 
 
 def position(key: str | None, keys: list[str]) -> int | None:
-    """Where an event's step stands. The last step may be called finalStep, or as in HIPPO one past the last number."""
+    """The index of the step that an event names. The last one may be called finalStep, or, as in HIPPO, one more."""
     if key in keys:
         return keys.index(key)
     numbers = [int(number) for number in keys if number != FINAL]

@@ -371,7 +371,7 @@ def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
 
 
 def places(text: str) -> tuple[str, ...]:
-    """What the text leaves open, such as `seconds`: each once, in the order in which they come first."""
+    """The names of the places in a text, such as `seconds`: each once, in the order in which they come first."""
     return tuple(dict.fromkeys(PLACE.findall(text)))
 
 
@@ -407,7 +407,7 @@ class Texts:
         return PLACE.sub(lambda place: str(values.get(place[1], place[0])), self[name])
 
     def of_server(self) -> dict[str, str]:
-        """The study's words for what servers say, by the English; only those that differ."""
+        """The study's words for what servers say, by the English sentence; only those that differ."""
         return {ENGLISH[name]: self[name] for name in SAID if self[name] != ENGLISH[name]}
 
 

@@ -65,13 +65,13 @@ class Pool(Record, frozen=True):
         return self.without([first]) if first else self
 
     def without(self, gone: Collection[str]) -> Pool:
-        """The pool without these."""
+        """The pool without these warm servers."""
         return self._with(
             {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in gone}
         )
 
     def with_ready(self, those: Collection[str]) -> Pool:
-        """The pool with these marked ready; ids that are not in the pool are ignored."""
+        """The pool with these warm servers marked ready; ids that are not in the pool are ignored."""
         known = self.warm_servers.keys() & those
         ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
         return self._with({**self.warm_servers, **ready})

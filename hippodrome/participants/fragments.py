@@ -56,7 +56,7 @@ ADDRESSES = {
 
 @dataclass(frozen=True)
 class Fragment:
-    """A step page ready to be filled in, and what the frame needs to know about it."""
+    """A step page that is ready to be filled in, and what the frame needs to know about it."""
 
     text: str
     has_fields: bool = False  # named inputs: something to send

@@ -121,7 +121,7 @@ def script(
 
 
 def script_json(data: Any) -> Html:
-    """JSON that can stand in a script element."""
+    """JSON for a script element: nothing in it can end the element."""
     return Html(json.dumps(data).replace("<", "\\u003c"))
 
 
@@ -154,7 +154,7 @@ def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str,
 
 
 def allowed_sources(given: list[str]) -> list[str]:
-    """Those that are valid sources: no value may add a directive to the policy."""
+    """Those of these sources that are valid, so that no value can add a directive to the policy."""
     return [source for source in given if _SOURCE.fullmatch(source)]
 
 

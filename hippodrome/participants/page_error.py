@@ -27,7 +27,7 @@ REFUSED = HippoAnswer(400)
 
 
 class PageError(Exception):
-    """Respond with this title and text, to a program as JSON. `status` is the HTTP status.
+    """Ends a request with a page of this title and text, or JSON for a program. `status` is the HTTP status.
 
     If HIPPO has an answer of its own in this case, programs get its status and its text. A front end gets 200 where it
     acts on no other status. `lang` is the language of title and text.
@@ -41,7 +41,7 @@ class PageError(Exception):
 
     @classmethod
     def of(cls, texts: Texts, status: int, name: str, hippo: HippoAnswer | None = None, **values: object) -> PageError:
-        """In the words of a study: its text of this name is the title, that of `{name}Text` the text."""
+        """The error in a study's words: its text of this name is the title, its text `{name}Text` the text."""
         title, text = texts[name], texts.say(f"{name}Text", **values)
         return cls(status, title, text, hippo, texts.language)
 

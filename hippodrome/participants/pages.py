@@ -30,7 +30,7 @@ LOBBY = "lobby"
 
 @dataclass(frozen=True)
 class StepView:
-    """A step page for one participant."""
+    """What the page of a step shows to one participant."""
 
     project: Project
     step: Step
@@ -48,7 +48,7 @@ class StepView:
 
 @dataclass(frozen=True)
 class GameView:
-    """The game page for one participant, who waits on it and then plays."""
+    """What the page of a game step shows to one participant, who waits on it and then plays."""
 
     project: Project  # as the participant's session runs it (`Project.for_session`)
     step: Step
@@ -103,7 +103,7 @@ def step_page(view: StepView) -> Page:
 
 
 def fragment(view: StepView) -> str:
-    """The researcher's part, for clients with a frame and a form of their own. Raises FragmentError.
+    """The researcher's part of a page, for clients with a frame and a form of their own. Raises FragmentError.
 
     The hidden fields that name the step come first; such a client sends them along. (HIPPO's front end
     posts all named elements of its form, IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`.)
@@ -169,7 +169,7 @@ def game_page(view: GameView) -> Page:
 
 
 def is_over(state: Mapping[str, Any]) -> bool:
-    """Whether no server is there or on its way."""
+    """Whether there is no server, and none will come."""
     return state.get("state") in ("ended", "failed")
 
 
@@ -179,7 +179,7 @@ def in_lobby(state: Mapping[str, Any]) -> bool:
 
 
 def game_message(view: GameView) -> str:
-    """What a program shows of a game step whose server was lost or has ended: a sentence, in a form of the program's.
+    """What a program shows of a game step whose server was lost or has ended: a sentence for the program's own form.
 
     The form asks for another server if the participant may have one.
     """

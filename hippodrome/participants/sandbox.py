@@ -25,7 +25,7 @@ class FragmentError(Exception):
 
 
 def uses_jinja(text: str) -> bool:
-    """Whether Jinja has to render it. `{#` alone is more likely a style sheet's `@media print{#menu{…}}`."""
+    """Whether Jinja has to render this text. `{#` alone does not count: style sheets have `@media print{#menu{…}}`."""
     return "{{" in text or "{%" in text or ("{#" in text and "#}" in text)
 
 

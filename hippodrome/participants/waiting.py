@@ -33,7 +33,7 @@ class Waiting:
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
-        """The state as JSON data. `since` is when the participant reached the step; it counts if there is no record."""
+        """The state as JSON data. `since`, when the participant reached the step, is used if there is no record."""
         state: dict[str, Any] = {
             "state": State.QUEUED,
             "attempt": 1,

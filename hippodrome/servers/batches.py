@@ -19,7 +19,7 @@ def for_each(
     log_text: str,
     name: Callable[[I], str] | None = None,
 ) -> tuple[list[tuple[I, T]], list[I]]:
-    """Call `act` on each item; return the items with their results, without None, and the items for which it raised.
+    """Call `act` on each item; return those with a result, each with its result, and those for which it raised.
 
     Each error is logged as `log_text`, with the server name that `name` returns.
     """

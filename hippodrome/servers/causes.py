@@ -219,7 +219,7 @@ def cause_of_refusal(error: NoCapacity | Refused) -> Cause:
 
 
 def parse_cause(written: str) -> Cause | None:
-    """The cause that a record names; None if it names none, or one of a later version."""
+    """The cause that a record names; None if it names none, or one that only a later version knows."""
     return Cause(written) if written in set(Cause) else None
 
 

@@ -278,5 +278,5 @@ class DnsRecords:
 
 
 def pause(looked: int) -> int:
-    """Seconds until the next check, after `looked` checks: the longer it takes, the rarer the checks."""
+    """Seconds until the next check, after `looked` checks. The more checks there were, the longer the pause."""
     return PAUSES[looked] if looked < len(PAUSES) else LONG_PAUSE

@@ -18,7 +18,7 @@ from hippodrome.servers.resources import Resources
 
 
 class Why(StrEnum):
-    """A resource is left over because …"""
+    """The reason why a resource is left over."""
 
     CLOSED = "its server is closed"
     REPLACED = "a later attempt has replaced its server"
@@ -79,7 +79,7 @@ def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Why | 
 
 
 def leftovers(found: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
-    """What is left over of the resources found. `owners`: the records that own them, by the names of resources."""
+    """The resources that are left over. `owners`: the records that own them, by the names of resources."""
 
     def keep(name: str, *, ours: bool = False) -> bool:
         return why_left_over(name, owners.get(name), scope, ours=ours) is not None

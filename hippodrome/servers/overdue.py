@@ -35,7 +35,7 @@ Rule = Callable[[Server, RunningTask | None, datetime], Remedy | None]
 
 
 def remedy(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """What to do about this server and its living task, if it has one; None if nothing."""
+    """What to do about this server and its living task, if it has one; None if nothing has to be done."""
     if not record.is_closed and now > record.deadline + OVERDUE_AFTER:
         return Remedy.OVERDUE
     return RULES[record.state](record, task, now)

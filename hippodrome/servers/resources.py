@@ -18,7 +18,7 @@ from hippodrome.ports import DnsRecord, Platform, RunningTask
 
 @dataclass(frozen=True)
 class Resources:
-    """What a listing found. `cluster` is the installation's own."""
+    """The resources that a listing found. `cluster` is the installation's own."""
 
     tasks: list[RunningTask] = field(default_factory=list)
     dns_records: list[DnsRecord] = field(default_factory=list)
@@ -43,7 +43,7 @@ class Resources:
         return [kind.removesuffix("s") for kind, number in self.counts().items() if number]
 
     def names(self) -> Iterator[str]:
-        """The names of all these resources, which may be those of servers."""
+        """The names of all these resources. Each may be the name of a server."""
         yield from (task.name for task in self.tasks)
         yield from (ids.host_server(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)

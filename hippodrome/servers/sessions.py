@@ -36,7 +36,7 @@ def members_of(repository: Repository, project_id: str, session_id: str) -> list
 
 
 class Sessions:
-    """Reads what decides about the servers of sessions."""
+    """Reads the documents that decide about the servers of sessions."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services

@@ -132,7 +132,7 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class ServerAccess:
-    """Whose a server is. What it may read and create follows from this alone. Pure.
+    """To whom a server belongs. What it may read and create follows from this alone. Pure.
 
     `name` is its own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id` and
     `certificate` are set. `user_id` may be a session's id; then `members` are the ids of those who play there, once the

@@ -85,9 +85,9 @@ class Repository:
     # Servers
 
     def project_of_own_server(self, project: Project, user_id: str) -> Project | None:
-        """The project as a participant's own server runs it that was started before several players were registered.
+        """The registration for one player, if the participant still has a server of their own that runs it.
 
-        None if that server has ended for good, or was never there. A participant with a membership plays with others: a
+        None if that server has ended for good, or if there never was one. A participant with a membership plays with others: a
         function that had not read the registration yet has started their own server. No call if one player is
         registered, or never was. Errors as in `membership`.
         """

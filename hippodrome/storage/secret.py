@@ -46,7 +46,7 @@ class Secret(Record, frozen=True):
         return hmac.new(self.secret.encode(), text.encode(), hashlib.sha256).hexdigest()
 
     def credential(self, name: str, nonce: str) -> str:
-        """With it, the server of this name gets presigned requests. The participant's browser never sees it."""
+        """The credential with which this server gets presigned requests. The participant's browser never sees it."""
         return self.derive("credential", name, nonce)
 
     def token(self, server: Server) -> str:

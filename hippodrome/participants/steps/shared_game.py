@@ -24,7 +24,7 @@ UNMATCHED = "unmatched"
 
 
 class StepAnswered(Exception):
-    """The step has got its answer meanwhile, so the next one is due."""
+    """The step was answered meanwhile, so the next one is due."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Standing:
 
     @property
     def players(self) -> int:
-        """For how many their session is; 0 if they have none, or in documents of earlier versions."""
+        """How many participants their session is for; 0 without a session, and in documents of earlier versions."""
         return self.found.players if isinstance(self.found, Membership | NoServerYet) else 0
 
     @property
@@ -51,7 +51,7 @@ class Standing:
 
 
 class SharedGame:
-    """What the game step and its polls share."""
+    """The lobby, and then the session, of participants at a game step."""
 
     def __init__(self, services: StepServices) -> None:
         self._services = services
@@ -71,7 +71,7 @@ class SharedGame:
         return self._standing(project, self._lobby.visit(project, user_id, project.group(user_id), answers))
 
     def decided(self, project: Project, user_id: str) -> Standing | None:
-        """Where the participant is without having asked; None if that is not decided yet. Nothing is written."""
+        """Where the participant stands, if it is decided: in a session, or unmatched; else None. Writes nothing."""
         membership = self._services.repository.membership(project.id, user_id)
         return self._standing(project, membership) if membership else None
 
