@@ -84,7 +84,7 @@ class Found:
 class Eraser:
     """Erases one participant from one project. May be interrupted anywhere and run again.
 
-    With `late=False` it does not wait until their server can store nothing more: enough for bots.
+    With `late=False` it does not wait for the time in which their server could still store something, as bots need not.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Eraser:
         return found
 
     def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
-        """One round: server, documents, then the slot: no other participant takes it before the erasure is done."""
+        """The steps of one round: server, documents, and last the slot, so that nobody takes it too early."""
         steps: list[Step] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]

@@ -34,7 +34,7 @@ STATE = ".hippodrome"
 
 @dataclass
 class Erased:
-    """What was deleted and written anew."""
+    """What was deleted, and what was written anew."""
 
     files: int = 0
     rewritten: int = 0
@@ -170,7 +170,7 @@ def _runs(path: Path, folders: set[str]) -> bool:
 def erase(
     data: Path, project: str, user: str, *, dry_run: bool, confirm: Callable[[int, int], None]
 ) -> tuple[Erased | None, list[str], int]:
-    """Erase, if there is something and `confirm` does not raise. What was done, what cannot be read, what was found."""
+    """Erase, unless nothing is found or `confirm` raises. Return what was done, cannot be read, and was found."""
     if not data.is_dir():
         raise Problem(f"There is no folder {data}.", "Name the data folder of `make run`.")
     eraser = FolderEraser(data, project, user)

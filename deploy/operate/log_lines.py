@@ -42,7 +42,7 @@ _LEFT_OUT |= {"function_memory_size", "function_request_id", "requestId", "xray_
 
 @dataclass(frozen=True)
 class Line:
-    """One event: when, of which function (or `trial`), how bad, what, and the fields beside it."""
+    """One event: when, of which function (or `trial`), how bad it is, its text, and further fields."""
 
     time: datetime
     source: str
@@ -66,7 +66,7 @@ class Line:
         return None
 
     def as_text(self) -> str:
-        """The line as people read it; local time."""
+        """The line for a terminal, in local time."""
         more = _printable(" ".join(f"{name}={_short(value)}" for name, value in self.fields.items()))
         level = f"{self.level:<7} " if self.level else ""
         message = _printable(self.message.rstrip("\n")).replace("\n", "\n    ")
@@ -84,7 +84,7 @@ class Line:
 
 
 def read(event: Mapping[str, Any], source: str) -> Line:
-    """What an event of FilterLogEvents says, whatever wrote it."""
+    """Read an event of FilterLogEvents, whatever wrote it."""
     time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
     text = str(event.get("message", ""))
     stream = str(event.get("logStreamName", ""))
@@ -137,7 +137,7 @@ def _of_text(text: str, time: datetime, source: str, stream: str) -> Line:
 
 
 def moment(text: str, now: datetime) -> datetime:
-    """The time that `--since` means: `90m` ago, or an ISO date or time (UTC where it says nothing). ValueError else."""
+    """The time that `--since` means: `90m` ago, or an ISO date or time, in UTC unless it says so. Raises ValueError."""
     ago = _AGO.fullmatch(text.strip())
     if ago:
         try:

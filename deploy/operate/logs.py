@@ -55,13 +55,13 @@ class Reader:
         return sorted(found)
 
     def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[Line]:
-        """Every line since then, in the order of time, whole pages of them. Each group's events come sorted."""
+        """Every line since this time, in the order of time. Each log group's events come sorted, a page at once."""
         streams = [self._events(source, since, project_id) for source in sources]
         for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
             yield read(event, source)
 
     def events(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> list[tuple[str, Line]]:
-        """The same with the events' ids, for who has to tell new ones from old ones."""
+        """The lines with the events' ids, by which new ones are told from old ones."""
         streams = [self._events(source, since, project_id) for source in sources]
         merged = heapq.merge(*streams, key=lambda one: (one[0], one[1]))
         return [(f"{source}/{_id_of(event)}", read(event, source)) for _, _, event, source in merged]
@@ -129,7 +129,7 @@ def follow(
     sleep: Callable[[float], None] = time.sleep,
     rounds: int | None = None,
 ) -> None:
-    """Show what comes, until Ctrl-C (or for so many looks): each event once, late ones when they come."""
+    """Print new lines until Ctrl-C, or for so many looks: each event once, late ones when they come."""
     seen: dict[str, datetime] = {}
     latest = since
     while rounds is None or rounds > 0:

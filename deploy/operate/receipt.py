@@ -42,7 +42,7 @@ class ProjectReceipt:
     looked: datetime | None = None
 
     def note(self, versions: Iterable[Version]) -> None:
-        """Count what has been deleted."""
+        """Count versions that were deleted."""
         for version in versions:
             kind = self._kind(version.key)
             counts = self.deleted.setdefault(kind, {"versions": 0, "deleteMarkers": 0, "uploads": 0, "bytes": 0})
@@ -126,7 +126,7 @@ def receipt(
 
 
 def write(target: Path, made: Mapping[str, Any]) -> None:
-    """Write it into a new file. Raises `Problem`."""
+    """Write the receipt into a new file. Raises `Problem`."""
     try:
         with target.open("x", encoding="utf-8") as file:
             json.dump(made, file, indent=1)

@@ -95,12 +95,12 @@ class SessionEraser:
     # -- erasing
 
     def leave_sessions(self, note: Note = lambda _: None) -> None:
-        """Take them out of all sessions, none of which plays."""
+        """Take the participant out of all their sessions, none of which may be playing."""
         for found in self.sessions():
             self.leave(found, note)
 
     def leave(self, found: FoundSession, note: Note) -> None:
-        """Take them out of one session, which does not play."""
+        """Take the participant out of one session, which may not be playing."""
         if found.others:
             self.take_out(found, note)
             self.take_name(found, note)
@@ -108,7 +108,7 @@ class SessionEraser:
             self.delete_session(found, note)
 
     def take_out(self, found: FoundSession, note: Note) -> None:
-        """Write the session's recordings without the participant, and delete what they were before."""
+        """Write the session's recordings without the participant, and delete their earlier versions."""
         folder = session_folder(self._project, found.id)
         for key in dict.fromkeys(version.key for version in self._storage.versions(folder)):
             if key.endswith(_RECORDING):
@@ -117,7 +117,7 @@ class SessionEraser:
         self._storage.delete([*self._storage.uploads(folder)], note)
 
     def take_name(self, found: FoundSession, note: Note) -> None:
-        """Write the session's document without the participant's id, the last one of all that is done."""
+        """Write the session's document without the participant's id. This is the last step."""
         key = session_key(self._project, found.id)
         last = newest(self._storage, key)
         if last is None:
@@ -136,7 +136,7 @@ class SessionEraser:
         return replace(parsed, members=tuple(members)).to_json()
 
     def delete_session(self, found: FoundSession, note: Note) -> None:
-        """Delete everything of a session in which no one else plays; its own document is the last."""
+        """Delete everything of a session of which no member is left; its own document is the last."""
         folder, last = session_folder(self._project, found.id), session_key(self._project, found.id)
         self._storage.delete([*self._storage.uploads(folder)], note)
         self._storage.delete([each for each in self._storage.versions(folder) if each.key != last], note)

@@ -38,7 +38,7 @@ DAILY = timedelta(days=1)  # how often the function renew_certificate looks
 
 @dataclass(frozen=True)
 class Queue:
-    """A queue of the stack. `dead` if it holds what could not be dealt with."""
+    """A queue of the stack. `dead`: it is a dead-letter queue."""
 
     name: str
     waiting: int
@@ -76,7 +76,7 @@ class Warm(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """Servers of a project that have failed for the same cause since a day ago, the last of them by its name."""
+    """Servers of a project that failed for the same cause in the last 24 hours, and the name of the last one."""
 
     project: str
     cause: Cause
@@ -136,7 +136,7 @@ class Snapshot:
 
 
 class Monitor:
-    """Looks at an installation, again and again; it remembers what need not be read twice."""
+    """Looks at an installation again and again. It keeps what need not be read twice."""
 
     def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
         self._account = account
@@ -148,7 +148,7 @@ class Monitor:
         self._formed: dict[str, int] = {}  # by session, its members: they never change
 
     def look(self, told: Callable[[str], None] = lambda _: None) -> Snapshot:
-        """One look. `told` gets how far a long listing is."""
+        """Look once. `told` is called with the progress of a long listing."""
         look = Snapshot(at=datetime.now(UTC))
         with ThreadPoolExecutor(4) as pool:
             servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
@@ -229,7 +229,7 @@ class Monitor:
 
 
 def midnight(now: datetime) -> datetime:
-    """When today began (UTC, as AWS bills)."""
+    """When today began, in UTC, by which AWS bills."""
     return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
 
 
@@ -290,7 +290,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
 
 
 def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
-    """The installation's alarms: those that speak to its topic."""
+    """The installation's alarms: those that send to its topic."""
     pages = account.client("cloudwatch").get_paginator("describe_alarms")
     for page in pages.paginate(ActionPrefix=installation["Alarms"]):
         yield from page.get("MetricAlarms", ())

@@ -105,7 +105,7 @@ def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
 
 
 def as_data(look: Snapshot, installation: Installation, bill: Billed | None = None) -> dict[str, Any]:
-    """The look as JSON data."""
+    """The snapshot as JSON data."""
     certificate = look.certificate
     return {
         "stack": installation.stack,
@@ -192,7 +192,7 @@ def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
 
 
 def picture(look: Snapshot, installation: Installation) -> RenderableType:
-    """The look as tables."""
+    """The snapshot as tables."""
     parts: list[RenderableType] = [
         Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
     ]

@@ -43,7 +43,7 @@ class Found:
 
     @property
     def to_do(self) -> bool:
-        """Whether something has not been told to stop yet."""
+        """Whether anything was found that was not told to stop yet."""
         return bool(self.servers or self.leftovers)
 
     def __bool__(self) -> bool:

@@ -21,25 +21,25 @@ class Storage(Protocol):
         """Every version and delete marker below a prefix."""
 
     def versions_of(self, key: str) -> Iterator[Version]:
-        """Those of one document."""
+        """Every version and delete marker of one document."""
 
     def uploads(self, prefix: str) -> Iterator[Version]:
         """Every unfinished upload below a prefix."""
 
     def read(self, version: Version) -> bytes:
-        """The content of a version. Empty if it is gone, or none has it."""
+        """The content of a version; empty if it is gone or is a delete marker."""
 
     def fetch(self, version: Version, to: Path) -> None:
-        """The content of a version, into a file."""
+        """Write the content of a version into a file."""
 
     def store(self, key: str, file: Path) -> None:
         """Store a file's content as the newest version, whole or not at all."""
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Store a small document if its newest version still is `before`; whether it was."""
+        """Store a small document if its newest version still is `before`; return whether it was."""
 
     def delete(self, versions: Iterable[Version], note: Note) -> object:
-        """Delete these for good."""
+        """Delete these versions for good."""
 
 
 def read_all(storage: Storage, versions: Sequence[Version]) -> list[bytes]:

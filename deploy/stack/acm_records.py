@@ -40,7 +40,7 @@ class Validation(NamedTuple):
 
     @property
     def domain(self) -> str:
-        """The name that it proves, and its wildcard's."""
+        """The domain that the record proves, for its name and its wildcard."""
         return self.name.partition(".")[2]
 
 
@@ -50,12 +50,12 @@ def of_certificate(account: Account, arn: str, zone: str) -> list[Validation]:
 
 
 def in_use_by(account: Account, arn: str) -> list[str]:
-    """What uses a certificate, by ARN; nothing if it is gone."""
+    """The ARNs of what uses a certificate; none if it is gone."""
     return list(_describe(account, arn, account.region).get("InUseBy", ()))
 
 
 def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
-    """Write down what has to be deleted after the stack."""
+    """Write down which records have to be deleted after the stack."""
     known = remembered(bucket)
     wanted = list(dict.fromkeys([*known, *found]))
     if wanted != known and bucket.exists():
@@ -63,13 +63,13 @@ def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
 
 
 def remembered(bucket: CodeBucket) -> list[Validation]:
-    """What was written down and has not been forgotten."""
+    """The records that were written down and not deleted yet."""
     body = bucket.get(NOTE)
     return [Validation(**one) for one in json.loads(body)] if body else []
 
 
 def present(account: Account, one: Validation) -> dict[str, Any] | None:
-    """The record in the zone, if it is still there and the same."""
+    """The record in the zone; None if it is gone or has changed."""
     client = account.client("route53")
     try:
         answer = client.list_resource_record_sets(
@@ -87,7 +87,7 @@ def present(account: Account, one: Validation) -> dict[str, Any] | None:
 
 
 def alike(account: Account, zone: str, domain: str) -> list[Validation]:
-    """The records in a zone that prove this very name to ACM, of any account."""
+    """All records in a zone that prove this name to ACM, for whichever account."""
     if not domain:
         return []
     found: list[Validation] = []

@@ -46,7 +46,7 @@ _LONGEST_BUNDLE = 1_000_000  # bytes
 
 @dataclass(frozen=True)
 class Choice:
-    """What to order. Without `directory` where the present certificate comes from, or Let's Encrypt's staging."""
+    """What to order. Without `directory`: from where the present certificate comes, or from Let's Encrypt's staging."""
 
     directory: str = ""
     email: str = ""
@@ -57,7 +57,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Report:
-    """What there is now, and what was or would be done."""
+    """The present certificate, and what was done or would be done."""
 
     domain: str
     directory: str  # of the certificate that is in place
@@ -76,11 +76,11 @@ class Report:
 
     @property
     def for_tests(self) -> bool:
-        """Browsers do not trust it, because it comes from Let's Encrypt's staging environment."""
+        """Whether it comes from Let's Encrypt's staging environment, which browsers do not trust."""
         return bool(self.stored) and self.directory == STAGING
 
     def as_json(self) -> dict[str, Any]:
-        """For scripts."""
+        """The report as JSON data, for scripts."""
         return {
             "domain": self.domain,
             "names": list(self.stored.names) if self.stored else [],
@@ -140,7 +140,7 @@ def command(
 
 
 def inspect(account: Account, installation: Installation, choice: Choice = Choice()) -> Report:
-    """What is there, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
+    """The present certificate, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
     renewal, wish = renewal_of(account, installation, choice, lambda _: None)
     decision = renewal.decide(wish)
     if decision.verdict is Verdict.ORDER:
@@ -156,7 +156,7 @@ def obtain(
     *,
     tell: Callable[[Stage], None] = lambda _: None,
 ) -> Report:
-    """Order a certificate if it is time to; one that is fresh stays. Raises `Problem`; the one in use stays then."""
+    """Order a certificate if one is due. Raises `Problem`; the present one stays then."""
     renewal, wish = renewal_of(account, installation, choice, tell)
     if renewal.decide(wish).verdict is Verdict.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
@@ -209,7 +209,7 @@ def renewal_of(
 
 
 def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
-    """The domain lies in the zone, the Internet finds the zone, and no CAA record forbids. Raises `Problem`.
+    """Check that the domain is in the zone, the Internet finds the zone, and no CAA record forbids. Raises `Problem`.
 
     `own`: the directory is a CA of one's own, which may look elsewhere than in the Internet's DNS; then only a warning.
     """

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def take_over(account: Account, installation: Installation) -> StoredCertificate | None:
-    """Copy a fresh certificate of an earlier installation, if this one has none yet. What was copied.
+    """Copy a fresh certificate of an earlier installation, if this one has none; return what was copied.
 
     `Renewal.obtain` writes the rest (`fullchain.pem`, `certificate.json`) from it.
     """

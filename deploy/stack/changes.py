@@ -32,7 +32,7 @@ _NOTHING = ("didn't contain changes", "No updates are to be performed")
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that a plan and an apply start from."""
+    """What a plan and an apply begin with: the stack, and the template and parameters that it is to have."""
 
     account: Account
     stack: Stack
@@ -48,23 +48,23 @@ class Prepared:
 
     @property
     def existing(self) -> Mapping[str, Any] | None:
-        """The stack, unless there is none that works (none, one that never came to life, an empty shell)."""
+        """The described stack; None if there is none, or none that was ever complete."""
         makes = states.action_for(self.status) in {Action.CREATE, Action.RECREATE}
         return None if makes else self.found
 
     @cached_property
     def before(self) -> dict[str, str]:
-        """The parameters that stand."""
+        """The parameters of the stack."""
         return parameters_of(self.existing)
 
     def changed_parameters(self) -> dict[str, tuple[str, str]]:
-        """Before and after, of those that are not as they were."""
+        """By name, the parameters that differ: the stack's value, and the new one."""
         names = sorted(set(self.before) | set(self.parameters))
         pairs = {name: (self.before.get(name, ""), self.parameters.get(name, "")) for name in names}
         return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
     def unchanged(self) -> bool:
-        """Whether template, code, parameters and tags are those that stand: then no change set is needed to know."""
+        """Whether the stack has this template, code, parameters and tags, so that no change set is needed."""
         if self.existing is None or states.action_for(self.status) is not Action.UPDATE or self.changed_parameters():
             return False
         tags = {tag["Key"]: tag["Value"] for tag in self.existing.get("Tags", ())}
@@ -110,7 +110,7 @@ class ChangeSet:
 
 @contextlib.contextmanager
 def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = time.sleep) -> Iterator[ChangeSet]:
-    """A change set for what was prepared; the template is uploaded for it. Deleted afterwards, unless it was executed.
+    """Make a change set, with the template uploaded for it. It is deleted afterwards, unless it was executed.
 
     With `keep` it stays when the block ends well (it is executed there). Raises `Problem` if CloudFormation refuses it.
     """

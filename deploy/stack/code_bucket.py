@@ -39,7 +39,7 @@ class CodeBucket:
         self._owner = {"Bucket": self.name, "ExpectedBucketOwner": account.id}
 
     def exists(self) -> bool:
-        """Whether it is there and ours. Raises `Problem` if it is another account's."""
+        """Whether the bucket exists and is ours. Raises `Problem` if it is another account's."""
         try:
             return bucket_exists(self._account, self.name)
         except ClientError as error:
@@ -48,7 +48,7 @@ class CodeBucket:
             raise
 
     def make(self) -> bool:
-        """Make it, or finish one that was half made; True if something was done. The tag is set last: it means done."""
+        """Make the bucket, or finish a half-made one; return whether something was done. Its tag is set last."""
         exists = self.exists()
         if exists and self._tagged():
             return False
@@ -72,7 +72,7 @@ class CodeBucket:
         return True
 
     def upload(self, functions: Sequence[Function]) -> int:
-        """Upload the zips that are not there yet; how many."""
+        """Upload the zips that are not there yet; return how many."""
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             there = list(pool.map(lambda function: self._has(function.key), functions))
         missing = [function for function, found in zip(functions, there, strict=True) if not found]
@@ -87,13 +87,13 @@ class CodeBucket:
         return len(missing)
 
     def put(self, key: str, body: bytes) -> str:
-        """Store an object, its hash checked by S3; its https URL."""
+        """Store an object, whose hash S3 checks; return its https URL."""
         checksum = base64.b64encode(hashlib.sha256(body).digest()).decode()
         self._s3.put_object(**self._owner, Key=key, Body=body, ChecksumSHA256=checksum)
         return self.url(key)
 
     def get(self, key: str) -> bytes:
-        """An object's content; nothing if there is none, or no bucket."""
+        """An object's content; empty if there is no object or no bucket."""
         try:
             answer = self._s3.get_object(**self._owner, Key=key)
         except ClientError as error:
@@ -103,7 +103,7 @@ class CodeBucket:
         return bytes(answer["Body"].read())
 
     def put_template(self, text: str) -> str:
-        """Store a template under its hash, if it is not there; its URL for CloudFormation."""
+        """Store a template under its hash, if it is not there; return its URL for CloudFormation."""
         body = text.encode()
         key = f"templates/{hashlib.sha256(body).hexdigest()[:16]}.yml"
         return self.url(key) if self._has(key) else self.put(key, body)

@@ -30,7 +30,7 @@ _STACKS = 3  # of one name that are looked into, the newest first
 
 
 def remaining(account: Account, stack: str) -> float:
-    """Seconds until every name of the stack of that name is free again; 0 if they are."""
+    """Seconds until all names of the stack's resources are free again; 0 if they are."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     answers = list(pages)

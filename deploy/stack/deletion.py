@@ -37,7 +37,7 @@ class StackDeletion:
         self._without: list[str] = []  # resources that the next try leaves out
 
     def run(self, title: str = "Deleting the stack") -> None:
-        """Delete it, and see to what is in the way for a while. Raises `Problem` if something else is."""
+        """Delete the stack; wait for, or remove, what is in the way for a while. Raises `Problem` for all else."""
         self._executor.retry(lambda: self._try(title), self._recover, TRIES)
 
     def _try(self, title: str) -> None:

@@ -42,7 +42,7 @@ def cost_of(kind: str) -> str:
 
 
 def removal_of(thing: ListedResource, account: Account) -> str:
-    """The command that removes a thing by hand; "" for what only its service's console knows."""
+    """The command that removes a resource by hand; "" if only its service's console can."""
     listing = BY_KIND.get(thing.kind)
     if listing is None:
         return ""
@@ -51,7 +51,7 @@ def removal_of(thing: ListedResource, account: Account) -> str:
 
 
 def resources(account: Account, stack: str) -> list[Resource]:
-    """What the stack of that name has, or had before it was deleted (CloudFormation remembers for 90 days)."""
+    """The resources of the stack of that name, also if it was deleted (CloudFormation keeps them for 90 days)."""
     found = [
         Resource(one["ResourceType"], one["PhysicalResourceId"])
         for known in stacks(account, stack)
@@ -62,7 +62,7 @@ def resources(account: Account, stack: str) -> list[Resource]:
 
 
 def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
-    """Installations of that name as CloudFormation describes them: the one that is there, and those deleted last."""
+    """The installations of that name as CloudFormation describes them: the present one, and those deleted last."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
@@ -83,7 +83,7 @@ def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
 
 
 class Addresses(NamedTuple):
-    """Where an installation's names lie: the hosted zone, the root domain, the site's name, the servers' domain."""
+    """The domains of an installation: its hosted zone, root domain, site, and the servers' domain."""
 
     zone: str
     root: str
@@ -92,7 +92,7 @@ class Addresses(NamedTuple):
 
 
 def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
-    """Those of installations, each once."""
+    """The domains of these installations, each once."""
     found = []
     for parameters in map(parameters_of, described):
         zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
@@ -103,7 +103,7 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
 
 
 def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedResource]:
-    """Which of these exist, by listing each kind once. Kinds that only exist as part of others are not looked for."""
+    """Those of these resources that exist, by one listing for each kind. Kinds that are parts of others are skipped."""
     by_type: dict[str, set[str]] = {}
     for resource in wanted:
         by_type.setdefault(resource.type, set()).add(resource.physical_id)
@@ -207,7 +207,7 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
 
 
 def server_names(account: Account, where: Addresses) -> list[str]:
-    """Names of servers that are in a zone, whosever: another installation may have the same root domain."""
+    """DNS names of servers in the zone, also those of another installation with the same root domain."""
     told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
     host = where.servers.removesuffix(where.root).rstrip(".")
     try:
@@ -223,7 +223,7 @@ SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
 
 
 def service_roles(account: Account) -> list[str]:
-    """Those of them that are there."""
+    """Those of these roles that exist."""
     iam = account.client("iam")
     found = []
     for name in SERVICE_ROLES:
@@ -238,7 +238,7 @@ def service_roles(account: Account) -> list[str]:
 
 
 def stored(account: Account, bucket: str, most: int = 200_000) -> int:
-    """Bytes in a bucket, with all versions; of one with more than `most` versions at least so many."""
+    """Bytes in a bucket, with all versions. If there are more than `most` versions: at least so many bytes."""
     found = VersionedBucket(account, bucket).versions()
     return sum(version.size for version in itertools.islice(found, most))
 
@@ -273,7 +273,7 @@ def _tags(account: Account, bucket: str) -> dict[str, str]:
 
 
 def bucket_exists(account: Account, name: str) -> bool:
-    """Whether the bucket is there and ours."""
+    """Whether the bucket exists and is ours."""
     try:
         account.client("s3").head_bucket(Bucket=name, ExpectedBucketOwner=account.id)
     except ClientError as error:
@@ -297,7 +297,7 @@ _TAGGED = {  # what the tagging API finds that no listing above looks for: servi
 
 
 def tagged(account: Account, stack: str) -> list[ListedResource]:
-    """What else carries the stack's tag. The tagging API lags behind, so it is only asked about what is not listed."""
+    """Further resources with the stack's tag. The tagging API lags, so it is asked only for what is not listed."""
     client = account.client("resourcegroupstaggingapi")
     found = []
     try:

@@ -19,7 +19,7 @@ class Listing(NamedTuple):
     cost: str = "nothing"  # a month, unused
 
     def removal(self, name: str, region: str) -> str:
-        """The command that removes one."""
+        """The command that removes one resource."""
         return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
 
 

@@ -31,13 +31,13 @@ class PolicyAttachments(NamedTuple):
 
     @property
     def whom(self) -> str:
-        """`the user ada, the group lab`."""
+        """The users, groups and roles in words: `the user ada, the group lab`."""
         named = (("user", self.users), ("group", self.groups), ("role", self.roles))
         return ", ".join(f"the {kind} {name}" for kind, names in named for name in names)
 
 
 def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
-    """Return who has the policy, as permissions or (`PermissionsBoundary`) as a boundary; none if gone."""
+    """Who has the policy, for permissions or (`PermissionsBoundary`) as a boundary; nobody if the policy is gone."""
     found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
     try:
@@ -51,7 +51,7 @@ def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> Po
 
 
 def must_be_no_boundary(account: Account, arn: str) -> None:
-    """Raises `Problem` if the policy is a user's or role's permissions boundary, without which they could do more."""
+    """Raise `Problem` if the policy is a permissions boundary: without it, its user or role could do more."""
     listed = attached(account, arn, "PermissionsBoundary")
     iam = account.client("iam")
     users = [one for one in listed.users if _bound(iam.get_user(UserName=one)["User"], arn)]

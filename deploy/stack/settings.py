@@ -35,13 +35,13 @@ _PARAMETERS = {  # the template's parameter for each setting that goes there as 
 
 
 def option(parameter: str) -> str:
-    """The option that sets a parameter of the template; the parameter's own name if none does."""
+    """The option that sets a parameter of the template; the parameter's name if there is no such option."""
     return next((f"--{name.replace('_', '-')}" for name, one in _PARAMETERS.items() if one == parameter), parameter)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What was asked for, each by its option; None means: as it was, or as the template has it."""
+    """The administrator's options. None: the stack's present value, or else the template's default."""
 
     domain: Annotated[
         str | None,
@@ -92,7 +92,7 @@ class Settings:
         code_bucket: str,
         subnets: Sequence[str] = (),
     ) -> dict[str, str]:
-        """The template's parameters: what was asked for, else what it was, else the default. Raises `Problem`.
+        """The template's parameters: the option, else the stack's present value, else the default. Raises `Problem`.
 
         `subnets` are those of the installation that stands.
         """
@@ -162,7 +162,7 @@ def _zones(
 
 
 def taking_settings(command: Callable[..., int]) -> Callable[..., int]:
-    """A command of typer's that has an option for each setting, where its function takes `settings`."""
+    """Turn a function that takes `settings` into a command of typer's with an option for each setting."""
     hints = get_type_hints(Settings, include_extras=True)
     options = [
         inspect.Parameter(

@@ -50,7 +50,7 @@ class NotDeleted(Problem):
 
 @dataclass
 class Operation:
-    """What goes on in a stack: states of resources by logical id, and failures in the order in which they came."""
+    """One operation on a stack: states of resources by logical id, and failures in the order in which they came."""
 
     states: dict[str, str] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
@@ -74,7 +74,7 @@ class Stack:
         self._sleep = sleep
 
     def describe(self) -> Mapping[str, Any] | None:
-        """What CloudFormation says, or None. A stack without resources that waits for a change set counts.
+        """The stack as CloudFormation describes it; None if there is none.
 
         Raises `Problem` if the stack of that name is not an installation of Hippodrome.
         """
@@ -82,22 +82,22 @@ class Stack:
 
     @property
     def status(self) -> str:
-        """Its state, "" if there is none."""
+        """The stack's state; "" if there is none."""
         found = self.describe()
         return str(found["StackStatus"]) if found else ""
 
     def template(self) -> str:
-        """The text of the template that stands; "" if it was JSON, which ours is not."""
+        """The text of the stack's template; "" if it was JSON, which ours is not."""
         found = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
         return found if isinstance(found, str) else ""
 
     def resources(self, stack_id: str = "") -> list[dict[str, Any]]:
-        """Its resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
+        """The stack's resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
         pages = self._client.get_paginator("list_stack_resources").paginate(StackName=stack_id or self.name)
         return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
 
     def ids_of(self, kind: str) -> list[str]:
-        """The physical ids of its resources of a type that exist; none if there is no stack."""
+        """The physical ids of the stack's resources of a type that exist; none if there is no stack."""
         try:
             return ids_of(self.resources(), kind)
         except ClientError as error:
@@ -106,14 +106,14 @@ class Stack:
             raise
 
     def last_event(self, stack_id: str) -> str:
-        """The id of its newest event, to tell what comes after; "" if there is none."""
+        """The id of the stack's newest event, by which later ones are recognised; "" if there is none."""
         events = self._client.describe_stack_events(StackName=stack_id)["StackEvents"]
         return str(events[0]["EventId"]) if events else ""
 
     # -- waiting ------------------------------------------------------------------------------------------------------
 
     def follow(self, title: str, stack_id: str, total: int = 0, after: str | None = None) -> str:
-        """Show what goes on until it ends; the state then. `after`: the last event before it (else: it is going on).
+        """Show the present operation until it ends; return the state then. `after`: the last event before it.
 
         Raises `Problem` on Ctrl-C: CloudFormation goes on without us, and the same command attaches again.
         """
@@ -202,7 +202,7 @@ class Stack:
             self.follow("Waiting for CloudFormation", found["StackId"])
 
     def settle(self) -> None:
-        """Wait for what is going on, and lead the stack out of states in which it takes no change.
+        """Wait for the present operation, and lead the stack out of states in which it takes no change.
 
         Raises `Problem` if that is a matter for people.
         """
@@ -232,7 +232,7 @@ class Stack:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
-        """Delete it and wait; nothing if it is gone. Raises `NotDeleted`, and `Problem` if it is protected.
+        """Delete the stack and wait. Raises `NotDeleted`, and `Problem` if it is protected.
 
         `without`: resources that a deletion has failed at and that the next leaves out, by their names in the template.
         """
@@ -259,7 +259,7 @@ class Stack:
             raise NotDeleted(problem, self.operation(stack_id).failures)
 
     def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
-        """Raises `Problem` if the stack's termination protection is on."""
+        """Raise `Problem` if the stack's termination protection is on."""
         if found.get("EnableTerminationProtection"):
             raise Problem(
                 f"The stack {self.name} is protected against deletion (termination protection).",
@@ -268,7 +268,7 @@ class Stack:
             )
 
     def problem(self, what: str, stack_id: str, status: str) -> Problem:
-        """Why the latest operation failed, in one screen: the first failure, then others of their own."""
+        """Why the latest operation failed: the first failure, then other independent ones, as much as fits a screen."""
         failures = self.operation(stack_id).failures
         details: list[str] = []
         for failure in failures[:3]:
@@ -283,7 +283,7 @@ class Stack:
 
 
 def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
-    """The physical ids of those of these resources that are of a type and exist."""
+    """The physical ids of those of these resources that have this type and exist."""
     gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
     return [
         str(one["PhysicalResourceId"])
@@ -335,7 +335,7 @@ _ADVICE = (  # what is known to go wrong, and what helps
 
 
 def advice(failures: Sequence[Failure], details: Sequence[str] = ()) -> str:
-    """What helps against the first failure."""
+    """The advice for the first failure."""
     reason = failures[0].reason if failures else " ".join(details)
     for pattern, text in _ADVICE:
         if re.search(pattern, reason, re.IGNORECASE):

@@ -14,7 +14,7 @@ from console.problem import Problem
 
 
 class Action(Enum):
-    """What `apply` does first."""
+    """The first thing that `apply` does."""
 
     CREATE = "make it"  # there is nothing, or an empty shell
     UPDATE = "bring it up to date"
@@ -58,17 +58,17 @@ _BECAUSE = {
 
 
 def action_for(status: str) -> Action:
-    """What to do about a stack in that state ("": there is none). One that is not in the table is left alone."""
+    """What to do about a stack in this state ("": there is none). Unknown states are left to the administrator."""
     return ACTIONS.get(status, Action.STOP) if status else Action.CREATE
 
 
 def broken(status: str) -> bool:
-    """Whether the stack never came to life, so that only deleting helps."""
+    """Whether the stack was never complete, so that it can only be deleted."""
     return action_for(status) is Action.RECREATE
 
 
 def problem(stack: str, status: str) -> Problem:
-    """What to tell about a stack that `apply` leaves to the administrator."""
+    """The problem of a stack that `apply` leaves to the administrator."""
     because = _BECAUSE.get(status, "is in a state that this version does not know")
     return Problem(
         f"The stack {stack} {because} ({status}).",

@@ -24,7 +24,7 @@ PRIVILEGED = 1024  # ports below need a privilege
 
 
 def port(installation: Installation) -> int:
-    """Where the servers of a study that is registered now are to listen."""
+    """The port on which servers of a study that is registered now must listen."""
     return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no choice
 
 
@@ -80,7 +80,7 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
 
 
 def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
-    """The ARN of the newest revision, if it says what is wanted; else None."""
+    """The ARN of the newest revision, if it has this content; else None."""
     try:
         found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
     except ClientError as error:
@@ -95,7 +95,7 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
 
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
-    """Make a new revision; its ARN."""
+    """Make a new revision; return its ARN."""
     tags = {TAG: installation.stack, "hippodrome:project": project_id}
     answer = account.client("ecs").register_task_definition(
         **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]

@@ -59,7 +59,7 @@ def command(
 
 
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
-    """The signature of each of these ids, in their order, from the function that has the secret."""
+    """The signatures of these ids, in their order, from the function that has the secret."""
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
         chunk = list(users[start : start + MAX_SIGNED])
@@ -72,7 +72,7 @@ def signed(account: Account, installation: Installation, project_id: str, users:
 
 
 def link(site: str, project: Project, user_id: str, signature: str) -> str:
-    """The address at which this participant takes part."""
+    """The address with which this participant takes part."""
     return f"{site.rstrip('/')}/next?{urlencode({'projectId': project.id, 'userId': user_id, 'signature': signature})}"
 
 

@@ -21,7 +21,7 @@ LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` hands it out, and a functi
 
 @dataclass(frozen=True)
 class Changes:
-    """What differs between the folder and the bucket. `put`: key → file. `gone`: keys without a file."""
+    """The differences between folder and bucket. `put`: key → file. `gone`: keys without a file."""
 
     put: Mapping[str, Path]
     gone: Sequence[str]
@@ -32,7 +32,7 @@ class Changes:
 
 
 def compare(account: Account, bucket: str, project_id: str, folder: Path, more: Iterable[Path] = ()) -> Changes:
-    """Look at the folder and at the bucket; nothing is changed. `more` are pages from elsewhere. Raises `Problem`."""
+    """Compare folder and bucket; nothing is changed. `more` are pages from elsewhere. Raises `Problem`."""
     prefix = f"{project_id}/steps/"
     files = {prefix + file.name: file for file in [*_files(folder), *more]}
     there = _listing(account, bucket, prefix)
@@ -41,7 +41,7 @@ def compare(account: Account, bucket: str, project_id: str, folder: Path, more: 
 
 
 def upload(account: Account, bucket: str, changes: Changes) -> None:
-    """Write what is new or different. What is interrupted here goes on with the next `compare`."""
+    """Write the pages that are new or different. After an interruption, the next `compare` finds the rest."""
     documents = _documents(account, bucket)
     with screen.progress() as progress:
         for key, file in progress.track(changes.put.items(), description="Uploading pages"):
@@ -49,7 +49,7 @@ def upload(account: Account, bucket: str, changes: Changes) -> None:
 
 
 def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
-    """Remove pages that the folder has no more. Only once nothing registered names them."""
+    """Remove pages that are not in the folder any more. Call it only when no registration names them."""
     documents = _documents(account, bucket)
     for key in gone:
         documents.delete(key)

@@ -45,7 +45,7 @@ Base = Annotated[
 
 @dataclass(frozen=True)
 class RegisterRequest:
-    """How to register: `live` None means as config.yml says; `again` builds a new image although there is one."""
+    """How to register. `live` None: as config.yml says. `again`: build a new image even if there is one."""
 
     live: bool | None = None
     again: bool = False
@@ -57,7 +57,7 @@ class RegisterRequest:
 
 @dataclass(frozen=True)
 class Plan:
-    """What registering would do. Nothing has been changed yet."""
+    """What registering would do. Nothing is changed yet."""
 
     study: project_folder.Study
     before: Project | None
@@ -68,7 +68,7 @@ class Plan:
 
     @property
     def steps(self) -> list[str]:
-        """What there is to do, a line each; empty if there is nothing to do."""
+        """What there is to do, in one line each; empty if nothing is."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
             found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
@@ -81,7 +81,7 @@ class Plan:
         return found + [f"remove {key}" for key in self.pages.gone]
 
     def task(self, revision: str | None) -> dict[str, Any]:
-        """What is registered of a task definition: its revision, and the port on which its servers listen."""
+        """What a project registers of its task definition: the revision, and the port on which its servers listen."""
         return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
 
 
@@ -138,7 +138,7 @@ def command(
 
 
 def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> Plan:
-    """Look at the folder and at AWS. Raises `Problem` if the project cannot be registered here."""
+    """Compare the folder with AWS. Raises `Problem` if the project cannot be registered here."""
     found = project_folder.read(folder, installation)
     if request.live is not None:
         found.registration["live"] = request.live
@@ -153,7 +153,7 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
-    """Register the study; return what was done. Raises `Problem`, and KeyboardInterrupt between the steps."""
+    """Register the study; return what was done. Raises `Problem`, or KeyboardInterrupt between two steps."""
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)
@@ -208,7 +208,7 @@ def _remarks(folder: Path, found: project_folder.Study) -> list[str]:
 
 
 def link(installation: Installation, project_id: str) -> str:
-    """The address where participants begin. docs/recruiting.md says what recruiters add to it."""
+    """The address with which participants begin. docs/recruiting.md says what recruiters add to it."""
     return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
 
 
@@ -273,7 +273,7 @@ def _confirm(account: Account, installation: Installation, doing: Plan, request:
 
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
-    """Let the installation register the project. Raises `Problem` with what it objects to."""
+    """Let the installation register the project. Raises `Problem` with its objections."""
     answer = register_function.ask(account, installation, {"project": registration})
     if "registered" not in answer:
         said = [str(problem) for problem in answer.get("problems") or []]

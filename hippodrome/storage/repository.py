@@ -87,9 +87,9 @@ class Repository:
     def project_of_own_server(self, project: Project, user_id: str) -> Project | None:
         """The registration for one player, if the participant still has a server of their own that runs it.
 
-        None if that server has ended for good, or if there never was one. A participant with a membership plays with others: a
-        function that had not read the registration yet has started their own server. No call if one player is
-        registered, or never was. Errors as in `membership`.
+        None if that server has ended for good, or if there never was one. None for a participant with a membership, who
+        plays with others: a function that had not read the registration yet has started the server. No call if one
+        player is registered, or never was. Errors as in `membership`.
         """
         before = project.for_session(1) if project.has_sessions else None
         record = self.server_of(project.id, user_id) if before else None

@@ -26,5 +26,5 @@ class Action:
 
     @property
     def human(self) -> bool:
-        """A person asked for it."""
+        """Whether a human asked for it."""
         return self.by == "human"

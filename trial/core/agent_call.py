@@ -28,7 +28,7 @@ class AgentCall:
         self._emit(call)
 
     def has_ended(self, call: Call, *, hangs: bool = False) -> bool:
-        """The shell says that this call has ended; whether it is the one that the agent has.
+        """The shell says that a call has ended. Return whether it is the call that the agent has.
 
         `hangs`: it has not come back within its limit.
         """
@@ -39,6 +39,6 @@ class AgentCall:
         return True
 
     def give_up(self, now: float) -> None:
-        """Give the call up if it is time to. If it comes back later, that changes nothing."""
+        """Give the call up if its time is over. If it comes back later, that changes nothing."""
         if self.give_up_at is not None and now >= self.give_up_at:
             self.call, self.give_up_at, self.hangs = None, None, True

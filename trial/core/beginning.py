@@ -42,7 +42,7 @@ class Beginning:
         """This episode begins anew, because it could not be replayed."""
 
     def begin(self, progress: Progress, participants: Participants) -> Call | None:
-        """The call that begins the next episode; None: a recording is to be opened before."""
+        """Return the call that begins the next episode; None if a recording must be opened first."""
         self._timing.begin_episode()  # what pages are told before the reset is the new episode's time
         unfinished = self.unfinished
         self._seed = self._next_seed(progress) if unfinished is None or unfinished.seed is None else unfinished.seed
@@ -56,7 +56,7 @@ class Beginning:
         return self._new_seed() if first is None else first + progress.episode - 1
 
     def opened(self, progress: Progress, participants: Participants, ns: int) -> Call:
-        """The call that begins the episode now that its recording is open. `ns` is the time, for messages."""
+        """Return the call that begins the episode, now that its recording is open. `ns` is the time, for messages."""
         unfinished, self.unfinished = self.unfinished, None
         if unfinished is not None and unfinished.steps:
             progress.choices.begins(self._seed)
@@ -67,7 +67,7 @@ class Beginning:
         return self._reset(progress, participants)
 
     def begin_again(self, progress: Progress, participants: Participants) -> Call:
-        """The call that begins an episode anew that could not be replayed."""
+        """Return the call that begins an episode anew because it could not be replayed."""
         self.begun_again = progress.episode
         return self._reset(progress, participants)
 
@@ -97,5 +97,5 @@ class Beginning:
         progress.choices.policies.go_on(unfinished.going_on, unfinished.failures)
 
     def repeat_feedback(self, unfinished: UnfinishedEpisode, ns: int) -> None:
-        """Take up the feedback that an earlier server's agent did not hear any more."""
+        """Keep the feedback that an earlier server's agent did not hear, so that the agent hears it now."""
         self._message_log.repeat(unfinished.unheard, ns)

@@ -76,7 +76,7 @@ class Choices:
         self._advice.clear()
 
     def see(self, view: View | None, now: float) -> None:
-        """This is what the players see now. None: all of them act, and all actions are possible."""
+        """The players see this now. None: all of them act, and all actions are possible."""
         self._view = view
         if self.turns is not None:
             to_act = frozenset(self._players) if view is None else view.to_act & self._players.keys()
@@ -125,7 +125,7 @@ class Choices:
         self.turns.choose(player, Action(index, controls.names[index], "human", pressed_at=controls.time))
 
     def said_at(self, player: str, ns: int) -> None:
-        """Note when the message came that is read now. With `timed_keys`, an action that it chooses has this time."""
+        """Note when the present message came. With `timed_keys`, an action that it chooses has this time."""
         self.controls[player].time = ns
 
     def let_go(self, player: str | None = None) -> None:
@@ -141,7 +141,7 @@ class Choices:
     # ---- a step
 
     def next_actions(self, steps: int) -> Mapping[str, Action]:
-        """Each player's action of the step that begins now. Advice is for this step, and counts if no key acts."""
+        """Each player's action of the step that begins now. `advice` is for this step; it counts if no key acts."""
         view, turns = self._view, self.turns
         actions: dict[str, Action] = {}
         for name, player in self._players.items():
@@ -174,23 +174,23 @@ class Choices:
     # ---- policies
 
     def asks(self, steps: int, now: float) -> Sequence[AskPolicy]:
-        """What policies are to be asked now that the players see something."""
+        """What to ask the policies, now that the players see something."""
         return self.policies.asks(self._view, steps, now) if self._view is not None and self.policies else ()
 
     def take_place(self, player: str, plays: str) -> None:
-        """A policy plays in the place of a human from now on."""
+        """From now on a policy plays in the place of a human."""
         self.let_go(player)
         self.policies.take_place(replace(self._players[player], plays=plays))
 
     def ask(self, player: str, steps: int, now: float) -> AskPolicy | None:
-        """What the policy that has taken a place is to be asked now; None if it is not to act."""
+        """What to ask the policy that has taken a place; None if it is not to act now."""
         view = self._view
         return self.policies.ask(player, view, steps, now) if view is not None and player in view.to_act else None
 
     # ---- turn by turn
 
     def policies_choose(self, now: float) -> None:
-        """Take the choices of those policies that have answered, or whose time is over."""
+        """Take the choices of all policies that have answered, or whose time is over."""
         turns = self.turns
         for name in self._waiting():
             if turns is not None and name in self.policies:
@@ -227,14 +227,14 @@ class Choices:
 
     @property
     def waits_for(self) -> tuple[str, ...]:
-        """The humans that the game waits for; none in real time."""
+        """The humans for whom the game waits; none in real time."""
         turns, policies = self.turns, self.policies
         if turns is None:
             return ()
         return tuple(name for name in self._players if turns.waits_for(name) and name not in policies)
 
     def policies_until(self) -> float | None:
-        """When the time of a policy that the game waits for is over."""
+        """When the time of a policy for which the game waits is over; None if it waits for none."""
         return self.policies.until(self._waiting())
 
     # ---- programs

@@ -29,7 +29,7 @@ class Client:
 
 
 class Clients:
-    """Every human has one connection at most. Each is shown their player's picture, score and turn."""
+    """The connections of all humans, one at most for each. Each shows the picture, score and turn of their player."""
 
     def __init__(
         self, config: Trial, timing: Timing, emit: Callable[[Effect], None], assets: Sequence[Mapping[str, Any]] = ()
@@ -46,7 +46,7 @@ class Clients:
         self.frame_id = 0
 
     def add(self, human: str, connection: Hashable, window: Window, player: str) -> Client:
-        """Add a connection of the human who plays this player. One that they have already must have been removed."""
+        """Add a connection of the human who plays this player. An earlier connection must have been removed before."""
         client = self._by_human[human] = Client(connection, window, player)
         return client
 
@@ -58,16 +58,16 @@ class Clients:
         return client
 
     def remove(self, connection: Hashable) -> Client | None:
-        """Forget a connection that is closed; None if it was replaced before."""
+        """Remove a connection that is closed, and return its client; None if another has replaced it."""
         human = next((human for human, each in self._by_human.items() if each.connection == connection), None)
         return None if human is None else self._by_human.pop(human)
 
     def of(self, connection: Hashable) -> Client | None:
-        """The client with this connection; None if it was replaced."""
+        """The client with this connection; None if another has replaced it."""
         return next((each for each in self._by_human.values() if each.connection == connection), None)
 
     def stalled(self, now: float) -> list[Client]:
-        """Those that have stopped acknowledging frames."""
+        """The clients that have stopped acknowledging frames."""
         return [client for client in self._by_human.values() if client.window.stalled(now)]
 
     def send(self, client: Client, text: str) -> None:
@@ -80,19 +80,19 @@ class Clients:
             self.send(client, text)
 
     def say_each(self, words_for: Callable[[str], str | None]) -> None:
-        """Tell each client these words, by its player, as an error; None: nothing."""
+        """Send each client, by its player, these words as an error; None: send nothing."""
         for client in self._by_human.values():
             words = words_for(client.player)
             if words is not None:
                 self.send(client, messages.error(words))
 
     def send_controls(self, client: Client, progress: Progress, participants: Participants, now: float) -> None:
-        """Tell a client all of the game and of its controls."""
+        """Send a client everything about the game and its controls."""
         times = self._timing.told(progress, now, participants.told(now))
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
     def send_state(self, progress: Progress, participants: Participants, now: float) -> None:
-        """Send the state to each client that was last sent another one, with the seconds that are left of all times."""
+        """Send the state, with all seconds that are left, to each client whose last state was another one."""
         progress.told = participants.state()
         for client in self._by_human.values():
             player = client.player
@@ -127,16 +127,16 @@ class Clients:
             self._emit(SendPicture(client.connection, picture, self.frame_id))
 
     def by_human(self) -> list[tuple[str, Client]]:
-        """Those that are connected, and whose they are."""
+        """All connected clients, each with the human whose it is."""
         return list(self._by_human.items())
 
     def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for them."""
+        """Tell a client that the trial is over and stored. `outcome` says how a session has ended for its member."""
         self._emit(SendDone(client.connection, episodes, score, outcome))
 
 
 def state_of(progress: Progress, player: str) -> tuple[object, ...]:
-    """What is sent to clients whenever one of these changes."""
+    """What the clients' state shows. When one of these values changes, the state is sent again."""
     score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
     return progress.state, progress.episode, score, progress.frame_rate, progress.stands, progress.told, to_act
 

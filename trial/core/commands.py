@@ -83,7 +83,7 @@ class Commands:
                 participants.stop(player)
 
     def carry_out_waiting(self, progress: Progress, participants: Participants, timing: Timing) -> None:
-        """No step is being taken: do what has waited for that."""
+        """Carry out the commands that have waited for the end of a step."""
         commands, self.waiting = self.waiting, []
         for command in commands:
             timing.skip()
@@ -95,7 +95,7 @@ class Commands:
 
 
 def not_offered(message: Message, ui: Collection[str]) -> str | None:
-    """The control that this message needs and that the project's `ui` leaves out; None if all of it is offered."""
+    """The control that this message needs, if the project's `ui` leaves it out; else None."""
     command, wish, name = message.command, message.frame_rate, message.action
     if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
         return command

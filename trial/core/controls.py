@@ -65,16 +65,16 @@ class Controls:
         self.default = self._index.get(NOOP, 0) if default is None else default
 
     def knows(self, name: str) -> bool:
-        """Whether the name is an action, or a key that can be part of one."""
+        """Whether the name is that of an action, or of a key that can be part of one."""
         return name in self._index or name in DIRECTIONS or name in self._key_names
 
     def keep(self, name: str) -> None:
-        """This action acts until the next one. NOOP and names that are no actions end the one that acts."""
+        """Let this action act until another one is chosen. NOOP and unknown names end the action that acts."""
         self._press = self._index.get(name) if name != NOOP else None
         self._press_left = math.inf if self._press is not None else 0
 
     def press(self, name: str) -> None:
-        """One press: acts for `lifespan` steps, or until another action; with `single` for one step."""
+        """Choose an action by one press. It acts for `lifespan` steps (`single`: for one), or until another action."""
         index = self._combined_with(name, ())
         if self._single:
             self._wait(index)
@@ -112,7 +112,7 @@ class Controls:
             self._tapped.insert(0, name)
 
     def clear(self) -> None:
-        """Let go of everything, as when the player's connection is lost."""
+        """Let go of all keys and presses, as when the player's connection is lost."""
         self._held.clear()
         self._tapped.clear()
         self._unseen.clear()
@@ -120,7 +120,7 @@ class Controls:
         self._press_left = 0
 
     def forget_taps(self) -> None:
-        """Forget the press, and the keys that were released before any step; keys that are held stay, and `keep`'s."""
+        """Forget the press, and keys released before a step acted on them; not held keys, nor `keep`'s action."""
         self._tapped.clear()
         self._presses.clear()
         if self._press_left < math.inf:
@@ -128,7 +128,7 @@ class Controls:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Names held down now, newest first."""
+        """The names of the keys that are held down, newest first."""
         return tuple(self._held)
 
     def take(self) -> tuple[int, bool]:

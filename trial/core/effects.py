@@ -27,7 +27,7 @@ Pictures = Picture | dict[str, Picture]
 
 @dataclass(frozen=True, slots=True)
 class SendMessage:
-    """Send a message."""
+    """Send this text to a client."""
 
     connection: Hashable
     text: str
@@ -74,12 +74,12 @@ class Close:
 
 
 class AgentTimeout(Exception):
-    """The researcher's code has not come back in time. It still runs, and its thread can run nothing else."""
+    """The researcher's code has not returned in time. It still runs, so its thread can do nothing else."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Call:
-    """A call of the researcher's code. After `limit` seconds it has failed with AgentTimeout."""
+    """A call of the researcher's code. It fails with AgentTimeout after `limit` seconds."""
 
     limit: float
 
@@ -107,7 +107,7 @@ class ReplayCall(Call):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class FeedbackCall(Call):
-    """Give the agent these words of feedback. `heard` counts those it was given. Returns None."""
+    """Give the agent these words of feedback. `heard`: how many words count as heard afterwards. Returns None."""
 
     feedback: tuple[Word, ...]
     messages: int
@@ -133,7 +133,7 @@ class StepCall(FeedbackCall):
 
 @dataclass(frozen=True, slots=True)
 class TellMoved:
-    """Tell the agent's callbacks that a player's participant has come, gone or come back."""
+    """Tell the agent's callbacks that a player's participant has come, left or returned."""
 
     callback: Literal["on_join", "on_leave", "on_return"]
     player: str
@@ -141,7 +141,7 @@ class TellMoved:
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """What came of a reset: the line of the recording, the first picture, and what the players see.
+    """The result of a reset: the line of the recording, the first picture, and what the players see.
 
     `view` is None if all players act and may do everything.
     """
@@ -152,7 +152,7 @@ class Begun:
 
 
 class StepTaken(NamedTuple):
-    """What came of a step: rewards by player, whether the episode is over, the new picture, the line of the recording.
+    """The result of a step: rewards by player, whether the episode is over, the picture, the line of the recording.
 
     `view` is as in `Begun`.
     """
@@ -167,7 +167,7 @@ class StepTaken(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What came of a replay: the present picture, and what the players see.
+    """The result of a replay: the present picture, and what the players see.
 
     `observed` is what each policy acted upon in the steps that were taken again, in their order.
     """
@@ -239,7 +239,7 @@ class SaveAnswer:
 
 @dataclass(frozen=True, slots=True)
 class SaveMember:
-    """Store a member's answer; answered with `member_saved`. The core emits it for who is out while the others play."""
+    """Store a member's answer; answered with `member_saved`. For a member who is out while the others play."""
 
     human: str
     answers: Mapping[str, Any]

@@ -20,7 +20,7 @@ LAST_CALL_SECONDS = 2.0
 
 
 class Ending:
-    """Records what is over (`Progress.ended`), one after the other, and at last the end of the trial."""
+    """Records the ends of episodes and breaks (`Progress.ended`), one after the other, and the end of the trial."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Ending:
         """The last lines are written, and the answer was given to the store."""
 
     def last_feedback(self, progress: Progress) -> FeedbackCall:
-        """The call before the first end is recorded: the agent hears the feedback, and its callbacks what is over."""
+        """The call before the first end is recorded: the agent hears the feedback, its callbacks what has ended."""
         return FeedbackCall(
             limit=LAST_CALL_SECONDS if self.closing else self._settings.step_seconds,
             feedback=self._message_log.feedback,
@@ -53,7 +53,7 @@ class Ending:
         )
 
     def record(self, call: FeedbackCall, progress: Progress, participants: Participants) -> None:
-        """Record the end of the first episode or break that is over, with the messages before this call."""
+        """Record the first end of an episode or a break that is not recorded, with the messages before it."""
         over = progress.ended.pop(0)
         if isinstance(over, Episode):
             for player, late in progress.choices.policies.late().items():
@@ -67,13 +67,13 @@ class Ending:
             self._close_recording(participants)
 
     def shut_down_break(self, progress: Progress) -> None:
-        """If the server must end in a break, it ends the break."""
+        """End the break, if the server must end during one."""
         if self.closing and progress.on_break and not self._break_shut_down:
             self._break_shut_down = True
             progress.ended.append(Break(progress.episode, "shutdown"))
 
     def write_last(self, progress: Progress, participants: Participants, *, broken: bool) -> None:
-        """Write the last lines, and give the answer to the store; none if the game was `broken`, or is not over."""
+        """Write the last lines and store the answer. No answer if the game was `broken`, or is not over."""
         self.all_written = True
         if self.closing and not progress.over and not progress.on_break:
             self._emit(records.shutdown(progress, self._message_log.messages))

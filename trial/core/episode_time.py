@@ -20,24 +20,24 @@ class EpisodeTime:
         self._runs_since: float | None = None
 
     def begin(self) -> None:
-        """An episode begins: its first picture is to stand."""
+        """An episode begins: its first picture stands for a while."""
         self._moves = self._freeze == 0
         self._played = 0.0
         self._stands_since = self._runs_since = None
 
     def go_on(self, played: float) -> None:
-        """The episode was played for so long on an earlier server, and goes on."""
+        """The episode goes on. It was played for so many seconds on an earlier server."""
         self.begin()
         self._moves, self._played = True, played
 
     def rest(self, now: float) -> None:
-        """The game is held. A first picture that stood stands as long again when it goes on."""
+        """The game is held. A first picture that was standing stands for its whole time again afterwards."""
         if self._runs_since is not None:
             self._played += now - self._runs_since
         self._stands_since = self._runs_since = None
 
     def starts_in(self, now: float) -> float:
-        """Seconds for which the first picture still stands. Its time begins when this is asked first."""
+        """Seconds for which the first picture still stands. They are counted from the first call on."""
         if self._moves:
             return 0.0
         if self._stands_since is None:
@@ -52,7 +52,7 @@ class EpisodeTime:
             self._runs_since = now
 
     def left(self, now: float) -> float | None:
-        """Seconds of play that are left of the episode; None if there is no limit."""
+        """Seconds of play that are left in the episode; None if it has no limit."""
         if not self._limit:
             return None
         running = 0.0 if self._runs_since is None else now - self._runs_since

@@ -28,7 +28,7 @@ class Window:
 
     @property
     def acknowledging(self) -> bool:
-        """The client has acknowledged a frame."""
+        """Whether the client has acknowledged a frame."""
         return self._round_trip < math.inf
 
     def sent(self, frame_id: int, now: float) -> None:
@@ -40,7 +40,7 @@ class Window:
             self._under_way.popleft()
 
     def acknowledged(self, frame_id: int, now: float) -> None:
-        """The client has shown this frame, and so all before it."""
+        """The client has shown this frame, and so all frames before it."""
         frames = 0
         while self._under_way and self._under_way[0][0] <= frame_id:
             seen, at, first = self._under_way.popleft()
@@ -60,5 +60,5 @@ class Window:
         return max(0.0, self._sent_at + 1.0 - now)  # even then one frame a second: an acknowledgement may be lost
 
     def stalled(self, now: float) -> bool:
-        """The client acknowledged before, and has stopped."""
+        """Whether the client has acknowledged frames, and has stopped doing so."""
         return bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS and self.acknowledging

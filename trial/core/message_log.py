@@ -17,7 +17,7 @@ FIELDS_KEPT = 32 * 1024 * 1024
 
 
 class Word(NamedTuple):
-    """A word of feedback, and the player whose participant said it; None if there is only one."""
+    """A word of feedback, and the player of the participant who said it; None if there is only one player."""
 
     text: str
     player: str | None = None
@@ -38,7 +38,7 @@ class MessageLog:
 
     @property
     def messages(self) -> list[dict[str, Any]]:
-        """A copy of the messages that stand in no line of the recording yet."""
+        """A copy of the messages that are in no line of the recording yet."""
         return self._messages.copy()
 
     @property
@@ -47,7 +47,7 @@ class MessageLog:
         return tuple(self._feedback)
 
     def add(self, message: Message, ns: int, player: str | None = None) -> None:
-        """Keep what a client has sent, unless there is too much of it."""
+        """Keep a message of a client, unless too many are kept."""
         if message.fields:
             length = len(str(message.fields))
             self._fields_left -= length
@@ -65,7 +65,7 @@ class MessageLog:
             self._feedback.append(Word(message.command, player))
 
     def note(self, event: str, ns: int, player: str | None = None) -> None:
-        """Keep an event that no message reports."""
+        """Keep an event that is no message of a client."""
         if not self._full(player):
             self._messages.append({"ns": ns, **_of(player), "event": event})
 
@@ -76,24 +76,24 @@ class MessageLog:
         return player is None or sum(said.get("player") == player for said in self._messages) >= MESSAGES_KEPT
 
     def repeat(self, feedback: Sequence[Word], ns: int) -> None:
-        """Put feedback first that the agent of an earlier server did not hear."""
+        """Put feedback before all other: the agent of an earlier server did not hear it."""
         again = [{"ns": ns, **_of(word.player), "command": word.text, "again": True} for word in feedback]
         self._messages[:0] = again
         self._feedback[:0] = feedback
 
     def take_dropped(self) -> int:
-        """How many messages were dropped since this was asked last."""
+        """How many messages were dropped since the last call."""
         dropped, self._dropped = self._dropped, 0
         return dropped
 
     def recorded(self, messages: int, feedback: int) -> None:
-        """The first messages stand in the recording. Of their feedback the agent will hear no more."""
+        """The first `messages` are in the recording now. The agent hears no more of the first `feedback` words."""
         del self._messages[:messages]
         self._fields_waiting = 0
         self.heard(feedback)
 
     def heard(self, feedback: int) -> None:
-        """The agent has heard the first words of feedback."""
+        """The agent has heard the first `feedback` words."""
         del self._feedback[:feedback]
 
 

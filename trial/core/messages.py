@@ -21,19 +21,19 @@ _FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack
 
 
 class NotAMessage(ValueError):
-    """Not JSON, or not an object. Three of these close a connection (4400)."""
+    """The message is no JSON, or no object. Three of these close a connection (4400)."""
 
 
 class BadMessage(ValueError):
-    """An object that means nothing here; the words go back to the client."""
+    """The object is no message that is known here. The words are sent back to the client."""
 
 
 class CommandRefused(ValueError):
-    """What a client asked for is not possible now; the words go back to it."""
+    """What a client asked for is not possible now. The words are sent back to it."""
 
 
 class CloseConnection(Exception):
-    """The connection is to be closed with this code, after these words."""
+    """Close the connection with this code, after these words."""
 
     def __init__(self, code: int, words: str) -> None:
         super().__init__(words)
@@ -77,7 +77,7 @@ class Message:
     """Whether the participant looks at another page. Only members of a session say it."""
 
     def record(self) -> dict[str, Any]:
-        """What goes into a recording: everything but acknowledgements, requestUI and `hidden`."""
+        """The fields for the recording: all but acknowledgements, requestUI and `hidden`."""
         said: dict[str, Any] = {}
         if self.command is not None and self.command != "requestUI":
             said["command"] = self.command
@@ -97,7 +97,7 @@ class Message:
 
 
 def object_of(data: str | bytes) -> dict[str, Any]:
-    """A message's JSON object. Raises NotAMessage."""
+    """The JSON object that a message is. Raises NotAMessage."""
     if not isinstance(data, str):
         raise NotAMessage("messages are JSON text, not bytes")
     try:
@@ -130,13 +130,13 @@ def parse_hello(data: str | bytes) -> Hello:
 
 
 def words_of(trial: Trial) -> tuple[str, ...]:
-    """The project's own controls whose press gives the agent a word: those that are called like no action."""
+    """The words that the project's own controls give the agent: those controls that have no action's name."""
     actions = {*trial.action_space, *_BUTTONS_OF_ACTIONS}
     return tuple(name for name in trial.ui.own if name.lower() not in actions)
 
 
 def is_feedback(command: str | None) -> bool:
-    """Whether the command of a message is a word for the agent: one of FEEDBACK, or of the project's own."""
+    """Whether the command of a message is a word of feedback: one of FEEDBACK, or of the project's own."""
     return command is not None and command not in PLAIN_COMMANDS
 
 
@@ -284,7 +284,7 @@ def state(
     time_left: float | None = None,
     session: Mapping[str, Any] | None = None,
 ) -> str:
-    """Where the trial stands, sent whenever one of these changes.
+    """The message that says how the trial stands.
 
     `starts_in`: seconds for which the first picture still stands. `time_left`: seconds of play of the episode.
     `next_in`: seconds of a break that are left. Turn by turn, `to_act`: whether it is the client's turn, and
@@ -314,13 +314,13 @@ def _scores(score: float, episode_score: float, next_in: float | None) -> dict[s
 
 
 def done(episodes: int, score: float, outcome: str | None = None) -> str:
-    """The trial is over; in a session, with this outcome for the client."""
+    """The message that the trial is over; in a session, with its outcome for this client."""
     said = {"done": True, "episodes": episodes, "score": tidy(score)}
     return json.dumps(said if outcome is None else {**said, "outcome": outcome})
 
 
 def error(words: str) -> str:
-    """What was wrong, in words."""
+    """The message that says in words what was wrong."""
     return json.dumps({"error": words})
 
 

@@ -28,7 +28,7 @@ class Alone:
         return self._progress.first
 
     def name_of(self, player: str) -> str | None:
-        """What the recording calls the participant who plays this player: nothing, there is one."""
+        """The name in the recording for the participant who plays this player: None, since there is one participant."""
         return None
 
     # ---- what happens
@@ -37,17 +37,17 @@ class Alone:
         """The participant has connected. They begin, or go on, by `start`."""
 
     def go(self, player: str, now: float, *, closing: bool) -> None:
-        """The participant has gone: hold the game, unless the server is `closing`, which has ended what was on."""
+        """The participant has left: hold the game, unless the server is `closing`, which has ended the game itself."""
         if not closing:
             self._progress.leave(player)
 
     def stalls(self, player: str, now: float) -> bool:
-        """The participant's page has stopped answering, as if they had gone. Whether that is new."""
+        """The participant's page has stopped answering: treat them as gone. Return whether that is new."""
         self._progress.leave(player)
         return True
 
     def receive(self, player: str, message: Message, window: Window, now: float) -> bool:
-        """A message has come; whether it is read: always."""
+        """A message has come. Return whether it is read: always."""
         return True
 
     def start(self, player: str, now: float) -> None:
@@ -59,7 +59,7 @@ class Alone:
         self._progress.pause()
 
     def stop(self, player: str) -> None:
-        """The participant is to end the game, after the step that is being taken."""
+        """End the game for the participant, after the step that is being taken."""
 
     def stopped(self) -> None:
         """The game has ended because the participant has stopped it."""
@@ -68,54 +68,54 @@ class Alone:
         """The participant's browser has answered a ping. Only sessions measure it."""
 
     def saved(self, human: str) -> None:
-        """A member's answer is stored. There is none."""
+        """A member's answer is stored. Alone, there is none."""
 
     # ---- what follows
 
     def attend(self, now: float, seconds: float) -> None:
-        """Bring the game into line with who is here. One participant's game follows their commands alone."""
+        """Hold the game, or let it go on, as the members are there. Alone, only commands decide."""
 
     def wake_at(self, now: float) -> float | None:
-        """When to call `attend` again if nothing happens: there is no need to."""
+        """When to call `attend` again if nothing happens: never."""
         return None
 
     # ---- recordings and answers
 
     def of_reset(self) -> Mapping[str, Any]:
-        """More for the line of a reset."""
+        """Further fields for the line of a reset: none."""
         return {}
 
     def outcomes(self) -> Mapping[str, str | None] | None:
-        """How the trial has ended for each member."""
+        """How the trial has ended for each member: None, since there are no members."""
         return None
 
     def write_lines(self) -> None:
-        """Write the lines that wait for an open recording."""
+        """Write the lines that wait for an open recording: there are none."""
 
     def answer(self, seconds: float, *, played: bool) -> SaveAnswer:
-        """What is to be stored; `seconds` were played. Without an answer if the game could not be `played`."""
+        """What to store; `seconds` were played. Without an answer if the game could not be `played`."""
         return SaveAnswer(records.answers(self._progress, seconds, self._trial_id) if played else None)
 
     # ---- what the participant is told
 
     def state(self) -> None:
-        """Changes whenever members are to be told of each other again: never."""
+        """A value that changes when members are to be told of each other: always None."""
         return None
 
     def told(self, now: float) -> Mapping[str, Any] | None:
-        """What all members are told of each other."""
+        """What all members are told of each other: None."""
         return None
 
     def sentence(self, player: str) -> str | None:
-        """Why the game is over for a member, in words."""
+        """The words that tell a member why the game is over: None."""
         return None
 
     def has_answered(self, human: str) -> bool:
-        """Whether a member's answer is stored. There is none."""
+        """Whether a member's answer is stored: no."""
         return False
 
     def answer_of(self, human: str) -> Mapping[str, Any] | None:
-        """A member's own answer, once there is one."""
+        """A member's own answer: None."""
         return None
 
 

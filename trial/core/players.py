@@ -32,7 +32,7 @@ class PlayersError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """A place of the environment. `plays` is what `trial.players` says: human, or what chooses its actions."""
+    """A place of the environment. `plays` is what `trial.players` says: human, or who else chooses its actions."""
 
     name: str
     action_space: tuple[str, ...]
@@ -46,7 +46,7 @@ class Player:
 
     @property
     def by_program(self) -> bool:
-        """A program at the trial's /gym chooses its actions."""
+        """Whether a program at the trial's /gym chooses its actions."""
         return self.plays.startswith(GYM_PLAYER)
 
 
@@ -115,7 +115,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def is_legal(action: int, mask: Mask | None) -> bool:
-    """Whether the mask allows the action. One that says nothing of it, or allows nothing, forbids nothing."""
+    """Whether the mask allows the action. A mask that is too short, or allows no action at all, forbids nothing."""
     return mask is None or action >= len(mask) or bool(mask[action]) or not any(mask)
 
 
@@ -125,7 +125,7 @@ def legal_actions(count: int, mask: Mask | None) -> list[int]:
 
 
 def legal_or_idle(action: int, player: Player, mask: Mask | None) -> int:
-    """The action, or if the mask forbids it the idle one, or if that is forbidden the first that is legal."""
+    """The action if it is legal; else the idle action if that is legal; else the first legal one."""
     if is_legal(action, mask):
         return action
     if is_legal(player.idle, mask):
@@ -134,6 +134,6 @@ def legal_or_idle(action: int, player: Player, mask: Mask | None) -> int:
 
 
 def random_action(player: Player, mask: Mask | None, seed: int) -> int:
-    """One of the legal actions; the same for the same seed."""
+    """A random legal action: the same one for the same seed."""
     choice = legal_actions(len(player.action_space), mask)
     return choice[seed % len(choice)] if choice else player.idle

@@ -22,7 +22,7 @@ FAILURES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What a policy acted upon."""
+    """What a policy saw when it chose its action."""
 
     observation: Any
     info: Any
@@ -85,7 +85,7 @@ class Policies:
 
     @property
     def asked(self) -> tuple[Player, ...]:
-        """Those that are asked; all but the ones that a program plays."""
+        """The players whose policies are asked: all but those that a program plays."""
         return tuple(place.player for place in self._places.values() if not place.player.by_program)
 
     def begin(self) -> None:
@@ -107,19 +107,19 @@ class Policies:
                 self._places[player].last = action
 
     def take_place(self, player: Player) -> None:
-        """A policy plays for this player from now on."""
+        """From now on a policy plays for this player."""
         self._places[player.name] = _Place(player)
 
     def give_back(self, player: str) -> None:
-        """The policy plays for this player no more; its late answers change nothing."""
+        """The policy does not play for this player any more; its late answers change nothing."""
         self._places.pop(player, None)
 
     def late(self) -> dict[str, int]:
-        """How many steps of the episode found a policy late, by player."""
+        """By player, in how many steps of the episode its policy was late."""
         return {name: place.late for name, place in self._places.items() if place.late}
 
     def asks(self, view: View, steps: int, now: float) -> list[AskPolicy]:
-        """What is to be asked now that `steps` steps of the episode were taken."""
+        """What to ask the policies after `steps` steps of the episode."""
         due = self._seconds is not None or steps % self._frame_skip == 0
         found = []
         for name, place in self._places.items():
@@ -135,7 +135,7 @@ class Policies:
         return found
 
     def ask(self, player: str, view: View, steps: int, now: float) -> AskPolicy:
-        """What this player's policy is to be asked now."""
+        """What to ask this player's policy now."""
         place = self._places[player]
         self._asks += 1
         place.asked, place.asked_at, place.asked_after, place.answer = self._asks, now, steps, None
@@ -143,7 +143,7 @@ class Policies:
         return AskPolicy(player, self._asks, view.observations.get(player), view.infos.get(player), place.mask)
 
     def acted(self, player: str, ask_id: int, action: Any) -> str | None:
-        """The policy has answered. What is wrong with the answer, in words; None if nothing is, or nobody waits."""
+        """The policy has answered. Return what is wrong with the answer; None if it is right, or came too late."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return None
@@ -163,7 +163,7 @@ class Policies:
         return None
 
     def failed(self, player: str, ask_id: int) -> bool:
-        """The policy has raised an error; whether anything waits for this answer."""
+        """The policy has raised an error. Return whether its answer was awaited."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return False
@@ -173,7 +173,7 @@ class Policies:
         return True
 
     def idles(self, player: str) -> bool:
-        """Whether the policy is asked no more in this episode."""
+        """Whether the policy is not asked any more in this episode."""
         return self._places[player].idles
 
     def advise(self, player: str, action: int) -> None:
@@ -231,13 +231,13 @@ class Policies:
         return _idle(player, mask, "late", place.asked_after)  # it has observed this all the same, and may remember it
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
-        """A turn begins: programs have their time from now on, and nothing counts that was chosen before."""
+        """A turn begins: programs have their time from now on. What was chosen before does not count."""
         for name, place in self._places.items():
             if name in to_act and place.player.by_program:
                 place.asked_at, place.answer = now, None
 
     def until(self, waiting: Sequence[str]) -> float | None:
-        """When the time of one of these players is over; None if none of them is a policy."""
+        """When the time for the answers of these players is over; None if none of them is a policy."""
         return min((self._until(self._places[name]) for name in waiting if name in self._places), default=None)
 
     def _until(self, place: _Place) -> float:

@@ -92,7 +92,7 @@ class _Member:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What the project says: seconds, milliseconds, numbers."""
+    """The project's numbers for presence, in the units of config.yml: seconds and milliseconds."""
 
     absent: float
     gather: float
@@ -103,7 +103,7 @@ class Rules:
 
 @dataclass(slots=True)
 class Presence:
-    """All members of a session, by their player."""
+    """The presence of all members of a session, by their player."""
 
     rules: Rules
     players: Sequence[str]
@@ -132,7 +132,7 @@ class Presence:
     # ---- what happens
 
     def come(self, player: str, now: float) -> Literal["joined", "returned"]:
-        """The member has connected. One whose time was over plays again."""
+        """The member has connected. If their time was over, they play again."""
         self._give_time_back(now)
         member = self._members[player]
         returned, member.met = member.met, True
@@ -178,7 +178,7 @@ class Presence:
         return self._members[player].hidden
 
     def goes_on(self, player: str, now: float) -> None:
-        """The member has gone on from the page; they have also had enough of a pause."""
+        """The member goes on from the page, and from a pause."""
         self._members[player].gone_on = True
         self.paused = False
         if self._page_until is None:
@@ -209,18 +209,18 @@ class Presence:
         return sum(each * 1000 > self.rules.max_ping for each in member.samples)
 
     def page(self) -> None:
-        """A break begins: nobody has gone on from it."""
+        """A break begins: no member has gone on from it yet."""
         self._page_until = None
         for member in self._members.values():
             member.gone_on = False
         self._tell()
 
     def refused(self, player: str) -> None:
-        """An earlier server has refused the member for their round trip."""
+        """An earlier server has refused the member, because their round trip took too long."""
         self._members[player].over = "ping"
 
     def has_left(self, player: str) -> None:
-        """On an earlier server, the game has ended because the member stayed away."""
+        """An earlier server has ended the game, because the member stayed away."""
         self._members[player].over = "absent"
 
     # ---- what follows
@@ -244,7 +244,7 @@ class Presence:
             self._changed(now)
 
     def may_play(self, now: float, *, on: bool) -> bool:
-        """Whether the game may be on now. If it is not `on`, the countdown comes first, from when this is asked."""
+        """Whether the game may be on now. If it was not `on`, the countdown begins with this call."""
         if not self.complete or self.paused or self._held_by_page(now):
             self._give_time_back(now)
             self._on_since = None
@@ -270,17 +270,17 @@ class Presence:
 
     @property
     def complete(self) -> bool:
-        """No member is waited for, and one at least is here."""
+        """Whether no member is waited for, and at least one is here."""
         members = self._members.values()
         return any(one.here for one in members) and not any(one.missing for one in members)
 
     @property
     def waits(self) -> bool:
-        """A member waits for the game."""
+        """Whether a member waits for the game."""
         return any(one.takes_part for one in self._members.values())
 
     def all_gone_on(self, now: float) -> bool:
-        """All who are here have gone on from the page, or the others have waited long enough for the rest."""
+        """Whether all who are here have gone on from the page, or have been waited for long enough."""
         if self._page_until is None:
             return False
         return now >= self._page_until or all(one.gone_on for one in self._members.values() if one.here)
@@ -289,16 +289,16 @@ class Presence:
         return self.reads and not self.all_gone_on(now)
 
     def time_left(self, player: str) -> float:
-        """Seconds for which the others would wait for the member from now on: none if no absence is left to them."""
+        """Seconds for which the others would wait for the member from now on; 0 if the member has used them up."""
         left = self._members[player].waiting.left
         return left if left >= self._least else 0.0
 
     def over(self, player: str) -> Over | None:
-        """Why the member does not play any more; None if they do."""
+        """Why the member does not play any more; None if they play."""
         return self._members[player].over
 
     def all_refused(self) -> bool:
-        """Nobody is left who could play."""
+        """Whether no member is left who may play."""
         return all(one.over == "ping" for one in self._members.values())
 
     # ---- what is told
@@ -330,7 +330,7 @@ class Presence:
         return min(self._until(now, reads=on_break), counts, *measuring)
 
     def round_trips(self) -> dict[str, int]:
-        """The median of each member's last samples in milliseconds, of those who have some."""
+        """By player, the median of the member's last samples in milliseconds, for those who have samples."""
         return {one.player: round(_median(one.samples) * 1000) for one in self._members.values() if one.samples}
 
     def _until(self, now: float, *, reads: bool) -> float:

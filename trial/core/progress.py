@@ -95,7 +95,7 @@ class Progress:
         return self.episode_scores[self.first]
 
     def resume(self, ended: Sequence[Episode]) -> None:
-        """Begin after these episodes, which an earlier server saw. Before anything is played."""
+        """Begin after these episodes, which an earlier server has seen. Called before anything is played."""
         for episode in ended:
             self.episodes_played += episode.steps > 0
             self.total_steps += episode.steps
@@ -114,7 +114,7 @@ class Progress:
                 scores[player] += score
 
     def replayed(self, steps: int, scores: Mapping[str, float]) -> None:
-        """The episode stands where an earlier server left it."""
+        """The episode has reached the step at which the earlier server left it."""
         self.needs_reset = self.frozen = False
         self.steps = steps
         self.total_steps += steps
@@ -127,7 +127,7 @@ class Progress:
 
     @property
     def stands(self) -> bool:
-        """The episode's first picture is shown and stands."""
+        """Whether the episode's first picture is shown and still stands."""
         return self.frozen and self.playing and not self.needs_reset
 
     @property
@@ -168,7 +168,7 @@ class Progress:
             self.state = PlayState.PAUSED
 
     def partner_left(self) -> None:
-        """End the trial for all members of the session, because one of them stays away."""
+        """End the trial for all members of the session, because a member stays away."""
         self._end_all(PARTNER_LEFT, PARTNER_LEFT)
 
     def _hold(self, why: str) -> None:
@@ -199,7 +199,7 @@ class Progress:
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
     def act(self, name: str, held: bool | None, *, lasts: bool = False, player: str | None = None) -> None:
-        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for other names.
+        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for unknown names.
 
         With `lasts` it is an action that acts until the next one, also over pauses and episodes; one of an unknown
         name ends the one before. Turn by turn, each press and each key that goes down is a choice; it does nothing if
@@ -221,7 +221,7 @@ class Progress:
             self._end_episode("turnSeconds")
 
     def to_act(self, player: str) -> bool:
-        """Turn by turn: whether it is the player's turn, and they have not chosen."""
+        """Turn by turn: whether it is this player's turn, and they have not chosen."""
         return self.playing and self.turns is not None and self.turns.waits_for(player)
 
     # ---- steps
@@ -232,19 +232,19 @@ class Progress:
         self.needs_reset = False
 
     def thaw(self) -> None:
-        """The first picture has stood long enough: keys act, those that are held now too."""
+        """The first picture has stood long enough: from now on keys act, also those that are held already."""
         self.frozen = False
         self.choices.forget_taps()
 
     def time_over(self) -> None:
-        """The episode has been played for `episodeSeconds`, and no step is due that could be its last."""
+        """`episodeSeconds` are over, and no step is due that could be the episode's last one."""
         self._good_episodes += 1
         self._end_episode("truncated", "episodeSeconds")
 
     def stepped(
         self, rewards: Mapping[str, float], terminated: bool, truncated: bool, limit: str | None = None
     ) -> None:
-        """A step was taken. `limit` is the key of `trial` that makes it the episode's last one, if there is one."""
+        """A step was taken. `limit`: the key of `trial` that ends the episode with this step, if there is one."""
         if self.over:
             return
         self.steps += 1
@@ -260,7 +260,7 @@ class Progress:
             self._end_episode("terminated" if terminated else "truncated", None if own else limit)
 
     def failed(self, *, fatal: bool = False) -> None:
-        """The researcher's code raised an error (or, `fatal`, will never answer)."""
+        """The researcher's code raised an error. `fatal`: it will never answer."""
         if self.over:
             return
         self._failures += 1

@@ -15,7 +15,7 @@ _LONGEST_ERROR = 2000
 
 
 class Recording:
-    """One recording after the other: lines can be written while one `is_open`."""
+    """The recordings of a trial, one after the other. Lines can be written while one `is_open`."""
 
     def __init__(self, emit: Callable[[Effect], None]) -> None:
         self._emit = emit
@@ -25,17 +25,17 @@ class Recording:
         self._said: set[str] = set()  # of policies
 
     def ask(self, progress: Progress, seed: int) -> None:
-        """Have a recording opened, which begins with the present episode."""
+        """Ask the shell to open a recording, which begins with the present episode."""
         self.is_awaited = True
         players = tuple(progress.players.values()) if progress.several else ()
         self._emit(OpenRecording(progress.episode, seed, progress.frame_rate, progress.action_space, players))
 
     def opened(self) -> None:
-        """It is open."""
+        """The recording is open."""
         self.is_open, self.is_awaited = True, False
 
     def failed(self) -> None:
-        """It cannot be opened."""
+        """The recording cannot be opened."""
         self.is_awaited = False
 
     def close(self) -> None:
@@ -67,5 +67,5 @@ class Recording:
 
 
 def words_of(error: Exception) -> str:
-    """The type of an error and its message, at most so much as a line may hold."""
+    """The type of an error and its message, shortened to what a line may hold."""
     return "".join(traceback.format_exception_only(error)).strip()[:_LONGEST_ERROR]

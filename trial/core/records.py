@@ -14,7 +14,7 @@ from trial.core.progress import Progress
 def end(
     over: Episode | Break, said: Sequence[Mapping[str, Any]], outcomes: Mapping[str, str | None] | None = None
 ) -> RecordLine:
-    """The line that ends an episode or a break. `said` are the participant's messages since the line before.
+    """The line that ends an episode or a break. `said`: the participant's messages since the line before.
 
     `outcomes`: in a session, by player, how the trial has ended with it for each member.
     """
@@ -35,7 +35,7 @@ def shutdown(progress: Progress, said: Sequence[Mapping[str, Any]]) -> RecordLin
 
 
 def answers(progress: Progress, seconds: float, trial_id: str) -> dict[str, Any]:
-    """The answer of the step. `seconds` is how long was played."""
+    """The answer of the step. `seconds`: how long was played."""
     return {
         "episodes": progress.episodes_played,
         **_scores(progress.score, progress.scores if progress.several else {}),
@@ -57,7 +57,7 @@ def member_answers(
 def result(
     progress: Progress, player: str, answers: Mapping[str, Any] | None, *, in_session: bool
 ) -> tuple[int, float, str | None]:
-    """What a client is told of the trial that is over: episodes, the player's score, and in a session the outcome.
+    """What a client is told when the trial is over: episodes, the player's score, and in a session the outcome.
 
     `answers` is the answer, if it is known: of the participant, or of the member.
     """
@@ -69,7 +69,7 @@ def result(
 
 
 def number(over: Episode | Break) -> int:
-    """The number of the episode that is over, or of the one before the break."""
+    """The number of the episode that is over; of a break, that of the episode before it."""
     return over.after if isinstance(over, Break) else over.number
 
 

@@ -9,6 +9,6 @@ SEEDS = 2**31
 
 
 def policy_seed(episode_seed: int, player: str) -> int:
-    """The seed of a player's policy in an episode; the same for the same two, on every machine and in every version."""
+    """The seed of a player's policy in an episode. It depends on its arguments alone, on every machine and version."""
     digest = hashlib.sha256(f"{episode_seed}\0{player}".encode()).digest()
     return int.from_bytes(digest[:8], "big") % SEEDS

@@ -143,13 +143,13 @@ class Session:
         self._record(player, what)
 
     def go(self, player: str, now: float, *, closing: bool) -> None:
-        """The member has gone, also while the server is `closing`: let go of their keys."""
+        """The member has left, or the server is `closing`: let go of their keys."""
         self._progress.choices.let_go(player)
         self.presence.go(player, now)
         self._record(player, "left")
 
     def stalls(self, player: str, now: float) -> bool:
-        """The member's page has stopped answering, as if they had gone. Return whether they were here until now."""
+        """The member's page has stopped answering: treat them as gone. Return whether they were here until now."""
         new = self.presence.stalls(player, now)
         if new:
             self._turned_away(player)
@@ -168,7 +168,7 @@ class Session:
             self._turned_away(player)
 
     def receive(self, player: str, message: messages.Message, window: Window, now: float) -> bool:
-        """A message has come; whether it is read: not from a member whose round trip was too long."""
+        """A message has come. Return whether it is read: not if the member's round trip was too long."""
         if self.presence.over(player) == "ping":
             return False
         if message.hidden is not None:
@@ -193,7 +193,7 @@ class Session:
         self.presence.goes_on(player, now)
 
     def stop(self, player: str) -> None:
-        """A member is to end the game for all, after the step that is being taken."""
+        """A member ends the game for all, after the step that is being taken."""
         self._stopped.add(player)
 
     def stopped(self) -> None:
@@ -220,7 +220,7 @@ class Session:
     # ---- what follows
 
     def attend(self, now: float, seconds: float) -> None:
-        """Bring the game into line with who is here, and tell those for whom it is over. No step is being taken.
+        """Hold the game, or let it go on, as the members are there; tell those for whom it is over. Not during a step.
 
         `seconds` were played.
         """
@@ -256,7 +256,7 @@ class Session:
 
     @property
     def settled(self) -> bool:
-        """The game is on, and nothing has changed since it was decided that it may be. So it is at most steps."""
+        """Whether the game is on, and nothing has changed since that was decided, as at most steps."""
         return self._settled == self.presence.version and self._progress.playing
 
     def _begin(self) -> None:
@@ -317,7 +317,7 @@ class Session:
     # ---- recordings and answers
 
     def answer(self, seconds: float, *, played: bool) -> SaveAnswer:
-        """What is to be stored: the answer of each member for whom the trial is over only now, by their id.
+        """What to store: by id, the answers of the members for whom the trial is over only now.
 
         `seconds` were played. Without answers if the game could not be `played`.
         """
@@ -347,7 +347,7 @@ class Session:
         return PARTNER if outcome == "stopped" and self._stopped and player not in self._stopped else outcome
 
     def of_reset(self) -> dict[str, Any]:
-        """More for the line of a reset."""
+        """Further fields for the line of a reset."""
         trips = self.presence.round_trips()
         replaced = sorted(self._replaced)
         return {**({"roundTrip": trips} if trips else {}), **({"standIns": replaced} if replaced else {})}
@@ -370,7 +370,7 @@ class Session:
     # ---- what members are told
 
     def wake_at(self, now: float) -> float | None:
-        """When to call `attend` again if nothing happens; None: there is no need to."""
+        """When to call `attend` again if nothing happens; None if there is no need to."""
         progress = self._progress
         if progress.over or self.settled:
             return None
@@ -378,7 +378,7 @@ class Session:
         return wake_at if wake_at < math.inf else None
 
     def state(self) -> Hashable:
-        """Changes whenever members are to be told of each other again."""
+        """A value that changes whenever members are to be told of each other again."""
         return self.presence.version, self._progress.choices.waits_for
 
     def told(self, now: float) -> dict[str, Any]:
@@ -394,7 +394,7 @@ class Session:
         return said
 
     def sentence(self, player: str) -> str | None:
-        """Why the game is over for this member, in words; None if it is not, or needs none."""
+        """The words that tell this member why the game is over; None if it is not, or if no words are needed."""
         over = self.presence.over(player)
         if over == "ping":
             return PING

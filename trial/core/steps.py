@@ -15,7 +15,7 @@ from trial.settings import Settings
 
 
 class Steps:
-    """Takes one step after the other. The caller says when, and makes the calls of the agent that this returns."""
+    """Takes steps, one after the other. The caller says when, and makes the calls of the agent that are returned."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class Steps:
         self._emit = emit
 
     def take(self, progress: Progress, now: float) -> StepCall:
-        """The call that takes the step that is due, with the messages and the feedback since the step before."""
+        """Return the call that takes the step that is due, with the messages and the feedback since the last step."""
         said, dropped = self._message_log.messages, self._message_log.take_dropped()
         fields: dict[str, Any] = {
             "episode": progress.episode,
@@ -72,7 +72,7 @@ class Steps:
         self.show(begun, progress, now)
 
     def show(self, found: Begun | Replayed, progress: Progress, now: float) -> None:
-        """Show where the episode begins or goes on."""
+        """Show the picture with which the episode begins or goes on."""
         self._see(found.view, progress, now)
         self._clients.show(found.pictures)
 

@@ -16,7 +16,7 @@ from trial.core.progress import Progress
 
 
 class Due(Enum):
-    """What is to be done now. MORE: the progress has changed, so ask again."""
+    """What is due now. MORE: the progress has changed, so ask again."""
 
     NOTHING = "nothing"
     MORE = "more"
@@ -25,7 +25,7 @@ class Due(Enum):
 
 
 class StateTimes(NamedTuple):
-    """Seconds that are left: of a break, of a turn, of the first picture, of the episode. None: there is none.
+    """Seconds that are left: of a break, a turn, the first picture, the episode. None: it does not run, or never ends.
 
     `session` is what the members of a session are told of each other.
     """
@@ -44,7 +44,7 @@ class Pacer:
         self._due: float | None = None
 
     def rest(self) -> None:
-        """Forget the rhythm: the next frame is due at once."""
+        """Forget when the last frame was due: the next one is due at once."""
         self._due = None
 
     def next(self, now: float, rate: int) -> float:
@@ -61,7 +61,7 @@ class Pacer:
 
 
 class Timing:
-    """The times of one trial. It lets breaks, first pictures, turns and episodes end when their time is over."""
+    """The times of one trial. It ends breaks, first pictures, turns and episodes whose time is over."""
 
     def __init__(self, config: Trial) -> None:
         self.seconds = 0.0
@@ -79,11 +79,11 @@ class Timing:
     # ---- what has happened
 
     def begin_episode(self) -> None:
-        """An episode begins: its first picture is to stand."""
+        """An episode begins: its first picture stands for a while."""
         self._episode.begin()
 
     def resume_episode(self, played: float) -> None:
-        """The episode was played for so long on an earlier server, and goes on."""
+        """The episode goes on. It was played for so many seconds on an earlier server."""
         self._episode.go_on(played)
 
     def skip(self) -> None:
@@ -193,7 +193,7 @@ class Timing:
         return Due.STEP
 
     def limit_of_step(self, progress: Progress, now: float) -> str | None:
-        """The key of `trial` that makes the step that begins now the episode's last one, if there is one."""
+        """The key of `trial` whose limit this step reaches, so that it is the episode's last one; None if none."""
         if self._max_steps and progress.steps + 1 >= self._max_steps:
             return "maxSteps"
         left = self._episode.left(now)
@@ -203,7 +203,7 @@ class Timing:
     # ---- what clients are told
 
     def told(self, progress: Progress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
-        """The seconds that are left of all that ends by its time, beside what is told of the `session`."""
+        """All seconds that are left, and what is told of the `session`."""
         return StateTimes(
             next_in=self._break_left(progress, now),
             turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),

@@ -133,33 +133,33 @@ class Trial:
 
     @property
     def broken(self) -> bool:
-        """The game could not even begin: there is no frame, and there will be no answer. Certain once it is `ready`."""
+        """Whether the game could not begin: no frame came, and no answer will. Certain once it is `ready`."""
         return self.progress.outcome == "failed" and self._clients.pictures is None
 
     @property
     def finished(self) -> bool:
-        """All recordings and the answer are stored."""
+        """Whether all recordings and the answer are stored."""
         return self.phase is Phase.FINISHED
 
     @property
     def played(self) -> bool:
-        """The game is over and recorded; the store may not have taken everything."""
+        """Whether the game is over and recorded. The store may still lack a part of it."""
         return self.finished or (self.progress.over and self._ending.all_written)
 
     @property
     def done(self) -> bool:
-        """Nothing happens any more."""
+        """Whether nothing will happen any more."""
         return self.phase in (Phase.FINISHED, Phase.CLOSED)
 
     @property
     def saving(self) -> bool:
-        """The trial is over, and not everything is stored."""
+        """Whether the trial is over, and not everything is stored."""
         return self.progress.over and not self.finished
 
     # ---- events: the start
 
     def already_played(self, answers: Mapping[str, Any]) -> list[Effect]:
-        """An earlier server stored this answer of the step. In a session: those of all members, by their ids."""
+        """An earlier server has stored this answer of the step; in a session, those of all members, by their ids."""
         self._earlier_answers = answers
         self.phase = Phase.FINISHED
         self.ready = True
@@ -250,7 +250,7 @@ class Trial:
         return self.advance(now)
 
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
-        """A connection is closed. The game is held until its human starts it again."""
+        """A connection was closed. The game is held until its human starts it again."""
         self._now = now
         client = self._clients.remove(connection)
         if client is None:
@@ -267,7 +267,7 @@ class Trial:
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
-        """A client's message. One from a connection that was replaced changes nothing."""
+        """A client has sent a message. If its connection was replaced, that changes nothing."""
         self._now = now
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
@@ -288,7 +288,7 @@ class Trial:
     # ---- events: the agent
 
     def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:
-        """The agent's call came back. One that was given up changes nothing."""
+        """A call of the agent has returned. If it was given up before, that changes nothing."""
         if not self._agent.has_ended(call):
             return []
         self._now = now
@@ -304,7 +304,7 @@ class Trial:
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
-        """The agent's call raised this error; AgentTimeout: it has not come back."""
+        """A call of the agent has raised this error. AgentTimeout: it has not returned in time."""
         hangs = isinstance(error, AgentTimeout)
         if not self._agent.has_ended(call, hangs=hangs):
             return []
@@ -331,7 +331,7 @@ class Trial:
     # ---- events: policies
 
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
-        """The player's policy chose this action. An answer to an earlier question changes nothing."""
+        """The player's policy has chosen this action. An answer to an earlier question changes nothing."""
         self._now = now
         wrong = self.progress.choices.policies.acted(player, ask_id, action)
         if wrong is not None:
@@ -356,7 +356,7 @@ class Trial:
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
-        """The recording cannot be opened: nothing is played that is not recorded."""
+        """The recording cannot be opened, so the game ends: nothing is played that is not recorded."""
         self._now = now
         self._recording.failed()
         self._fail(fatal=True)
@@ -376,7 +376,7 @@ class Trial:
         return [Log(logging.INFO, text), *self._take_effects()]
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
-        """The member's answer is stored: they go on, whatever the others do, or wait for."""
+        """The member's answer is stored: they go on to the next step, whatever the others do."""
         self._now = now
         self._participants.saved(human)
         for each, client in self._clients.by_human():
@@ -387,7 +387,7 @@ class Trial:
     # ---- events: time
 
     def advance(self, now: float) -> list[Effect]:
-        """Do all that can be done at this time. Every other event does this, too."""
+        """Do everything that is due at this time. Every other event does this, too."""
         self._now = now
         self.wake_at = None
         self._agent.give_up(now)
@@ -404,7 +404,7 @@ class Trial:
         return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
-        """The server must end: stop where the game stands. There is no answer unless the trial is over."""
+        """The server must end: end the game where it stands. There is no answer unless the trial is over."""
         self._closing = self._commands.closed = self._ending.closing = True
         if self._agent.call is not None:
             self._agent.give_up_at = now + LAST_CALL_SECONDS

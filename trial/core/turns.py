@@ -9,7 +9,7 @@ from trial.core.actions import Action
 
 
 class Turns:
-    """One turn after the other. `seconds` is what the humans have for each; 0: no limit."""
+    """The turns of a game, one after the other. `seconds`: the time of the humans for each; 0: no limit."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -19,7 +19,7 @@ class Turns:
         self.chosen: dict[str, Action] = {}
 
     def begin(self, to_act: frozenset[str]) -> None:
-        """A turn begins. Its clock stands until `run`."""
+        """A turn begins. Its time does not run before `run`."""
         self.to_act = to_act
         self.chosen = {}
         self._left, self._since = self._seconds, None
@@ -34,23 +34,23 @@ class Turns:
         return len(self.chosen) < len(self.to_act)
 
     def choose(self, player: str, action: Action) -> None:
-        """The player chose; what they chose before stays."""
+        """The player chooses. A choice that they made before in this turn stays."""
         if self.waits_for(player):
             self.chosen[player] = action
 
     def run(self, now: float) -> None:
-        """The game is on: the clock of the turn runs."""
+        """The game is on: the time of the turn runs."""
         if self._since is None:
             self._since = now
 
     def hold(self, now: float) -> None:
-        """The game is held: the clock of the turn stands."""
+        """The game is held: the time of the turn does not run."""
         self._left, self._since = self.left(now), None
 
     def left(self, now: float) -> float:
-        """Seconds that are left. Means nothing without a limit."""
+        """Seconds that are left in this turn. Without a limit the number means nothing."""
         return self._left if self._since is None else self._left - (now - self._since)
 
     def ends_in(self, now: float) -> float | None:
-        """Seconds that are left, from 0; None if there is no limit."""
+        """Seconds that are left in this turn, from 0; None if there is no limit."""
         return max(0.0, self.left(now)) if self._seconds else None

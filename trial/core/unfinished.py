@@ -51,7 +51,7 @@ class UnfinishedEpisode:
 
     @property
     def scores(self) -> dict[str, float]:
-        """Of all players, if there are several."""
+        """The scores of all players, if there are several."""
         found: dict[str, float] = {}
         for step in self.steps:
             for player, part in step.players.items():
@@ -60,7 +60,7 @@ class UnfinishedEpisode:
 
     @property
     def going_on(self) -> dict[str, int]:
-        """By player, the action of the last step, where a policy chose it in that step or in an earlier one."""
+        """By player, its last action, if a policy chose that in the last step or in an earlier one."""
         chosen: dict[str, int | None] = {}
         for step in self.steps:
             looked = {player: part for player, part in step.players.items() if part.observed is not None}
@@ -74,7 +74,7 @@ class UnfinishedEpisode:
 
     @property
     def failures(self) -> dict[str, int]:
-        """By player, how often its policy failed in a row, up to the end.
+        """By player, how often its policy failed in a row at the end.
 
         What it looked at stands in a step that a policy failed for. An action that had become illegal when it came
         looks alike; but after that the policy is asked again, and one that idles is not.
@@ -97,7 +97,7 @@ class UnfinishedEpisode:
 
 @dataclass(slots=True)
 class RecordedTrial:
-    """All that was recorded: the episodes that are over, an interrupted one if there is, and the seconds they took."""
+    """What was recorded: the episodes that are over, an interrupted one if there is one, and the seconds of all."""
 
     ended: list[Episode] = field(default_factory=list)
     unfinished: UnfinishedEpisode | None = None

@@ -21,7 +21,7 @@ __all__ = ["Image", "Plan", "build", "plan"]
 
 @dataclass(frozen=True)
 class Plan:
-    """What a project's image must hold, and whether there is one already (`uri`, by its digest)."""
+    """What a project's image must hold, and the image's `uri` (by its digest) if there is one already."""
 
     content: str  # the tag that says what is in it
     bundle: Bundle
@@ -31,7 +31,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Image:
-    """An image in the repository: `uri` names it by its digest. `built`: it was made just now."""
+    """An image in the repository, by its digest. `built`: it was built just now."""
 
     uri: str
     content: str
@@ -63,7 +63,7 @@ def plan(
 
 
 def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> Image:
-    """The image of the plan: that which is there, or a new one. Raises `Problem`.
+    """Return the image of the plan, and build it if there is none. Raises `Problem`.
 
     Built by the Docker of this machine, or by CodeBuild where there is none or `on_aws`.
     """

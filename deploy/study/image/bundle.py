@@ -32,13 +32,13 @@ _COMMENT = re.compile(r"(^|\s+)#.*$")
 
 @dataclass(frozen=True)
 class Bundle:
-    """What an image is made of: name in the build context → file, or bytes."""
+    """The files of an image's build context: by name there, a file or bytes."""
 
     entries: Mapping[str, Path | bytes]
 
     @property
     def hash(self) -> str:
-        """Twelve hex digits that are the same for the same content, wherever it lies."""
+        """Twelve hex digits that depend on the content alone."""
         digest = hashlib.sha256()
         for name, entry in sorted(self.entries.items()):
             inner = hashlib.sha256()
@@ -49,7 +49,7 @@ class Bundle:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """The size of all files, in bytes."""
         return sum(len(entry) if isinstance(entry, bytes) else entry.stat().st_size for entry in self.entries.values())
 
     def write_folder(self, folder: Path) -> None:

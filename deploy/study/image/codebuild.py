@@ -34,7 +34,7 @@ _PHASES = {
 
 
 def source_key(content: str) -> str:
-    """Where the source bundle lies in the data bucket."""
+    """The key of the source bundle in the data bucket."""
     return f"_builds/{content}.zip"
 
 
@@ -47,7 +47,7 @@ class Builder:
     bucket: str
 
     def build(self, order: Order) -> None:
-        """Build and push, or join the build of the same image that runs already. Raises `Problem` if it fails."""
+        """Build and push the image, or follow a build of it that runs already. Raises `Problem` if it fails."""
         running = self._running(order)
         if running:
             screen.info("A build of the same content is running already; joining it.")

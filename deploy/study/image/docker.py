@@ -19,7 +19,7 @@ PATIENCE = 15  # seconds for an answer of the engine
 
 
 def available() -> bool:
-    """Whether an engine answers, and buildx is there. The command alone (as on many machines) is not enough."""
+    """Whether a Docker engine answers and buildx is installed. The command `docker` alone is not enough."""
     if shutil.which("docker") is None:
         return False
     for question in (["docker", "version", "--format", "{{.Server.Version}}"], ["docker", "buildx", "version"]):
@@ -33,7 +33,7 @@ def available() -> bool:
 
 
 def build(order: Order) -> None:
-    """Build and push. Raises `Problem` with the log's last lines. What docker has done it keeps for the next run."""
+    """Build and push. Raises `Problem` with the log's last lines. Docker keeps finished layers for the next run."""
     _login(order.repository)
     command = ["docker", "buildx", "build", "--platform", "linux/amd64", "--provenance=false", "--progress", "plain"]
     command += ["--build-arg", "BUILDKIT_INLINE_CACHE=1"]

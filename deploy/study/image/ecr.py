@@ -43,7 +43,7 @@ class Repository:
 
     @property
     def registry(self) -> str:
-        """The host, which `docker login` wants."""
+        """The repository's host, for `docker login`."""
         return self.uri.partition("/")[0]
 
     @property
@@ -51,7 +51,7 @@ class Repository:
         return self.uri.partition("/")[2]
 
     def images(self) -> Images:
-        """What is there now: one DescribeImages for up to 1,000. Raises `Problem` if the repository is gone."""
+        """The present images: a DescribeImages for each 1,000. Raises `Problem` if the repository is gone."""
         found: list[Tagged] = []
         pages = self._client.get_paginator("describe_images").paginate(
             repositoryName=self.name, filter={"tagStatus": "TAGGED"}, PaginationConfig={"PageSize": 1000}
@@ -71,7 +71,7 @@ class Repository:
         return Images(self.uri, sorted(found))
 
     def password(self) -> str:
-        """What `docker login` takes for the user AWS; good for twelve hours."""
+        """The password of the user AWS for `docker login`; valid for twelve hours."""
         given = self._client.get_authorization_token()["authorizationData"][0]["authorizationToken"]
         return base64.b64decode(given).decode().partition(":")[2]
 
@@ -93,7 +93,7 @@ class Images:
         return f"{self.uri}@{same[-1].digest}" if same else None
 
     def tagged(self, tag: str) -> str | None:
-        """The image of this very tag as uri@digest."""
+        """The image with this tag, as uri@digest; None if there is none."""
         return next((f"{self.uri}@{image.digest}" for image in self.found if image.tag == tag), None)
 
     def next_tag(self, content: str) -> str:
@@ -102,12 +102,12 @@ class Images:
         return f"{content}.{most + 1}" if most else content
 
     def alike(self, project_id: str) -> str:
-        """The image (uri:tag) whose layers a new one of this project is most likely to share; "" if there is none."""
+        """The image (uri:tag) with which a new one of this project probably shares most layers; "" if there is none."""
         own = re.compile(re.escape(content_tag(project_id, "")) + r"[0-9a-f]{12}")
         best = max(self.found, key=lambda image: (own.fullmatch(image.content) is not None, image), default=None)
         return f"{self.uri}:{best.tag}" if best else ""
 
 
 def content_tag(project_id: str, content: str) -> str:
-    """The tag of a project's image with that content. A tag cannot begin with a dash, as a project's id may."""
+    """The tag of a project's image with this content. A tag cannot begin with a dash, as a project's id may."""
     return f"{'x' if project_id.startswith('-') else ''}{project_id}-{content}"

@@ -52,7 +52,7 @@ def project_files(folder: Path) -> dict[str, Path]:
 
 
 def inside(folder: Path, path: Path) -> bool:
-    """Whether what the path leads to, through links too, lies in the folder."""
+    """Whether the path leads into the folder, also through links."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # a link that leads to itself
@@ -77,7 +77,7 @@ class Ignore:
 
     @classmethod
     def of(cls, folder: Path) -> Ignore:
-        """That of the folder; nothing is ignored if there is none. Raises `Problem` if it cannot be read."""
+        """The `.dockerignore` of the folder; without one, nothing is ignored. Raises `Problem` if it cannot be read."""
         file = folder / ".dockerignore"
         try:
             return cls(file.read_text(encoding="utf-8-sig").splitlines() if file.is_file() else [])

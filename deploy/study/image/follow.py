@@ -49,7 +49,7 @@ _ADVICE: tuple[tuple[str, str], ...] = (
 
 
 class Log:
-    """The lines of a build: shown, and the last ones kept."""
+    """The lines of a build. They are shown, and the last ones kept."""
 
     def __init__(self, show: Callable[[str], None] | None = None) -> None:
         self._show = show or (lambda line: screen.info(f"  {line}", style="dim"))
@@ -63,7 +63,7 @@ class Log:
                 self._show(line)
 
     def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
-        """The problem to raise, with the lines that tell of errors (or else the last ones), and what to do."""
+        """The problem to raise, with the lines on errors (or else the last ones), and what to do."""
         more, lines = list(more), list(self._last)
         lacking = _lacking("\n".join(lines))
         if lacking:

@@ -25,5 +25,5 @@ class Order:
         return f"{self.repository.uri}:{self.tag}"
 
     def arrived(self) -> str | None:
-        """The image as uri@digest, if it is in the repository by now."""
+        """The image as uri@digest, if it is in the repository already; else None."""
         return self.repository.images().tagged(self.tag)

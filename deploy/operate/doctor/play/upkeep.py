@@ -59,7 +59,7 @@ class Timer:
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
     def end(self) -> None:
-        """Raises `CheckFailed`."""
+        """Check that the timer has ended the server. Raises `CheckFailed`."""
         scene, platform = self._scene, self._scene.platform
         record = scene.wait(
             self._ready,
@@ -210,7 +210,7 @@ def _subscribed(sns: Any, topic: str) -> int:
 
 
 def times(scene: Scene, records: Iterable[Server]) -> None:
-    """How long AWS took for each stage, beside what the simulation assumes."""
+    """Say how long AWS took for each stage, beside what the simulation assumes."""
     tasks = _tasks(scene, records)
     measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
     for record in records:
@@ -259,7 +259,7 @@ def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
 
 
 def cost(scene: Scene, records: Iterable[Server]) -> None:
-    """What the servers did cost, from their own records."""
+    """Say what the servers did cost, by their own records."""
     sum_ = spent(records, Prices(), datetime.now(UTC), {})
     minutes = sum_.hours * 60
     text = f"About ${sum_.usd.likely:.4f} for {sum_.attempts} servers with {minutes:.0f} minutes together"
