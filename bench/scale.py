@@ -30,7 +30,7 @@ from testing.simulation.cloud import CONCURRENCY, QUOTAS
 from testing.simulation.conditions import Conditions
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import Hippo
-from testing.simulation.people import Person, Visit
+from testing.simulation.people import SimulatedParticipant, Visit
 from testing.simulation.tasks import ADDRESSES
 from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, World
 
@@ -103,7 +103,7 @@ def crowd(
     """So many participants who come within so many seconds, until all of them are through."""
     conditions = conditions or Conditions()
     world = World(seed, conditions, wires=wires, concurrency=concurrency)
-    arrived = [Person(world, number) for number in range(people)]
+    arrived = [SimulatedParticipant(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, within))
     world.settle(HOURS * 3600)
@@ -251,7 +251,7 @@ def costs(came: Crowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
 def many_at_once() -> Iterator[Row]:
     """10,000 servers that run at the same time for an hour."""
     world = World(SEED, project=msgspec.structs.replace(PROJECT, max_runtime=110))
-    people = [Person(world, number, play=3600.0) for number in range(MANY)]
+    people = [SimulatedParticipant(world, number, play=3600.0) for number in range(MANY)]
     for person in people:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, MANY_WITHIN))
     busiest: dict[str, float] = {}

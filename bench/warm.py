@@ -29,7 +29,7 @@ from deploy.cost import estimate
 from deploy.cost.prices import Prices
 from hippodrome.model import ids, server, warm_pool
 from testing.quiet_log import quiet
-from testing.simulation.people import Person
+from testing.simulation.people import SimulatedParticipant
 from testing.simulation.world import PROJECT, World
 from testing.visitors import hidden
 
@@ -69,7 +69,7 @@ def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends
     """Participants who come at these seconds to a study with so many warm servers, which is closed afterwards."""
     world = World(SEED, project=msgspec.structs.replace(PROJECT, warm_servers=warm))
     world.open()
-    people = [Person(world, number, read=READS) for number in range(len(arrivals))]
+    people = [SimulatedParticipant(world, number, read=READS) for number in range(len(arrivals))]
     for person, comes in zip(people, arrivals, strict=True):
         world.clock.spawn(person.walk, delay=comes)
     world.clock.after(closes, world.close)

@@ -8,7 +8,7 @@ says what the functions see of it:
 * `Reach.CALL`: every attempt of one call. botocore gives up, and the port meets the error.
 * `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports try again themselves.
 
-Nothing sleeps: the pauses of botocore and of the ports are added up in `Injector.waited`, each wait at its longest.
+Nothing sleeps: the pauses of botocore and of the ports are added up in `AwsFaultInjector.waited`, each wait at its longest.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Reach(StrEnum):
     SPELL = "the invocation"
 
 
-class Fault(NamedTuple):
+class AwsFault(NamedTuple):
     """The `number`-th call of the functions (from 1) goes wrong."""
 
     number: int
@@ -143,7 +143,7 @@ def reaches(action: str, kind: Kind) -> list[Reach]:
     return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
 
 
-def invisible(fault: Fault, made: Made) -> bool:
+def invisible(fault: AwsFault, made: Made) -> bool:
     """Whether botocore alone should hide the fault from the functions.
 
     It cannot hide the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
@@ -153,7 +153,7 @@ def invisible(fault: Fault, made: Made) -> bool:
     return fault.reach is Reach.ATTEMPT and fault.kind not in (Kind.NOT_NOW, Kind.BROKEN) and not again
 
 
-class Injector:
+class AwsFaultInjector:
     """Counts the calls of one botocore session, and injects `fault` into its call."""
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class Injector:
         self.spot = True  # False: there is no room on Spot
         self.begin(None)
 
-    def begin(self, fault: Fault | None) -> None:
+    def begin(self, fault: AwsFault | None) -> None:
         """Count from 1 again, with this fault."""
         self.fault = fault
         self.calls: list[Made] = []  # so far

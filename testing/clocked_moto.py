@@ -29,7 +29,7 @@ from moto.sqs.models import sqs_backends
 
 from deploy.aws.account import Account, Installation
 from deploy.core.stages import Executor
-from deploy.operate.eraser import Eraser, Found
+from deploy.operate.eraser import Eraser, FoundOfParticipant
 from hippodrome.aws import AwsPlatform
 from hippodrome.config import read_project
 from hippodrome.model import ids, participant, server
@@ -49,7 +49,7 @@ from lambdas import (
 )
 from testing import aws_events, derived, template
 from testing.aws_events import ACCOUNT
-from testing.aws_faults import Fault, Injector
+from testing.aws_faults import AwsFault, AwsFaultInjector
 from testing.clock import Clock
 from testing.moto_world import MotoWorld
 
@@ -119,7 +119,7 @@ class TimedInstallation:
 
     def __enter__(self) -> Self:
         world = self._stack.enter_context(self.world)
-        self.injector = Injector()
+        self.injector = AwsFaultInjector()
         self._stack.enter_context(self.injector.installed())
         # Gap: moto stamps documents with the machine's time. Bridge: with the installation's.
         naive = lambda: self.clock.now().replace(tzinfo=None)  # noqa: E731
@@ -167,7 +167,7 @@ class TimedInstallation:
 
     # A run
 
-    def begin(self, fault: Fault | None = None) -> None:
+    def begin(self, fault: AwsFault | None = None) -> None:
         """Forget the last run: its people, tasks, documents; and start another one with cold functions."""
         now = self._contents()
         for key in now.keys() - self._s3_before.keys():
@@ -355,7 +355,7 @@ class TimedInstallation:
 
     # The administrator
 
-    def erase(self, project: str, user: str) -> Found:
+    def erase(self, project: str, user: str) -> FoundOfParticipant:
         """What `deploy erase` does; time passes while it waits. What the last look found."""
         self.injector.invocation("erase")
         eraser = Eraser(
@@ -445,7 +445,7 @@ class TimedInstallation:
         return sqs_backends[ACCOUNT][self.world.region].queues
 
 
-class Person:
+class VisitorOnMoto:
     """A participant: reads, answers, waits, plays, comes back after trouble. Ends `finished`, or `told` how things are."""
 
     READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where no server answers

@@ -55,7 +55,7 @@ class Call(NamedTuple):
     place: str
 
 
-class Fault(NamedTuple):
+class OsFault(NamedTuple):
     """The `number`-th call of this kind (from 1) goes wrong; `number` is an errno for all but kills."""
 
     call: Call
@@ -107,10 +107,10 @@ class _Off(threading.local):
     deep = 0
 
 
-class Injector:
+class OsFaultInjector:
     """Stands between Python and the system for everything below `root`; spoils the call that `fault` says."""
 
-    def __init__(self, root: Path, fault: Fault | None = None, *, only: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, root: Path, fault: OsFault | None = None, *, only: Callable[[], bool] = lambda: True) -> None:
         self.root = os.path.realpath(root)
         self.fault = fault
         self.calls: Counter[Call] = Counter()

@@ -20,7 +20,7 @@ class Unreachable(ConnectionError):
     """The call was not made, or the function cannot know whether it was."""
 
 
-class Fault(StrEnum):
+class PortFault(StrEnum):
     """What happens at a call."""
 
     ERROR = "is refused"
@@ -34,22 +34,22 @@ class FaultAt(NamedTuple):
     """What happens to a function at the n-th call that it makes, from 1."""
 
     call: int
-    fault: Fault
+    fault: PortFault
 
     def __repr__(self) -> str:
         return f"<call {self.call} {self.fault}>"
 
 
-def call_with_fault(action: str, effect: Callable[[], T], fault: Fault | None) -> T:
+def call_with_fault(action: str, effect: Callable[[], T], fault: PortFault | None) -> T:
     """Make a call with this fault. Raises Crash or Unreachable as it says. A refusal is an answer too, and may be lost."""
-    if fault is Fault.CRASH_BEFORE:
+    if fault is PortFault.CRASH_BEFORE:
         raise Crash(action)
-    if fault is Fault.ERROR:
+    if fault is PortFault.ERROR:
         raise Unreachable(action)
     try:
         return effect()
     finally:
-        if fault is Fault.CRASH_AFTER:
+        if fault is PortFault.CRASH_AFTER:
             raise Crash(action)
-        if fault is Fault.REPLY:
+        if fault is PortFault.REPLY:
             raise Unreachable(action)

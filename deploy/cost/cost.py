@@ -18,7 +18,17 @@ from deploy.aws.resource_names import TAG
 from deploy.core import options, participants
 from deploy.core.server_records import Records
 from deploy.cost.billed import Billed, billed_or_why
-from deploy.cost.estimate import FixedResources, Line, Study, Warm, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.estimate import (
+    CostLine,
+    FixedResources,
+    StudyToEstimate,
+    WarmCost,
+    assumptions,
+    month_lines,
+    study_lines,
+    total,
+    warm,
+)
 from deploy.cost.prices import REGION, Prices, current
 from deploy.cost.spent import Spent, spent
 from hippodrome.model.server import Server
@@ -85,7 +95,7 @@ def _read(folder: Path) -> Config:
         ) from None
 
 
-def _study(config: Config, people: int, minutes: float | None, spot: bool) -> Study:
+def _study(config: Config, people: int, minutes: float | None, spot: bool) -> StudyToEstimate:
     from hippodrome.config.remarks import starts_at_link  # noqa: PLC0415 - as in `_read`
 
     project, trial = config.project, config.trial
@@ -95,7 +105,7 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
             "Give a smaller --minutes, or the project a longer maxRuntime.",
         )
     rate = trial.max_frame_rate if trial.allow_frame_rate_change else trial.starting_frame_rate
-    return Study(
+    return StudyToEstimate(
         participants=people,
         steps=len(config.steps),
         cpu=project.aws_setup.cpu or 1,
@@ -112,7 +122,7 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
     )
 
 
-def _warm_before(config: Config, prices: Prices) -> list[Warm]:
+def _warm_before(config: Config, prices: Prices) -> list[WarmCost]:
     project = config.project
     if not project.warm_servers:
         return []
@@ -128,7 +138,7 @@ def _fixed_resources() -> FixedResources:
         return FixedResources()
 
 
-def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, as_json: bool) -> int:
+def _before(study: StudyToEstimate, waiting: Sequence[WarmCost], prices: Prices, region: str, as_json: bool) -> int:
     lines, monthly = study_lines(study, prices), month_lines(prices, _fixed_resources())
     notes = [*assumptions(study), prices.note(region)]
     if as_json:
@@ -147,17 +157,19 @@ def _before(study: Study, waiting: Sequence[Warm], prices: Prices, region: str, 
         )
         return Exit.DONE
     people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
-    _table(f"The study, {people}", [*lines, Line("Together", "", total(lines))], study.participants)
+    _table(f"The study, {people}", [*lines, CostLine("Together", "", total(lines))], study.participants)
     screen.result("")
     _show_warm(waiting)
-    _table("A month of the installation, even without participants", [*monthly, Line("Together", "", total(monthly))])
+    _table(
+        "A month of the installation, even without participants", [*monthly, CostLine("Together", "", total(monthly))]
+    )
     screen.result("")
     for note in notes:
         screen.result(note)
     return Exit.DONE
 
 
-def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
+def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
     rows = [(line.what, line.amount, *map(_money, (line.usd.low, line.usd.likely, line.usd.high))) for line in lines]
     if people > 1:
         each = lines[-1].usd * (1 / people)
@@ -167,7 +179,7 @@ def _table(title: str, lines: Sequence[Line], people: int = 0) -> None:
     )
 
 
-def _show_warm(waiting: Sequence[Warm]) -> None:
+def _show_warm(waiting: Sequence[WarmCost]) -> None:
     """Print what warm servers cost in an hour: for how long their studies are live is not known."""
     rows: list[Sequence[object]] = []
     for one in waiting:
@@ -300,11 +312,11 @@ def _prices(account: Account) -> Prices:
         raise Problem(f"{error}.", "Leave out --current to reckon with the table of this version.") from None
 
 
-def _line(line: Line) -> dict[str, Any]:
+def _line(line: CostLine) -> dict[str, Any]:
     return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
 
 
-def _warm(one: Warm) -> dict[str, Any]:
+def _warm(one: WarmCost) -> dict[str, Any]:
     hours = {"spotHour": one.spot, "onDemandHour": one.on_demand}
     return {"project": one.project_id, "servers": one.servers, **{name: usd.as_json() for name, usd in hours.items()}}
 

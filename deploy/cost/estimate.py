@@ -42,7 +42,7 @@ UNUSED_AHEAD = 35  # until one that was started ahead of a session is stopped: L
 DNS_QUERIES = Range(4, 10, 40)
 
 
-class Line(NamedTuple):
+class CostLine(NamedTuple):
     """One line of the estimate: what is billed, the likely amount of it, and what it costs."""
 
     what: str
@@ -51,7 +51,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Study:
+class StudyToEstimate:
     """What is known of a study before it is held."""
 
     participants: int
@@ -101,12 +101,12 @@ class Study:
         return Range(self.max_runtime / 4, self.max_runtime / 2, float(self.max_runtime))
 
 
-def study_lines(study: Study, prices: Prices) -> list[Line]:
+def study_lines(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     """What is billed because of participants."""
     return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
 
 
-def _servers(study: Study, prices: Prices) -> list[Line]:
+def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     if not study.games:
         return []
     hours = study.server_minutes * study.servers * (1 / 60)
@@ -117,12 +117,12 @@ def _servers(study: Study, prices: Prices) -> list[Line]:
     size = f"{study.cpu:g} vCPU, {study.memory:g} GB"
     kind = "Fargate Spot" if study.spot else "Fargate"
     return [
-        Line(f"Servers ({kind}, {size})", f"{hours.likely:,.1f} h", hours * machine),
-        Line("Public IPv4 addresses", f"{hours.likely:,.1f} h", hours * address),
+        CostLine(f"Servers ({kind}, {size})", f"{hours.likely:,.1f} h", hours * machine),
+        CostLine("Public IPv4 addresses", f"{hours.likely:,.1f} h", hours * address),
     ]
 
 
-class Warm(NamedTuple):
+class WarmCost(NamedTuple):
     """What an hour of a project's warm servers costs, all together, while they wait: on Spot, and on demand."""
 
     project_id: str
@@ -133,24 +133,24 @@ class Warm(NamedTuple):
     on_demand: Usd
 
 
-def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> Warm:
+def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> WarmCost:
     """What a project's warm servers cost. One costs as much as one that is played on: machine and public address."""
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
-    return Warm(project_id, servers, cpu, memory, spot, on_demand)
+    return WarmCost(project_id, servers, cpu, memory, spot, on_demand)
 
 
-def _functions(study: Study, prices: Prices) -> list[Line]:
+def _functions(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     pages, signed, workers = _page_requests(study), SIGNED * study.servers, WORKERS * study.servers
     http = pages + signed
     gb_seconds = (pages * NEXT_STEP_GB + signed * WORKER_GB) * NEXT_STEP_SECONDS + workers * WORKER_SECONDS * WORKER_GB
     return [
-        Line("Lambda requests", f"{(http + workers).likely:,.0f}", (http + workers) * prices.lambda_request.usd),
-        Line("Lambda time", f"{gb_seconds.likely:,.0f} GB-s", gb_seconds * prices.lambda_gb_second.usd),
-        Line("HTTP API", f"{http.likely:,.0f} requests", http * prices.http_request.usd),
+        CostLine("Lambda requests", f"{(http + workers).likely:,.0f}", (http + workers) * prices.lambda_request.usd),
+        CostLine("Lambda time", f"{gb_seconds.likely:,.0f} GB-s", gb_seconds * prices.lambda_gb_second.usd),
+        CostLine("HTTP API", f"{http.likely:,.0f} requests", http * prices.http_request.usd),
     ]
 
 
-def _small_things(study: Study, prices: Prices) -> list[Line]:
+def _small_things(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
     # A read more for each poll, two to sign.
     reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + SIGNED * 2) * servers + POLLS * study.clients
@@ -161,21 +161,23 @@ def _small_things(study: Study, prices: Prices) -> list[Line]:
     messages = WORKERS * (servers * 3)  # sent, received, deleted
     queries = DNS_QUERIES * servers
     return [
-        Line(
+        CostLine(
             "S3 requests",
             f"{(reads + writes).likely:,.0f}",
             reads * prices.s3_read.usd + writes * prices.s3_write.usd,
         ),
-        Line("SNS", f"{servers * PUBLISHES:,} publishes", Usd.exactly(servers * PUBLISHES * prices.sns_publish.usd)),
-        Line("SQS", f"{messages.likely:,.0f} requests", messages * prices.sqs_request.usd),
-        Line(
+        CostLine(
+            "SNS", f"{servers * PUBLISHES:,} publishes", Usd.exactly(servers * PUBLISHES * prices.sns_publish.usd)
+        ),
+        CostLine("SQS", f"{messages.likely:,.0f} requests", messages * prices.sqs_request.usd),
+        CostLine(
             "EventBridge Scheduler", f"{servers:,} timers at most", Usd(0, 0, servers * prices.scheduler_invocation.usd)
         ),
-        Line("Route 53 (changes are free)", f"{queries.likely:,.0f} queries", queries * prices.dns_query.usd),
+        CostLine("Route 53 (changes are free)", f"{queries.likely:,.0f} queries", queries * prices.dns_query.usd),
     ]
 
 
-def _data(study: Study, prices: Prices) -> list[Line]:
+def _data(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     per_gb = study.participants / 1e6
     frames = study.server_minutes * PLAYED * (60 * study.frame_rate)
     out = (frames * FRAME_KB + PAGE_LOADS * (study.steps * PAGE_KB)) * per_gb
@@ -184,13 +186,13 @@ def _data(study: Study, prices: Prices) -> list[Line]:
     logged = LOG_KB * per_gb
     kept = f"Data kept in S3, {MONTHS_KEPT.likely} months"
     return [
-        Line("Data to participants", f"{out.likely:,.2f} GB", out * prices.out_gb.usd),
-        Line(kept, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
-        Line("Logs", f"{logged.likely:,.3f} GB", logged * (prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
+        CostLine("Data to participants", f"{out.likely:,.2f} GB", out * prices.out_gb.usd),
+        CostLine(kept, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
+        CostLine("Logs", f"{logged.likely:,.3f} GB", logged * (prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
     ]
 
 
-def _page_requests(study: Study) -> Range:
+def _page_requests(study: StudyToEstimate) -> Range:
     """Requests to `next_step`: a GET and a POST for each step, none to answer the last; the polls; pages' own files."""
     return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
 
@@ -216,7 +218,7 @@ class FixedResources:
         )
 
 
-def month_lines(prices: Prices, fixed: FixedResources) -> list[Line]:
+def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
     """What a month without participants costs. The high figure is without free tiers."""
     # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
     # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
@@ -226,28 +228,28 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[Line]:
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
     least = max(0.0, polls - free["sqs"])
     return [
-        Line("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
+        CostLine("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
         _fixed("Alarms", fixed.alarms, prices.alarm_month.usd, free["alarm"]),
         _fixed("Metrics", fixed.metrics, prices.metric_month.usd, free["metric"]),
         _fixed("Dashboard", fixed.dashboards, prices.dashboard_month.usd, free["dashboard"]),
-        Line(
+        CostLine(
             "Asking the queues (SQS)",
             f"{polls:,.0f} requests",
             Usd(least, least, polls) * prices.sqs_request.usd,
         ),
-        Line("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
-        Line("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ecr_gb_month.usd),
-        Line("NAT gateway, load balancer, database", "none", Usd()),
+        CostLine("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
+        CostLine("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ecr_gb_month.usd),
+        CostLine("NAT gateway, load balancer, database", "none", Usd()),
     ]
 
 
-def _fixed(what: str, count: int, price: float, free: float) -> Line:
+def _fixed(what: str, count: int, price: float, free: float) -> CostLine:
     """Likely within the free tier, which the account's other things may have used up."""
     least = max(0.0, count - free) * price
-    return Line(what, f"{count}", Usd(least, least, count * price))
+    return CostLine(what, f"{count}", Usd(least, least, count * price))
 
 
-def assumptions(study: Study) -> list[str]:
+def assumptions(study: StudyToEstimate) -> list[str]:
     """What the estimate assumes, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
@@ -286,6 +288,6 @@ def assumptions(study: Study) -> list[str]:
     return [line.strip() for line in found]
 
 
-def total(lines: list[Line]) -> Usd:
+def total(lines: list[CostLine]) -> Usd:
     """The sum of the lines."""
     return sum((line.usd for line in lines), Usd())

@@ -13,7 +13,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, elsewhere, open_account
 from deploy.core import options
 from deploy.lifecycle.remains import look_again
-from deploy.lifecycle.removal import Found, Removal
+from deploy.lifecycle.removal import FoundInstallation, Removal
 from deploy.stack import inventory
 
 
@@ -51,7 +51,7 @@ def command(
     return remains.conclude(options.same_place(account.region, profile))
 
 
-def _tell(account: Account, stack: str, found: Found, data: bool, as_json: bool) -> int:
+def _tell(account: Account, stack: str, found: FoundInstallation, data: bool, as_json: bool) -> int:
     if as_json:
         screen.result_json(_as_json(found))
     elif found:
@@ -64,7 +64,7 @@ def _tell(account: Account, stack: str, found: Found, data: bool, as_json: bool)
     return Exit.CHANGES if to_do else Exit.DONE
 
 
-def _show(found: Found, data: bool) -> None:
+def _show(found: FoundInstallation, data: bool) -> None:
     if found.stack:
         screen.info(f"  - the stack, {found.stack['StackStatus']}, with all that it made", "red")
     for kind in dict.fromkeys(thing.kind for thing in found.things):
@@ -84,7 +84,7 @@ def _show(found: Found, data: bool) -> None:
         )
 
 
-def _as_json(found: Found) -> dict[str, Any]:
+def _as_json(found: FoundInstallation) -> dict[str, Any]:
     return {
         "stack": found.stack["StackStatus"] if found.stack else None,
         "things": [{"kind": thing.kind, "name": thing.name} for thing in found.things],

@@ -12,7 +12,7 @@ from console.formatting import count, duration, size
 from console.problem import Exit, Problem
 from deploy.aws.account import Account
 from deploy.cost.prices import Prices
-from deploy.lifecycle.removal import Found, Removal
+from deploy.lifecycle.removal import FoundInstallation, Removal
 from deploy.stack import acm_records, inventory, retained_bucket
 from deploy.stack.acm_records import Validation
 from deploy.stack.inventory import ListedResource
@@ -48,7 +48,7 @@ class Remains:
 
     removal: Removal
     remembered: Sequence[inventory.Resource]
-    after: Found
+    after: FoundInstallation
     left: Sequence[ListedResource]
 
     def __bool__(self) -> bool:

@@ -34,7 +34,7 @@ _GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundInstallation:
     """What exists of an installation."""
 
     stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
@@ -61,7 +61,7 @@ class Removal:
         self._records: list[Validation] = []
         self.kept: list[tuple[Validation, str]] = []  # records that stay, and what uses them
 
-    def look(self) -> Found:
+    def look(self) -> FoundInstallation:
         """Return what exists; change nothing."""
         described = self._stack.describe()
         things = [
@@ -75,7 +75,7 @@ class Removal:
             things.append(ListedResource("S3 bucket", self._code.name))
         attached = [policies.attached(self.account, arn) for arn in ids_of(made, "AWS::IAM::ManagedPolicy")]
         known = inventory.stacks(self.account, self.name)
-        return Found(
+        return FoundInstallation(
             described,
             things,
             self._data(),
@@ -84,7 +84,7 @@ class Removal:
             [*filter(None, attached)],
         )
 
-    def plan(self, found: Found, data: bool) -> list[Step]:
+    def plan(self, found: FoundInstallation, data: bool) -> list[Step]:
         """The steps in their order: the stack, what is beside it, and last the data, only with `data`."""
         steps: list[Step] = [step(self._prepare_stack, found.stack)] if found.stack else []
         steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
@@ -94,7 +94,7 @@ class Removal:
         steps.append(step(self._bucket, self._code.name, "code"))
         return steps + ([step(self._data_buckets)] if data else [])
 
-    def run(self, found: Found, data: bool) -> None:
+    def run(self, found: FoundInstallation, data: bool) -> None:
         """Remove everything; the data only with `data`. Raises `Problem` when something is in the way."""
         self.executor.execute(self.plan(found, data))
 
@@ -112,7 +112,7 @@ class Removal:
         if described["StackStatus"] != "CREATE_IN_PROGRESS":  # which may be deleted, and may last for hours
             self._stack.attach()
 
-    def _remember(self, found: Found) -> None:
+    def _remember(self, found: FoundInstallation) -> None:
         """Write down which records the site's certificate has left in DNS, while it still says so."""
         if not found.stack or not found.addresses:
             return
@@ -120,7 +120,7 @@ class Removal:
         self._records = [one for arn in arns for one in acm_records.of_certificate(self.account, arn, zone)]
         acm_records.remember(self._code, self._records)
 
-    def _delete_stack(self, found: Found) -> None:
+    def _delete_stack(self, found: FoundInstallation) -> None:
         def stop_servers() -> None:
             if found.installation:
                 self._stop_servers(found.installation)
@@ -231,7 +231,7 @@ class Removal:
                 raise
 
 
-def _zone(found: Found) -> str:
+def _zone(found: FoundInstallation) -> str:
     """The hosted zone of the stack that is there."""
     standing = inventory.addresses([found.stack] if found.stack else [])
     return (standing or found.addresses)[0].zone

@@ -18,7 +18,7 @@ from deploy.aws.account import STACK, Account, Installation, find_installation, 
 from deploy.aws.versions import VersionedBucket
 from deploy.core import options, participants
 from deploy.operate import receipt as receipts
-from deploy.operate.eraser import ROUNDS, Eraser, Found
+from deploy.operate.eraser import ROUNDS, Eraser, FoundOfParticipant
 from hippodrome.model import ids
 
 
@@ -152,7 +152,7 @@ def _must_be_known(project: str, known: list[str], stack: str) -> None:
         )
 
 
-def _erase(erasers: list[Eraser], found: Mapping[str, Found]) -> None:
+def _erase(erasers: list[Eraser], found: Mapping[str, FoundOfParticipant]) -> None:
     with screen.progress() as bars:
         bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
         for eraser in erasers:
@@ -176,7 +176,7 @@ def _advance(bars: Progress, bar: TaskID, count: int) -> None:
     bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
 
 
-def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
+def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
     if json:
         screen.result_json({"found": {name: one.counts() for name, one in found.items()}})
         return
@@ -189,7 +189,7 @@ def _show(found: Mapping[str, Found], json: bool, dry_run: bool) -> None:
         screen.result(f"There is nothing of this participant in {', '.join(found) or 'any project'}.")
 
 
-def _warn_of_others(found: Mapping[str, Found]) -> None:
+def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
     """Their session's server is stopped, too: that of others who play there."""
     playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
     if playing:
@@ -198,5 +198,5 @@ def _warn_of_others(found: Mapping[str, Found]) -> None:
         )
 
 
-def _words(found: Found) -> str:
+def _words(found: FoundOfParticipant) -> str:
     return ", ".join(f"{count:,} {what}" for what, count in found.counts().items() if count)

@@ -51,7 +51,7 @@ SIGNING = 30  # seconds that `sign_requests` may take from reading a server's re
 
 
 @dataclass
-class Found:
+class FoundOfParticipant:
     """What one look found of a participant in one project."""
 
     documents: int = 0  # versions, delete markers and unfinished uploads
@@ -114,11 +114,11 @@ class Eraser:
         self._sessions = SessionEraser(self._bucket, project, user)
         self._lobby = LobbyEraser(self._bucket, project, user)
 
-    def run(self, advance: Callable[[int], None] = lambda _: None) -> Found:
+    def run(self, advance: Callable[[int], None] = lambda _: None) -> FoundOfParticipant:
         """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
         return self._executor.converge(self.look, lambda found: self.plan(found, advance), rounds=ROUNDS, pause=0)
 
-    def look(self) -> Found:
+    def look(self) -> FoundOfParticipant:
         """Count everything there is of this participant; change nothing."""
         record = self._record(self._record_key)
         sessions = self._sessions.sessions()
@@ -131,7 +131,7 @@ class Eraser:
         own_name = record.dns_record if record else None
         if own_name and own_name not in there.dns_records and self._resolves(own_name):
             there.dns_records.append(own_name)
-        found = Found(
+        found = FoundOfParticipant(
             documents=sum(1 for _ in itertools.chain(self._lobby.look(), *self._documents())),
             record=record,
             resources=there,
@@ -143,7 +143,7 @@ class Eraser:
         self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
         return found
 
-    def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+    def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
         """The steps of one round: server, documents, and last the slot, so that nobody takes it too early."""
         steps: list[Step] = [step(self._begin_round)]
         if found.runs:
@@ -226,7 +226,7 @@ class Eraser:
     def _begin_round(self) -> None:
         self.receipt.rounds += 1
 
-    def _stop(self, found: Found) -> None:
+    def _stop(self, found: FoundOfParticipant) -> None:
         """Count what is removed, and stop the server as `stop_server` does."""
         from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same

@@ -41,7 +41,7 @@ _LEFT_OUT |= {"function_memory_size", "function_request_id", "requestId", "xray_
 
 
 @dataclass(frozen=True)
-class Line:
+class LogLine:
     """One event: when, of which function (or `trial`), how bad it is, its text, and further fields."""
 
     time: datetime
@@ -83,7 +83,7 @@ class Line:
         }
 
 
-def read(event: Mapping[str, Any], source: str) -> Line:
+def read(event: Mapping[str, Any], source: str) -> LogLine:
     """Read an event of FilterLogEvents, whatever wrote it."""
     time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
     text = str(event.get("message", ""))
@@ -97,43 +97,45 @@ def read(event: Mapping[str, Any], source: str) -> Line:
     return _of_text(text, time, source, stream)
 
 
-def _of_json(said: dict[str, Any], time: datetime, source: str, stream: str) -> Line:
+def _of_json(said: dict[str, Any], time: datetime, source: str, stream: str) -> LogLine:
     kind = str(said.get("type", ""))
     if kind.startswith("platform.") and isinstance(said.get("record"), dict):
         status = str(said["record"].get("status", "success"))
         fine = status == "success"
         message = kind.removeprefix("platform.") + ("" if fine else f": {status}")
         shown = {key: value for key, value in said["record"].items() if key in ("status", "errorType", "metrics")}
-        return Line(time, source, "" if fine else "ERROR", message, {} if fine else shown, platform=fine, stream=stream)
+        return LogLine(
+            time, source, "" if fine else "ERROR", message, {} if fine else shown, platform=fine, stream=stream
+        )
     if "errorType" in said and "message" not in said:  # an exception that left the function
         fields = {key: value for key, value in said.items() if key in ("errorType", "stackTrace", "requestId")}
-        return Line(time, source, "ERROR", "unhandled exception", fields, stream=stream)
+        return LogLine(time, source, "ERROR", "unhandled exception", fields, stream=stream)
     if "routeKey" in said or "httpMethod" in said:  # an access log of the HTTP API
         status = str(said.get("status", ""))
         level = "ERROR" if status.startswith("5") else "INFO"
         method = said.get("httpMethod") or said.get("routeKey")
         rest = {key: value for key, value in said.items() if key not in ("httpMethod", "routeKey", "status")}
-        return Line(time, source, level, f"{status} {method}", rest, stream=stream)
+        return LogLine(time, source, level, f"{status} {method}", rest, stream=stream)
     if "_aws" in said and "message" not in said:  # metrics (CloudWatch's embedded metric format)
         fields = {key: value for key, value in said.items() if key not in _LEFT_OUT | {"_aws"}}
-        return Line(time, source, "", "metrics", fields, platform=True, stream=stream)
+        return LogLine(time, source, "", "metrics", fields, platform=True, stream=stream)
     level = str(said.get("level", "")).upper()
     message = said.get("message", "")
     fields = {key: value for key, value in said.items() if key not in _LEFT_OUT and value is not None}
     text = message if isinstance(message, str) else json.dumps(message, ensure_ascii=False)
-    return Line(time, source, level, text, fields, stream=stream)
+    return LogLine(time, source, level, text, fields, stream=stream)
 
 
-def _of_text(text: str, time: datetime, source: str, stream: str) -> Line:
+def _of_text(text: str, time: datetime, source: str, stream: str) -> LogLine:
     if _FATAL_TEXT.search(text):
-        return Line(time, source, "ERROR", text.strip(), stream=stream)
+        return LogLine(time, source, "ERROR", text.strip(), stream=stream)
     if _PLATFORM_TEXT.match(text) and source != TRIAL:
-        return Line(time, source, "", text.strip(), platform=True, stream=stream)
+        return LogLine(time, source, "", text.strip(), platform=True, stream=stream)
     found = _TEXT.match(text)
     if found:
         level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(found[1], found[1])
-        return Line(time, source, level, found[2].rstrip("\n"), stream=stream)
-    return Line(time, source, "", text.rstrip("\n"), stream=stream)
+        return LogLine(time, source, level, found[2].rstrip("\n"), stream=stream)
+    return LogLine(time, source, "", text.rstrip("\n"), stream=stream)
 
 
 def moment(text: str, now: datetime) -> datetime:

@@ -21,7 +21,7 @@ from deploy.aws.account import STACK, find_installation, open_account
 from deploy.code.template import Template
 from deploy.core import options, participants
 from deploy.core.server_records import Records
-from deploy.operate.log_lines import TRIAL, Line, moment, read
+from deploy.operate.log_lines import TRIAL, LogLine, moment, read
 
 POLL = 5  # seconds between two looks; FilterLogEvents takes 5 requests a second in most regions, for all who ask
 OVERLAP = timedelta(seconds=60)  # events may arrive this late; those seen already are not shown again
@@ -54,13 +54,15 @@ class Reader:
             return sorted([*Template.read().functions, TRIAL])
         return sorted(found)
 
-    def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[Line]:
+    def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[LogLine]:
         """Every line since this time, in the order of time. Each log group's events come sorted, a page at once."""
         streams = [self._events(source, since, project_id) for source in sources]
         for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
             yield read(event, source)
 
-    def events(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> list[tuple[str, Line]]:
+    def events(
+        self, sources: Iterable[str], since: datetime, project_id: str | None = None
+    ) -> list[tuple[str, LogLine]]:
         """The lines with the events' ids, by which new ones are told from old ones."""
         streams = [self._events(source, since, project_id) for source in sources]
         merged = heapq.merge(*streams, key=lambda one: (one[0], one[1]))
@@ -104,7 +106,7 @@ class LineFilter:
         self._owner = owner  # label → the project of that server
         self._last: dict[str, bool] = {}  # log stream → whether its last line with a level was an error
 
-    def __call__(self, line: Line) -> bool:
+    def __call__(self, line: LogLine) -> bool:
         where = f"{line.source}/{line.stream}"
         if line.level:
             self._last[where] = line.is_error
@@ -122,9 +124,9 @@ class LineFilter:
 
 
 def follow(
-    look: Callable[[datetime], list[tuple[str, Line]]],
+    look: Callable[[datetime], list[tuple[str, LogLine]]],
     since: datetime,
-    show: Callable[[Line], None],
+    show: Callable[[LogLine], None],
     *,
     sleep: Callable[[float], None] = time.sleep,
     rounds: int | None = None,
@@ -196,7 +198,7 @@ def command(
 
     shown = 0
 
-    def show(line: Line) -> None:
+    def show(line: LogLine) -> None:
         nonlocal shown
         if not chosen(line):
             return

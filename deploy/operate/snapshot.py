@@ -67,7 +67,7 @@ class CertificateState:
         return self.expires - now < (self.expires - self.renewal) / 4
 
 
-class Warm(NamedTuple):
+class WarmServers(NamedTuple):
     """Warm servers for participants: how many are ready, how many there are, how many were taken today."""
 
     ready: int
@@ -75,7 +75,7 @@ class Warm(NamedTuple):
     taken_today: int
 
 
-class Failure(NamedTuple):
+class ServerFailure(NamedTuple):
     """Servers of a project that failed for the same cause in the last 24 hours, and the name of the last one."""
 
     project: str
@@ -112,7 +112,7 @@ class Snapshot:
         return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.ASSIGNED)
 
     @property
-    def failures(self) -> list[Failure]:
+    def failures(self) -> list[ServerFailure]:
         """Why servers have failed since a day ago: those that can be prevented first, then by number."""
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
@@ -121,14 +121,14 @@ class Snapshot:
                 if cause and one.closed and one.closed >= self.at - DAY:
                     name = one.warm_server_name or ids.server_name(record.label, one.attempt)
                     found.setdefault((record.project_id, cause), []).append((one.closed, name))
-        made = [Failure(*key, len(ends), *max(ends)) for key, ends in found.items()]
+        made = [ServerFailure(*key, len(ends), *max(ends)) for key, ends in found.items()]
         return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
 
-    def warm(self, project_id: str) -> Warm:
+    def warm(self, project_id: str) -> WarmServers:
         """The warm servers of a project."""
         mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
         taken = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
-        return Warm(sum(r.state is State.READY for r in mine), len(mine), len(taken))
+        return WarmServers(sum(r.state is State.READY for r in mine), len(mine), len(taken))
 
     def _closed_today(self) -> list[Server]:
         day = midnight(self.at)

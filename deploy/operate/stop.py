@@ -34,7 +34,7 @@ AT_ONCE = 4  # such calls; Route 53 takes 10 requests a second
 
 
 @dataclass
-class Found:
+class FoundServers:
     """What one look found: open servers, and resources that no open server owns."""
 
     servers: list[Server] = field(default_factory=list)
@@ -77,13 +77,13 @@ class Stopper:
         """How many records of servers could not be read: what those servers have counts as owned by none."""
         return self._records.unreadable
 
-    def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> Found:
+    def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> FoundServers:
         """Look and stop until a look finds nothing, or `wait` seconds are over; return what the last look found."""
         return self._executor.converge(
             self.look, lambda found: self.plan(found, advance), note=self._note, seconds=wait
         )
 
-    def look(self) -> Found:
+    def look(self) -> FoundServers:
         """Return what there is. Resources first and records afterwards, as the sweep does."""
         platform = self._platform
         found = resources.list_resources(platform)
@@ -92,7 +92,7 @@ class Stopper:
         known = {record.label: record for record in owners.values()}
         for record in self._records.open(platform.settings.max_runtime, platform.now()):
             known.setdefault(record.label, record)
-        return Found(
+        return FoundServers(
             sorted(
                 (record for record in known.values() if not record.is_closed and self._scope.covers(record)),
                 key=lambda record: record.requested,
@@ -101,7 +101,7 @@ class Stopper:
             [task for task in draining if self._scope.covers(owners.get(task.name))],
         )
 
-    def plan(self, found: Found, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+    def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
         """The steps that stop what was found; none if it only has to be waited for."""
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
         steps += removal_steps(self._platform, found.leftovers)
@@ -196,7 +196,7 @@ def _again(live: Sequence[Project]) -> str:
     return said + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
 
 
-def _show(found: Found, as_json: bool) -> None:
+def _show(found: FoundServers, as_json: bool) -> None:
     if as_json:
         screen.result_json({"found": found.counts(), "servers": [_line(record) for record in found.servers]})
         return

@@ -11,7 +11,7 @@ from deploy.aws.account import Account
 from deploy.core.stages import Executor
 from deploy.stack import acm_records, policies
 from deploy.stack.deletion_failures import Recovery, recoveries, recovery_from
-from deploy.stack.stack import Failure, NotDeleted, Stack
+from deploy.stack.stack import FailedResource, NotDeleted, Stack
 
 TRIES = 8  # at deleting the stack
 PAUSE = 20  # seconds between two looks at what is in the way
@@ -56,7 +56,7 @@ class StackDeletion:
             self._wait(wait, error.failures)
         return True
 
-    def _wait(self, wait: Recovery, failures: Sequence[Failure]) -> None:
+    def _wait(self, wait: Recovery, failures: Sequence[FailedResource]) -> None:
         match wait:
             case Recovery.CERTIFICATE:
                 for failure in failures:

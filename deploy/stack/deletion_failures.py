@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
-from deploy.stack.stack import Failure
+from deploy.stack.stack import FailedResource
 
 
 class Recovery(Enum):
@@ -108,7 +108,7 @@ TABLE: tuple[KnownFailure, ...] = (
 _DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECASE)
 
 
-def recovery_from(failure: Failure) -> Recovery | None:
+def recovery_from(failure: FailedResource) -> Recovery | None:
     """What helps against this failure; None if nothing that passes by itself, or that we can do."""
     if _DENIED.search(failure.reason):
         return None
@@ -120,7 +120,7 @@ def recovery_from(failure: Failure) -> Recovery | None:
     return None
 
 
-def recoveries(failures: Iterable[Failure]) -> list[Recovery]:
+def recoveries(failures: Iterable[FailedResource]) -> list[Recovery]:
     """What helps against all of these, each once; nothing if one of them is nothing that passes."""
     found = [recovery_from(failure) for failure in failures]
     return [] if None in found else list(dict.fromkeys(wait for wait in found if wait))

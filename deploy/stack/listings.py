@@ -103,21 +103,5 @@ _ALL = _read(_TABLE)
 BY_KIND = {listing.kind: listing for listing in _ALL.values()}
 LISTINGS = {type_: one for type_, one in _ALL.items() if type_ != "AWS::ECS::TaskDefinition"}  # which `register` makes
 KINDS = {type_: listing.kind for type_, listing in LISTINGS.items()}
-PARTS = {  # what goes with something else, and has no listing of its own: its type, and what it is a part of
-    "AWS::ApiGatewayV2::ApiMapping": "AWS::ApiGatewayV2::DomainName",
-    "AWS::ApiGatewayV2::Integration": "AWS::ApiGatewayV2::Api",
-    "AWS::ApiGatewayV2::Route": "AWS::ApiGatewayV2::Api",
-    "AWS::ApiGatewayV2::Stage": "AWS::ApiGatewayV2::Api",
-    "AWS::EC2::Route": "AWS::EC2::RouteTable",
-    "AWS::EC2::SubnetRouteTableAssociation": "AWS::EC2::Subnet",
-    "AWS::EC2::VPCGatewayAttachment": "AWS::EC2::VPC",
-    "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
-    "AWS::Lambda::Permission": "AWS::Lambda::Function",
-    "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
-    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # an unconfirmed one goes after three days
-    "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
-    "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
-}
-RECORDS = "AWS::Route53::RecordSet"  # listed in their zone: `records`
 KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
 """Without them ListCertificates names RSA_1024 and RSA_2048 only (ACM API reference)."""

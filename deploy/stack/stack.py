@@ -31,7 +31,7 @@ _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re
 
 
 @dataclass(frozen=True)
-class Failure:
+class FailedResource:
     """A resource that failed, and why."""
 
     logical_id: str
@@ -43,7 +43,7 @@ class Failure:
 class NotDeleted(Problem):
     """A stack that could not be deleted; `failures` are the resources that are in the way."""
 
-    def __init__(self, problem: Problem, failures: Sequence[Failure]) -> None:
+    def __init__(self, problem: Problem, failures: Sequence[FailedResource]) -> None:
         super().__init__(str(problem), problem.advice, problem.details, problem.exit_code)
         self.failures = tuple(failures)
 
@@ -53,7 +53,7 @@ class Operation:
     """One operation on a stack: states of resources by logical id, and failures in the order in which they came."""
 
     states: dict[str, str] = field(default_factory=dict)
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[FailedResource] = field(default_factory=list)
 
     @property
     def done(self) -> int:
@@ -163,7 +163,7 @@ class Stack:
             reason = str(event.get("ResourceStatusReason", ""))
             if status.endswith("_FAILED") and not _CONSEQUENCE.search(reason):
                 physical = str(event.get("PhysicalResourceId", ""))
-                found.failures.append(Failure(name, event["ResourceType"], physical, reason))
+                found.failures.append(FailedResource(name, event["ResourceType"], physical, reason))
         return found
 
     def _events(self, stack_id: str) -> Iterator[Mapping[str, Any]]:
@@ -334,7 +334,7 @@ _ADVICE = (  # what is known to go wrong, and what helps
 )
 
 
-def advice(failures: Sequence[Failure], details: Sequence[str] = ()) -> str:
+def advice(failures: Sequence[FailedResource], details: Sequence[str] = ()) -> str:
     """The advice for the first failure."""
     reason = failures[0].reason if failures else " ".join(details)
     for pattern, text in _ADVICE:

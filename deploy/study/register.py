@@ -56,13 +56,13 @@ class RegisterRequest:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RegisterPlan:
     """What registering would do. Nothing is changed yet."""
 
     study: project_folder.Study
     before: Project | None
     pages: pages.Changes
-    image: image.Plan | None
+    image: image.ImagePlan | None
     definition: str | None  # the existing revision that fits, if there is one
     port: int = LEGACY_PORT
 
@@ -137,7 +137,7 @@ def command(
     return Exit.DONE
 
 
-def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> Plan:
+def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> RegisterPlan:
     """Compare the folder with AWS. Raises `Problem` if the project cannot be registered here."""
     found = project_folder.read(folder, installation)
     if request.live is not None:
@@ -145,11 +145,11 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
     before = _registered(account, installation, found.id)
     changes = pages.compare(account, installation["Bucket"], found.id, folder, found.config.own_pages)
     if not found.plays:
-        return Plan(found, before, changes, None, None)
+        return RegisterPlan(found, before, changes, None, None)
     trial = found.registration["trial"]
     wanted = image.plan(account, installation, found.id, folder, again=request.again, base=request.base, trial=trial)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
-    return Plan(found, before, changes, wanted, revision, definition.port(installation))
+    return RegisterPlan(found, before, changes, wanted, revision, definition.port(installation))
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
@@ -245,7 +245,7 @@ def _close(account: Account, installation: Installation, folder: Path) -> None:
         screen.success("The study is closed: no participant can begin or go on")
 
 
-def _confirm(account: Account, installation: Installation, doing: Plan, request: RegisterRequest) -> None:
+def _confirm(account: Account, installation: Installation, doing: RegisterPlan, request: RegisterRequest) -> None:
     """Ask if the id belongs to a study of another name that has participants; a copied folder has the same id.
 
     Ask as well if the steps of an open study with participants change: the steps tell where each participant is.
@@ -305,7 +305,7 @@ def _tell_warm(registration: Mapping[str, Any]) -> None:
     )
 
 
-def _tell_plan(doing: Plan, as_json: bool) -> int:
+def _tell_plan(doing: RegisterPlan, as_json: bool) -> int:
     steps = doing.steps
     if as_json:
         screen.result_json({"project": doing.study.id, "steps": steps})

@@ -211,7 +211,7 @@ class Renewal:
         reason = error.reason if isinstance(error, OrderFailed) else FailureReason.BROKEN
         text = str(error) if isinstance(error, OrderFailed) else type(error).__name__
         until = error.until if isinstance(error, OrderFailed) else None
-        failure = rules.Failure(self._now(), wanted.directory, reason, text, until)
+        failure = rules.FailedOrder(self._now(), wanted.directory, reason, text, until)
         self._record_result(token, lambda state: rules.failed(state, failure))
 
     # ---- the order

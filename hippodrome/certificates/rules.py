@@ -111,7 +111,7 @@ class OrderFailed(Exception):
 UtcDatetime = Annotated[datetime, msgspec.Meta(tz=True)]
 
 
-class Failure(Record, frozen=True):
+class FailedOrder(Record, frozen=True):
     """One order that failed."""
 
     at: UtcDatetime
@@ -132,7 +132,7 @@ class State(Record, frozen=True):
     not_after: UtcDatetime | None = None
     ordered: UtcDatetime | None = None
     trusted: str = ""  # the root certificates (PEM) of a directory that is not public
-    failures: tuple[Failure, ...] = ()  # since the last success, oldest first
+    failures: tuple[FailedOrder, ...] = ()  # since the last success, oldest first
     claim: str = ""  # the token of the run that is ordering now
     claimed: UtcDatetime | None = None
     challenges: tuple[str, ...] = ()  # values that the TXT record may still have
@@ -266,7 +266,7 @@ def unclaimed(state: State) -> State:
     return msgspec.structs.replace(state, claim="", claimed=None)
 
 
-def failed(state: State, failure: Failure) -> State:
+def failed(state: State, failure: FailedOrder) -> State:
     """The order failed."""
     kept = (*state.failures, msgspec.structs.replace(failure, text=failure.text[:MAX_TEXT]))[-MAX_FAILURES:]
     return msgspec.structs.replace(unclaimed(state), failures=kept)

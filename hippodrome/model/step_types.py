@@ -25,7 +25,6 @@ RESERVED = {"game": GAME}
 """By page name in config.yml. Every other page name is that of a step file."""
 NAMES = " or ".join(RESERVED)
 """The reserved words, as messages say them."""
-TYPES = (PAGE, *RESERVED.values())
 
 
 def type_of(page: str) -> StepType:

@@ -27,7 +27,7 @@ from hippodrome.participants.steps import HANDLERS
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.shared_game import SharedGame, StepAnswered
 from hippodrome.participants.steps.visit import Visit
-from hippodrome.participants.waiting import Waiting
+from hippodrome.participants.waiting import ServerStates
 from hippodrome.ports import Platform
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
@@ -51,7 +51,7 @@ class Journey:
         self._slots = Slots(platform)
         self._files = Files(self._project_cache)
         self._answers = Answers(platform)
-        waiting = Waiting(platform.settings, self._secrets)
+        waiting = ServerStates(platform.settings, self._secrets)
         self._services = StepServices(platform, self._project_cache, self._repository, self._answers, waiting)
         self._shared_game = SharedGame(self._services)
         self._steps = {name: handler(self._services) for name, handler in HANDLERS.items()}

@@ -14,7 +14,7 @@ MAX_START_TIMES = 50  # starts
 FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 
-class Waiting:
+class ServerStates:
     """States of servers, and how long their starts took lately. docs/pages.md describes the JSON of `state`."""
 
     def __init__(self, settings: Settings, secrets: SecretCache) -> None:

@@ -121,7 +121,7 @@ class SigningRequest(msgspec.Struct, frozen=True):
     requests: list[DocumentRequest]
 
 
-class Refusal(Exception):
+class SigningRefusal(Exception):
     """An HTTP status and a sentence, which repeats nothing of the request."""
 
     def __init__(self, status: int, text: str) -> None:
@@ -268,14 +268,14 @@ class Signing:
             asked = _read(request)
             access = self._authenticate(asked)
             signed = self._sign(access, asked.requests)
-        except Refusal as refusal:
+        except SigningRefusal as refusal:
             return _json(refusal.status, {"message": refusal.text})
         requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
         return _json(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
-        """The access of the server that shows this credential. Raises the same `Refusal` for any error."""
-        refused = Refusal(403, "That is not the credential of a server that may store anything now.")
+        """The access of the server that shows this credential. Raises the same `SigningRefusal` for any error."""
+        refused = SigningRefusal(403, "That is not the credential of a server that may store anything now.")
         label, attempt = ids.parse_server_name(asked.server) or ("", 0)
         secret = self._secrets.find() if label else None
         stored = self._repository.server(label) if secret else None
@@ -305,10 +305,10 @@ class Signing:
         return ServerAccess(name, record.project_id, certificate=certificate)
 
     def _sign(self, access: ServerAccess, asked: Sequence[DocumentRequest]) -> list[Presigned]:
-        """Sign all requests. Raises `Refusal` and signs none if one of them is not allowed."""
+        """Sign all requests. Raises `SigningRefusal` and signs none if one of them is not allowed."""
         if not all(access.allows(wanted) for wanted in asked):
             logger.warning("a server asked for a document that is not its own", extra={"server": access.name})
-            raise Refusal(403, "That is none of this server's documents.")
+            raise SigningRefusal(403, "That is none of this server's documents.")
         announced = [
             wanted.size or 0 for wanted in asked if wanted.method is Method.PUT and access.is_recording(wanted.key)
         ]
@@ -316,7 +316,7 @@ class Signing:
             stored = [entry.size for entry in self._platform.documents.list(access.folder)]
             if len(stored) + len(announced) > MAX_RECORDINGS or sum(stored) + sum(announced) > MAX_RECORDED:
                 logger.error("a server has stored too much", extra={"server": access.name})
-                raise Refusal(403, "This server has stored as much as one may.")
+                raise SigningRefusal(403, "This server has stored as much as one may.")
         signer = self._platform.signer
         return [
             signer.presign_get(wanted.key, VALID_SECONDS)
@@ -332,15 +332,15 @@ def _json(status: int, data: Any) -> Response:
 
 
 def _read(request: Request) -> SigningRequest:
-    """Parse the body, which may be hostile. Raises `Refusal`."""
+    """Parse the body, which may be hostile. Raises `SigningRefusal`."""
     if request.method != "POST":
-        raise Refusal(405, "Use POST.")
+        raise SigningRefusal(405, "Use POST.")
     if request.body is None or len(request.body) > MAX_BODY:
-        raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
+        raise SigningRefusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
     try:
         asked = from_json(request.body, SigningRequest)
     except (ValueError, RecursionError):
-        raise Refusal(400, "The body must be JSON with server, credential and requests.") from None
+        raise SigningRefusal(400, "The body must be JSON with server, credential and requests.") from None
     if not 0 < len(asked.requests) <= MAX_REQUESTS:
-        raise Refusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")
+        raise SigningRefusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")
     return asked

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 import msgspec
 
 from protocol.keys import answer_key
-from testing.port_faults import Fault, FaultAt
+from testing.port_faults import FaultAt, PortFault
 from testing.simulation import session_checks
 from testing.simulation.conditions import Conditions
 from testing.simulation.members import Habits, Member
-from testing.simulation.people import Person, Visit
+from testing.simulation.people import SimulatedParticipant, Visit
 from testing.simulation.world import PROJECT, World
 
-FAULTS = (Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY)
+FAULTS = (PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER, PortFault.REPLY)
 HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: three times the deadline, and the sweeps after it
 
 
@@ -30,7 +30,7 @@ class Journey:
 
     name: str
     conditions: Callable[[], Conditions] = Conditions
-    person: Callable[[World], Person] = lambda world: Person(world, 0)
+    person: Callable[[World], SimulatedParticipant] = lambda world: SimulatedParticipant(world, 0)
     finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
     minutes: int = 30  # maxRuntime
     limits: Mapping[str, int] = field(default_factory=dict)
@@ -42,11 +42,11 @@ class Journey:
     play: float = 60.0  # seconds that a session plays
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
 
-    def people(self, world: World) -> list[Person]:
+    def people(self, world: World) -> list[SimulatedParticipant]:
         """All who take part. Those of a session come at the same time, but for their reading."""
         if self.group:
             return [Member(world, number, habits=habits, play=self.play) for number, habits in enumerate(self.group)]
-        return [self.person(world), *(Person(world, number) for number in range(1, 1 + self.others))]
+        return [self.person(world), *(SimulatedParticipant(world, number) for number in range(1, 1 + self.others))]
 
 
 JOURNEYS = (
@@ -57,7 +57,9 @@ JOURNEYS = (
     ),
     Journey("AWS is slow", conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0)),
     Journey("the image cannot be pulled", conditions=lambda: Conditions(stillborn=1.0), finishes=False),
-    Journey("nobody comes to play", person=lambda world: Person(world, 0, leaves_at="wait"), finishes=False),
+    Journey(
+        "nobody comes to play", person=lambda world: SimulatedParticipant(world, 0, leaves_at="wait"), finishes=False
+    ),
     Journey("within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}),
     Journey(
         "within limits Spot takes the server back",
@@ -80,7 +82,12 @@ JOURNEYS = (
         comes=150.0,
         closes=600.0,
     ),
-    Journey("play beyond maxRuntime", person=lambda world: Person(world, 0, play=7200), finishes=False, minutes=6),
+    Journey(
+        "play beyond maxRuntime",
+        person=lambda world: SimulatedParticipant(world, 0, play=7200),
+        finishes=False,
+        minutes=6,
+    ),
 )
 USUAL = Habits()
 PAIR: Mapping[str, object] = {"players": 2, "patience": 120.0}

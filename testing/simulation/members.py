@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from hippodrome.model import ids
-from testing.simulation.people import Person
+from testing.simulation.people import SimulatedParticipant
 from testing.simulation.trials import SimTrial, is_lost
 from testing.simulation.world import SECRET, World
 
@@ -34,7 +34,7 @@ class Quit(Exception):
     """They have closed the page of the game."""
 
 
-class Member(Person):
+class Member(SimulatedParticipant):
     """One participant's way through a study whose sessions have several players."""
 
     def __init__(self, world: World, number: int, *, habits: Habits | None = None, **person: Any) -> None:

@@ -53,7 +53,7 @@ class Visit:
     told: str = ""  # the honest page they ended with instead
 
 
-class Person:
+class SimulatedParticipant:
     """One participant's way through the study, as a browser walks it."""
 
     def __init__(

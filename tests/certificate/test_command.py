@@ -13,7 +13,7 @@ from deploy.stack import certificate
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates import rules
 from hippodrome.certificates.renewal import Renewal
-from hippodrome.certificates.rules import PRODUCTION, STAGING, Failure, FailureReason, State
+from hippodrome.certificates.rules import PRODUCTION, STAGING, FailedOrder, FailureReason, State
 from hippodrome.model.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
@@ -285,7 +285,7 @@ def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
 
 def test_rate_limited_until(world, delegated, capsys):
     until = datetime.now(UTC) + timedelta(hours=5)
-    failure = Failure(datetime.now(UTC), PRODUCTION, FailureReason.RATE_LIMITED, "too many", until)
+    failure = FailedOrder(datetime.now(UTC), PRODUCTION, FailureReason.RATE_LIMITED, "too many", until)
     world.put(STATE, to_json(State(failures=(failure,))))
     ran = world.run(capsys, "certificate", "--production", "--force")
     assert ran.code == 1

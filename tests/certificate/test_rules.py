@@ -12,7 +12,7 @@ from hippodrome.certificates.rules import (
     CLAIM,
     STAGING,
     Decision,
-    Failure,
+    FailedOrder,
     FailureReason,
     State,
     StoredCertificate,
@@ -39,7 +39,7 @@ def stored(age=DAY, lifetime=90 * DAY, **more):
 
 
 def failure(ago, trouble=FailureReason.VALIDATION, directory=STAGING, until=None):
-    return Failure(NOW - ago, directory, trouble, until=until)
+    return FailedOrder(NOW - ago, directory, trouble, until=until)
 
 
 NEVER = State()
@@ -137,7 +137,7 @@ def test_a_claim_holds_for_a_while():
 def test_the_state_does_not_grow(count, text):
     state = State()
     for _ in range(count):
-        state = rules.failed(state, Failure(NOW, STAGING, FailureReason.REFUSED, text))
+        state = rules.failed(state, FailedOrder(NOW, STAGING, FailureReason.REFUSED, text))
     assert len(state.failures) <= rules.MAX_FAILURES
     assert all(len(one.text) <= rules.MAX_TEXT for one in state.failures)
     assert from_json(to_json(state), State) == state

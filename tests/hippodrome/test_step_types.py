@@ -11,7 +11,7 @@ from hippodrome.config import read_project
 from hippodrome.http import Response
 from hippodrome.model import step_types
 from hippodrome.model.project import Project, Step
-from hippodrome.model.step_types import TYPES, StepType
+from hippodrome.model.step_types import PAGE, RESERVED, StepType
 from hippodrome.participants import steps
 from hippodrome.participants.forms import Form
 from hippodrome.participants.steps.page import PageStep
@@ -25,7 +25,7 @@ FOLDER = Path(steps.__file__).parent
 
 
 def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
-    assert set(steps.HANDLERS) == {kind.name for kind in TYPES}
+    assert set(steps.HANDLERS) == {kind.name for kind in (PAGE, *RESERVED.values())}
     for name, handler in steps.HANDLERS.items():
         assert handler.__module__ == f"hippodrome.participants.steps.{name}"
     shared = {"services", "sources", "visit", "shared_game"}

@@ -32,7 +32,7 @@ from local.backend.platform import LocalPlatform
 from local.backend.processes import end_everything, marked
 from local.publish import publish
 from testing import derived
-from testing.os_faults import Fault, Injector, Killed
+from testing.os_faults import Killed, OsFault, OsFaultInjector
 from tests.local.conftest import write_study
 
 QUICK = (sys.executable, "-I", "-S", str(Path(__file__).with_name("quick_trial.py")))
@@ -48,13 +48,13 @@ class Stranded(AssertionError):
 class FaultyStudy:
     """The folders of a study, and the processes that hold it one after the other."""
 
-    def __init__(self, folder: Path, *, warm: int = 0, fault: Fault | None = None) -> None:
+    def __init__(self, folder: Path, *, warm: int = 0, fault: OsFault | None = None) -> None:
         folder.mkdir()
         self.project = write_study(folder / "project", warm=warm, start=2)
         self.root = folder / "study"
         self.data, self.state = self.root / "data", self.root / ".hippodrome" / "data"
         self.root.mkdir()
-        self.injector = Injector(self.root, fault)
+        self.injector = OsFaultInjector(self.root, fault)
         self.promised: dict[str, str] = {}  # by step, what the participant was told is kept
         self.told: list[str] = []
         self.until = time.monotonic() + LIMIT
@@ -342,7 +342,7 @@ def hurried() -> Iterator[None]:
         yield
 
 
-def run(journey: str, folder: Path, fault: Fault | None = None) -> FaultyStudy:
+def run(journey: str, folder: Path, fault: OsFault | None = None) -> FaultyStudy:
     """One journey with one fault. Raises `Stranded`; `FaultyStudy.wrong` says what else is not as it should be."""
     study = FaultyStudy(folder, warm=1 if journey == "warm_is_given" else 0, fault=fault)
     try:

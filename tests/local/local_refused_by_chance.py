@@ -10,10 +10,10 @@ from pathlib import Path
 import typer
 
 from local.__main__ import main
-from testing.os_faults import ERRORS, Call, Injector
+from testing.os_faults import ERRORS, Call, OsFaultInjector
 
 
-class ByChance(Injector):
+class ByChance(OsFaultInjector):
     """Refuses calls by chance; one in ten times all that can be refused for this reason, for a moment."""
 
     dice = random.Random(int(os.environ["SEED"]))

@@ -20,29 +20,29 @@ from pathlib import Path
 import pytest
 
 from testing import exploration
-from testing.os_faults import ERRORS, KILLS, Call, Fault, Reach
+from testing.os_faults import ERRORS, KILLS, Call, OsFault, Reach
 from tests.local.faulty_study import JOURNEYS, FaultyStudy, Stranded, run
 
 SEED, SAMPLE = 9, 5
-ELSEWHERE = Fault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)
+ELSEWHERE = OsFault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)
 
 
-def points(study: FaultyStudy) -> Iterator[Fault]:
+def points(study: FaultyStudy) -> Iterator[OsFault]:
     """Every fault of a journey: at the first and the last call of each kind, at the first if it only looks."""
     yield ELSEWHERE
     for call, count in sorted(study.injector.calls.items()):
         looks = call.operation in ("stat", "process", "list", "read", "open")
         for number in {1} if looks else {1, count}:
             for error in ERRORS[call.operation]:
-                yield Fault(call, number, Reach.SPELL, error)
+                yield OsFault(call, number, Reach.SPELL, error)
                 if not looks:
-                    yield Fault(call, number, Reach.ONCE, error)
+                    yield OsFault(call, number, Reach.ONCE, error)
             if not looks:
                 for reach in KILLS:
-                    yield Fault(call, number, reach)
+                    yield OsFault(call, number, reach)
 
 
-def went_wrong(journey: str, folder: Path, fault: Fault | None) -> list[str]:
+def went_wrong(journey: str, folder: Path, fault: OsFault | None) -> list[str]:
     """What is wrong after a journey with this fault."""
     try:
         return run(journey, folder, fault).wrong()
@@ -84,9 +84,9 @@ def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
     assert wrong == {}
 
 
-def one_each(faults: list[Fault], turn: int) -> list[Fault]:
+def one_each(faults: list[OsFault], turn: int) -> list[OsFault]:
     """Of each kind of call one fault: another one in each journey, and for each place."""
-    kinds: dict[Call, list[Fault]] = {}
+    kinds: dict[Call, list[OsFault]] = {}
     for fault in faults:
         kinds.setdefault(fault.call, []).append(fault)
     return [of_it[(turn + number) % len(of_it)] for number, of_it in enumerate(kinds.values())]

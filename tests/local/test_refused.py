@@ -28,7 +28,7 @@ from local.backend.retry import Retry
 from local.backend.timers import FolderTimers
 from local.publish import publish
 from local.watch import Watch
-from testing.os_faults import Call, Fault, Injector, Reach
+from testing.os_faults import Call, OsFault, OsFaultInjector, Reach
 from testing.waiting import until
 from tests.local.backend.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
 from tests.local.conftest import write_study
@@ -46,17 +46,17 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def refusing(tmp_path: Path) -> Iterator[Callable[..., Injector]]:
+def refusing(tmp_path: Path) -> Iterator[Callable[..., OsFaultInjector]]:
     """Lets calls for files below the folder be refused as the fault says, from now on."""
-    injector = Injector(tmp_path)
+    injector = OsFaultInjector(tmp_path)
     with injector.installed():
 
         def begin(
             operation: str, place: str, number: int = 1, reach: Reach = Reach.ONCE, error: int = errno.EMFILE
-        ) -> Injector:
+        ) -> OsFaultInjector:
             injector.calls.clear()
             injector.struck = 0
-            injector.fault = Fault(Call(operation, place), number, reach, error)
+            injector.fault = OsFault(Call(operation, place), number, reach, error)
             return injector
 
         yield begin
@@ -64,7 +64,7 @@ def refusing(tmp_path: Path) -> Iterator[Callable[..., Injector]]:
 
 @pytest.mark.parametrize(("operation", "error"), [("rename", errno.ENOSPC), ("unlink", errno.EIO)])
 def test_a_message_whose_file_cannot_be_changed_comes_all_the_same(
-    tmp_path: Path, refusing: Callable[..., Injector], operation: str, error: int
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector], operation: str, error: int
 ) -> None:
     came: list[Any] = []
     bus = FolderBus(tmp_path, {"start": lambda event, context: came.append(event)}, lambda text: None)
@@ -94,7 +94,7 @@ def test_a_message_is_not_put_aside_for_what_the_machine_refuses(tmp_path: Path)
 
 
 def test_messages_that_cannot_be_read_at_the_start_are_not_left_out(
-    tmp_path: Path, refusing: Callable[..., Injector]
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector]
 ) -> None:
     FolderBus(tmp_path, {}).publish(Topic.START, {"n": 1})
     refusing("open", MESSAGE)
@@ -104,7 +104,7 @@ def test_messages_that_cannot_be_read_at_the_start_are_not_left_out(
 
 
 def test_a_timer_that_cannot_be_read_when_it_is_due_fires_later(
-    tmp_path: Path, refusing: Callable[..., Injector]
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector]
 ) -> None:
     fired: list[Any] = []
     timers = FolderTimers(tmp_path, fired.append, lambda text: None)
@@ -117,7 +117,9 @@ def test_a_timer_that_cannot_be_read_when_it_is_due_fires_later(
     assert injector.struck == 1
 
 
-def test_names_that_cannot_be_read_are_not_overwritten(tmp_path: Path, refusing: Callable[..., Injector]) -> None:
+def test_names_that_cannot_be_read_are_not_overwritten(
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector]
+) -> None:
     names = FileDns(tmp_path)
     one, two = (DnsRecord(f"s{'a' * 20}-{n}.localhost", "127.0.0.1") for n in (1, 2))
     names.change(add=[one])
@@ -132,7 +134,7 @@ def test_names_that_cannot_be_read_are_not_overwritten(tmp_path: Path, refusing:
     "call", [Call("list", "data"), Call("stat", "data/_servers"), Call("open", "data/project_master_list.json")]
 )
 def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
-    tmp_path: Path, refusing: Callable[..., Injector], call: Call
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector], call: Call
 ) -> None:
     told: list[str] = []
     others = set(threading.enumerate())
@@ -153,7 +155,9 @@ def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
     assert len(set(threading.enumerate()) - others) < 50
 
 
-def test_files_of_a_project_that_cannot_be_seen_are_not_gone(tmp_path: Path, refusing: Callable[..., Injector]) -> None:
+def test_files_of_a_project_that_cannot_be_seen_are_not_gone(
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector]
+) -> None:
     study = write_study(tmp_path / "study")
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={}, say=lambda text: None)
     platform_module.installed.use(platform)

@@ -17,7 +17,7 @@ from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
 from testing.simulation.conditions import SLOW_FOR, Conditions, propagation
 from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
-from testing.simulation.people import Person
+from testing.simulation.people import SimulatedParticipant
 from testing.simulation.ports import PAGE
 from testing.simulation.world import LOOPS, World
 from testing.tasks import Life
@@ -374,7 +374,7 @@ def test_each_fact_stands_among_the_assumptions(what):
 
 def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():
     world = World(5)
-    world.clock.spawn(Person(world, 0).walk)
+    world.clock.spawn(SimulatedParticipant(world, 0).walk)
     world.settle(7200)
     assert not any(world.left().values())
     assert world.clock.seconds < 1800

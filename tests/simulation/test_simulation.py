@@ -10,12 +10,12 @@ import pytest
 from deploy.aws.concurrency import starts
 from hippodrome.participants import scripts
 from testing import template
-from testing.port_faults import Fault, FaultAt
+from testing.port_faults import FaultAt, PortFault
 from testing.simulation import faults
 from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
 from testing.simulation.conditions import Conditions
-from testing.simulation.people import POLLS, Person, retry_delay
+from testing.simulation.people import POLLS, SimulatedParticipant, retry_delay
 from testing.simulation.world import TIMEOUTS, WIRES, World
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
 
@@ -24,7 +24,7 @@ SEED = 7
 
 def crowd(seed, people, seconds, conditions=None, **account):
     world = World(seed, conditions, **account)
-    arrived = [Person(world, number) for number in range(people)]
+    arrived = [SimulatedParticipant(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
     world.settle(2 * 3600)
@@ -63,7 +63,7 @@ def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
     journey = faults.Journey(
         "Spot takes the server back from somebody who plays for long",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(120.0, 240.0)),
-        person=lambda world: Person(world, 0, play=600.0),
+        person=lambda world: SimulatedParticipant(world, 0, play=600.0),
     )
     world, outcome = faults.run(journey, SEED)
     kinds = [task.request.spot for task in world.platform.tasks.tasks.values()]
@@ -144,7 +144,7 @@ def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_serve
 
 def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
     world = World(SEED)
-    person = Person(world, 0)
+    person = SimulatedParticipant(world, 0)
     slow = world.platform.documents
     create, times = slow.create, []
 
@@ -169,13 +169,13 @@ def test_each_task_runs_for_somebody_once():
 
 
 def test_a_fault_happens_at_the_call_it_is_meant_for():
-    _, outcome = faults.run(faults.JOURNEYS[0], SEED, FaultAt(5, Fault.CRASH_AFTER))
-    assert str(Fault.CRASH_AFTER) in outcome.story
+    _, outcome = faults.run(faults.JOURNEYS[0], SEED, FaultAt(5, PortFault.CRASH_AFTER))
+    assert str(PortFault.CRASH_AFTER) in outcome.story
 
 
 def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
     world = World(SEED)
-    person = Person(world, 0, read=100.0)
+    person = SimulatedParticipant(world, 0, read=100.0)
     world.clock.spawn(person.walk)
     world.clock.after(20, world.close)
     world.run(600)

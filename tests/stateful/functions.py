@@ -14,7 +14,7 @@ import greenlet
 
 from lambdas import installed
 from testing import port_faults
-from testing.port_faults import Crash, Fault, FaultAt
+from testing.port_faults import Crash, FaultAt, PortFault
 
 T = TypeVar("T")
 TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds; the template's
@@ -110,7 +110,7 @@ class Functions:
         fault = due.fault if due and due.call == invocation.calls else None
         if fault:
             self.disturbed()
-        if fault is Fault.WAIT:
+        if fault is PortFault.WAIT:
             invocation.waits_at = action
             self.waiting.append(invocation)
             self._tell(f"{invocation.function} ({invocation.about}) waits before {action}")

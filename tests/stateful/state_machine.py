@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from hippodrome.model.project import Project
-from testing.port_faults import Fault, FaultAt
+from testing.port_faults import FaultAt, PortFault
 from testing.studies import study
 from tests.stateful import checks
 from tests.stateful.world import World
 
-FAULTS = st.builds(FaultAt, st.integers(1, 12), st.sampled_from(list(Fault)))
+FAULTS = st.builds(FaultAt, st.integers(1, 12), st.sampled_from(list(PortFault)))
 MAYBE = st.none() | FAULTS
 USERS = ("alice", "bob")
 PEOPLE = st.sampled_from(USERS)

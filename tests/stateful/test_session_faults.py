@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 
 from testing.exploration import sample
-from testing.port_faults import Fault, FaultAt
+from testing.port_faults import FaultAt, PortFault
 from tests.stateful.functions import Invocation
 from tests.stateful.sessions import SessionWorld, always, ends_well, pairs
 from tests.stateful.world import World
 
 pytestmark = pytest.mark.usefixtures("numbered_sessions")
 
-FAULTS = (Fault.ERROR, Fault.REPLY, Fault.CRASH_BEFORE, Fault.CRASH_AFTER)
+FAULTS = (PortFault.ERROR, PortFault.REPLY, PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER)
 PAIR = ("alice", "bob")
 
 

@@ -20,7 +20,7 @@ from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
 from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
-from testing.port_faults import Fault, FaultAt
+from testing.port_faults import FaultAt, PortFault
 from testing.studies import study
 from tests.stateful.mutations import Mutation, assert_seen, written_unread
 from tests.stateful.state_machine import Machine
@@ -52,7 +52,7 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     world.answer("bob", "1")
     start = next(message for message in world.queued if message.text == "start bob")
     world.repeat(start)
-    world.deliver([start], FaultAt(3, Fault.WAIT))  # the record is written, and no place taken
+    world.deliver([start], FaultAt(3, PortFault.WAIT))  # the record is written, and no place taken
     world.deliver_all("start")
     assert world.functions.waiting[0].waits_at == "documents.get"
     world.account.fleet.spot = world.account.fleet.demand = "refused"

@@ -49,3 +49,16 @@ class TakesMessages:
         with contextlib.suppress(ConnectionClosed):
             await self.until(lambda: False, seconds)
         return self.websocket.close_code
+
+
+def play_to_the_end(server: Any, open_client: Any) -> None:
+    """One client starts the game of this server and watches it until the trial is over."""
+
+    async def play() -> None:
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(command="start")
+            assert await client.closed() == 1000
+
+    asyncio.run(play())

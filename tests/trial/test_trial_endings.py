@@ -4,6 +4,7 @@ import asyncio
 import json
 import time
 
+from tests.trial.client_messages import play_to_the_end
 from trial.recordings import recording
 
 UI = {"stop": True}
@@ -156,13 +157,7 @@ def test_recordings_stay_here_without_s3upload(launch, open_client, grid, tmp_pa
         grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool")
     )
 
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.say(command="start")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answered()
     assert server.recordings() == {}
@@ -233,13 +228,7 @@ def test_s3(launch, open_client, grid, monkeypatch):
         s3.create_bucket(Bucket="data")
         server = launch(grid(10), {"maxEpisodes": 2, "startingFrameRate": 60}, STORE="s3://data", **keys)
 
-        async def play():
-            async with open_client(server.address) as client:
-                await client.hello()
-                await client.say(command="start")
-                assert await client.closed() == 1000
-
-        asyncio.run(play())
+        play_to_the_end(server, open_client)
         assert server.wait() == 0, server.said()
         found = {entry["Key"] for entry in s3.list_objects_v2(Bucket="data")["Contents"]}
         assert found == {

@@ -14,6 +14,7 @@ import pytest
 
 from protocol.trial_keys import keys
 from protocol.trial_sections import Ui
+from tests.trial.client_messages import play_to_the_end
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
@@ -117,13 +118,7 @@ def test_recording_says_what_happened(launch, open_client, grid, tmp_path):
 def test_one_file_for_a_trial(launch, open_client, grid):
     server = launch(grid(5), {"maxEpisodes": 3, "dataFile": "trial", "startingFrameRate": 60})
 
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.say(command="start")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    play_to_the_end(server, open_client)
     assert server.wait() == 0
     recordings = server.recordings()
     assert list(recordings) == ["3-trial.jsonl.gz"]

@@ -9,7 +9,7 @@ from trial.core.message_log import MessageLog
 from trial.core.participants import Participants
 from trial.core.policies import Observed
 from trial.core.progress import Progress
-from trial.core.recording import Recording
+from trial.core.recording import Recordings
 from trial.core.seeds import policy_seed
 from trial.core.timing import Timing
 from trial.core.unfinished import UnfinishedEpisode
@@ -24,7 +24,7 @@ class Beginning:
         settings: Settings,
         *,
         timing: Timing,
-        recording: Recording,
+        recording: Recordings,
         message_log: MessageLog,
         new_seed: Callable[[], int],
         emit: Callable[[Effect], None],

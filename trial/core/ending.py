@@ -11,7 +11,7 @@ from trial.core.ended import Break, Episode
 from trial.core.message_log import MessageLog
 from trial.core.participants import Participants
 from trial.core.progress import Progress
-from trial.core.recording import Recording
+from trial.core.recording import Recordings
 from trial.core.timing import Timing
 from trial.settings import Settings
 
@@ -27,7 +27,7 @@ class Ending:
         settings: Settings,
         *,
         timing: Timing,
-        recording: Recording,
+        recording: Recordings,
         message_log: MessageLog,
         emit: Callable[[Effect], None],
     ) -> None:

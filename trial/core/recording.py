@@ -14,7 +14,7 @@ _POLICY_FAILURES_SAID = 20
 _LONGEST_ERROR = 2000
 
 
-class Recording:
+class Recordings:
     """The recordings of a trial, one after the other. Lines can be written while one `is_open`."""
 
     def __init__(self, emit: Callable[[Effect], None]) -> None:

@@ -18,7 +18,7 @@ from trial.core.effects import Effect, Log, RecordLine, ResetPolicy, SaveAnswer,
 from trial.core.flow_control import Window
 from trial.core.presence import Presence, Rules, outcomes
 from trial.core.progress import Progress
-from trial.core.recording import Recording
+from trial.core.recording import Recordings
 from trial.core.seeds import policy_seed
 from trial.core.unfinished import RecordedTrial
 
@@ -63,7 +63,7 @@ class Session:
         recorded: RecordedTrial | None,
         trial_id: str,
         say_each: Callable[[Callable[[str], str | None]], None],
-        recording: Recording,
+        recording: Recordings,
         emit: Callable[[Effect], None],
     ) -> None:
         """In the places of `vacant` a policy plays from the start. Those of `gone` are of members who never come back:

@@ -65,7 +65,7 @@ from trial.core.message_log import MessageLog
 from trial.core.participants import Alone, Participants
 from trial.core.players import Player, alone
 from trial.core.progress import Progress
-from trial.core.recording import Recording, words_of
+from trial.core.recording import Recordings, words_of
 from trial.core.session import Session
 from trial.core.steps import Steps
 from trial.core.timing import Due, Timing
@@ -115,7 +115,7 @@ class Trial:
         self._emit = self._effects.append
         self._messages = MessageLog()
         self._timing = Timing(self.config)
-        self._recording = Recording(self._emit)
+        self._recording = Recordings(self._emit)
         self._clients = Clients(self.config, self._timing, self._emit, assets)
         self._commands = Commands(self.config, self._clients, self._messages)
         self._agent = AgentCall(self._emit)

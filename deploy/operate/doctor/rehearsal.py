@@ -40,7 +40,7 @@ STAGES = {
 
 
 @dataclass
-class StateTimes:
+class SecondsToStates:
     """Seconds from the start message to each state."""
 
     seconds: dict[State, float] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class Rehearsal:
         self._repository = Repository(platform.documents)
         self._name = f"rehearsal-{secrets.token_hex(6)}"
         self.user_id = ids.new_session_id() if project.has_sessions else self._name
-        self.took = StateTimes()
+        self.took = SecondsToStates()
         self.left: list[Finding] = []  # what was found after an interruption
         self._record: Server | None = None
 

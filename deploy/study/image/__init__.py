@@ -20,7 +20,7 @@ __all__ = ["Image", "Plan", "build", "plan"]
 
 
 @dataclass(frozen=True)
-class Plan:
+class ImagePlan:
     """What a project's image must hold, and the image's `uri` (by its digest) if there is one already."""
 
     content: str  # the tag that says what is in it
@@ -47,7 +47,7 @@ def plan(
     again: bool = False,
     base: str = "",
     trial: Mapping[str, Any] | None = None,
-) -> Plan:
+) -> ImagePlan:
     """Look at the project's files and at the repository; nothing is changed. `again`: build in any case. `trial`: the
     section of config.yml, with which the agent is tried.
 
@@ -59,10 +59,10 @@ def plan(
     images = repository.images()
     cache = "" if again else images.alike(project_id)
     order = Order(repository, content, images.next_tag(content), bundle, fresh=again, cache_from=cache)
-    return Plan(content, bundle, None if again else images.of(content), order)
+    return ImagePlan(content, bundle, None if again else images.of(content), order)
 
 
-def build(installation: Installation, wanted: Plan, *, on_aws: bool = False) -> Image:
+def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
     """Return the image of the plan, and build it if there is none. Raises `Problem`.
 
     Built by the Docker of this machine, or by CodeBuild where there is none or `on_aws`.

@@ -9,7 +9,7 @@ from typing import Any
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Server
 from hippodrome.participants.answers import Answers
-from hippodrome.participants.waiting import Waiting
+from hippodrome.participants.waiting import ServerStates
 from hippodrome.ports import Platform
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
@@ -23,7 +23,7 @@ class StepServices:
     project_cache: ProjectCache
     repository: Repository
     answers: Answers
-    waiting: Waiting
+    waiting: ServerStates
 
     def state(
         self, project: Project, user_id: str, step: Step | None, record: Server | None, since: datetime | None = None

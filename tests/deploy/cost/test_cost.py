@@ -16,7 +16,16 @@ from deploy.aws.account import open_account
 from deploy.code.template import Template
 from deploy.cost.billed import billed
 from deploy.cost.cost import _fixed_resources, _study
-from deploy.cost.estimate import POLLS, FixedResources, Study, assumptions, month_lines, study_lines, total, warm
+from deploy.cost.estimate import (
+    POLLS,
+    FixedResources,
+    StudyToEstimate,
+    assumptions,
+    month_lines,
+    study_lines,
+    total,
+    warm,
+)
 from deploy.cost.prices import REGION, Price, Prices, Usd, current
 from deploy.cost.spent import spent
 from hippodrome.config import read_project
@@ -25,8 +34,8 @@ from testing.studies import study
 from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
-MAZE = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
-PAIRS = Study(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15, players=2)
+MAZE = StudyToEstimate(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
+PAIRS = StudyToEstimate(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15, players=2)
 HOUR = 0.04048 + 2 * 0.004445
 
 
@@ -43,7 +52,10 @@ def test_the_servers_cost_what_fargate_charges_for_their_time() -> None:
 
 
 def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
-    few, many = study_lines(MAZE, Prices()), study_lines(Study(**{**vars(MAZE), "participants": 1000}), Prices())
+    few, many = (
+        study_lines(MAZE, Prices()),
+        study_lines(StudyToEstimate(**{**vars(MAZE), "participants": 1000}), Prices()),
+    )
     for one, ten in zip(few, many, strict=True):
         assert one.usd.low <= one.usd.likely <= one.usd.high, one
         assert ten.usd.likely == pytest.approx(10 * one.usd.likely)
@@ -57,7 +69,7 @@ def test_requests_that_a_server_has_signed_are_counted() -> None:
     lines = {line.what: line for line in study_lines(MAZE, Prices())}
     looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS.likely)
     assert lines["HTTP API"].usd.likely >= (looks + 4 * MAZE.participants) * Prices().http_request.usd
-    none = {line.what: line for line in study_lines(Study(**{**vars(MAZE), "games": False}), Prices())}
+    none = {line.what: line for line in study_lines(StudyToEstimate(**{**vars(MAZE), "games": False}), Prices())}
     assert none["HTTP API"].usd.likely == pytest.approx(
         MAZE.participants * (2 * MAZE.steps - 1) * Prices().http_request.usd
     )
@@ -82,7 +94,7 @@ def test_what_the_pages_say_an_idle_installation_costs() -> None:
 
 
 def test_a_study_without_a_game_needs_no_servers() -> None:
-    lines = {line.what: line for line in study_lines(Study(**{**vars(MAZE), "games": False}), Prices())}
+    lines = {line.what: line for line in study_lines(StudyToEstimate(**{**vars(MAZE), "games": False}), Prices())}
     assert not any(what.startswith(("Servers", "Public")) for what in lines)
     assert lines["SQS"].usd.high == 0
     assert lines["HTTP API"].usd.likely > 0
@@ -92,7 +104,7 @@ def test_a_server_for_every_opened_link_is_said(tmp_path: Path) -> None:
     """Those who look and leave are no participants, so no figure holds their servers."""
     said = "Every opened link starts a server."
     assert not any(said in line for line in assumptions(MAZE))
-    assert any(said in line for line in assumptions(Study(**{**vars(MAZE), "at_link": True})))
+    assert any(said in line for line in assumptions(StudyToEstimate(**{**vars(MAZE), "at_link": True})))
     (tmp_path / "steps").mkdir()
     for page in ("consent", "rules", "thanks"):
         (tmp_path / "steps" / f"{page}.html").write_text("x")
@@ -480,7 +492,7 @@ def test_participants_who_play_together_share_a_server_and_wait_in_a_lobby() -> 
     assert pairs["HTTP API"].usd.likely > alone["HTTP API"].usd.likely
     assert any("A server for each 2: 15 minutes likely" in line for line in assumptions(PAIRS))
     assert not any("lobby" in line for line in assumptions(MAZE))
-    assert Study(participants=5, steps=5, cpu=1, memory=2, max_runtime=30, players=2).servers == 3
+    assert StudyToEstimate(participants=5, steps=5, cpu=1, memory=2, max_runtime=30, players=2).servers == 3
 
 
 def test_the_longest_wait_in_a_lobby_is_the_patience_of_the_study() -> None:

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from deploy.stack.deletion_failures import TABLE, Recovery, recoveries, recovery_from
-from deploy.stack.stack import Failure
+from deploy.stack.stack import FailedResource
 from testing.template import template
 
 REPORTED = [  # the type, the sentence, what helps; sources beside them
@@ -76,8 +76,8 @@ FOR_PEOPLE = [
 ]
 
 
-def failure(kind: str, reason: str) -> Failure:
-    return Failure("Thing", f"AWS::{kind}", "id", reason)
+def failure(kind: str, reason: str) -> FailedResource:
+    return FailedResource("Thing", f"AWS::{kind}", "id", reason)
 
 
 @pytest.mark.parametrize(("kind", "reason", "helps"), REPORTED)

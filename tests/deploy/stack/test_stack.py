@@ -158,7 +158,7 @@ def test_a_refusal_that_is_not_absence_is_raised(world: World, monkeypatch: pyte
     ],
 )
 def test_known_causes_have_their_advice(reason: str, word: str) -> None:
-    failure = stacks.Failure("Thing", "AWS::X::Y", "", reason)
+    failure = stacks.FailedResource("Thing", "AWS::X::Y", "", reason)
     assert word in stacks.advice([failure])
 
 

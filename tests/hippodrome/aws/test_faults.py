@@ -25,8 +25,8 @@ import pytest
 
 from hippodrome.model import ids
 from testing import clocked_moto, exploration
-from testing.aws_faults import Fault, Kind, Made, Reach, invisible, kinds, reaches
-from testing.clocked_moto import GAME, PROJECT, Person, TimedInstallation
+from testing.aws_faults import AwsFault, Kind, Made, Reach, invisible, kinds, reaches
+from testing.clocked_moto import GAME, PROJECT, TimedInstallation, VisitorOnMoto
 from testing.exploration import sample
 from testing.quiet_log import quiet
 
@@ -40,7 +40,7 @@ class Journey:
     """One way through the study; `begin` starts it, and returns the participants who must reach the end."""
 
     name: str
-    begin: Callable[[TimedInstallation], list[Person]]
+    begin: Callable[[TimedInstallation], list[VisitorOnMoto]]
     changes: dict[str, Any] = field(default_factory=dict)  # of the project
     finishes: bool = True  # whether they come to the last page where nothing goes wrong
     spot: bool = True  # whether it has room
@@ -48,28 +48,28 @@ class Journey:
     alarms: bool = False  # whether messages may come to the dead letters, and so to somebody's eyes
 
 
-def from_the_link(installation: TimedInstallation) -> list[Person]:
-    return [Person(installation, USER)]
+def from_the_link(installation: TimedInstallation) -> list[VisitorOnMoto]:
+    return [VisitorOnMoto(installation, USER)]
 
 
-def at_the_game(installation: TimedInstallation) -> list[Person]:
-    return [Person(installation, USER, at_game=True)]
+def at_the_game(installation: TimedInstallation) -> list[VisitorOnMoto]:
+    return [VisitorOnMoto(installation, USER, at_game=True)]
 
 
-def two_at_once(installation: TimedInstallation) -> list[Person]:
-    return [Person(installation, user, at_game=True) for user in (USER, OTHER)]
+def two_at_once(installation: TimedInstallation) -> list[VisitorOnMoto]:
+    return [VisitorOnMoto(installation, user, at_game=True) for user in (USER, OTHER)]
 
 
-def nobody_plays(installation: TimedInstallation) -> list[Person]:
-    return [Person(installation, USER, at_game=True, leaves=True)]
+def nobody_plays(installation: TimedInstallation) -> list[VisitorOnMoto]:
+    return [VisitorOnMoto(installation, USER, at_game=True, leaves=True)]
 
 
-def ends_by_itself(installation: TimedInstallation) -> list[Person]:
+def ends_by_itself(installation: TimedInstallation) -> list[VisitorOnMoto]:
     installation.ran = lambda task: installation.clock.after(40, lambda: installation.end(task))
     return nobody_plays(installation)
 
 
-def spot_strikes(installation: TimedInstallation) -> list[Person]:
+def spot_strikes(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """AWS takes the first task back while the participant plays."""
     first: list[str] = []
 
@@ -82,7 +82,7 @@ def spot_strikes(installation: TimedInstallation) -> list[Person]:
     return at_the_game(installation)
 
 
-def stop_overtakes_start(installation: TimedInstallation) -> list[Person]:
+def stop_overtakes_start(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """Told to stop before it was started; the participant then asks for another one."""
     installation.hold["start"] = 20
     people = at_the_game(installation)
@@ -91,14 +91,14 @@ def stop_overtakes_start(installation: TimedInstallation) -> list[Person]:
     return people
 
 
-def stopped_while_it_starts(installation: TimedInstallation) -> list[Person]:
+def stopped_while_it_starts(installation: TimedInstallation) -> list[VisitorOnMoto]:
     installation.clock.after(
         5, lambda: installation.publish("stop", {"projectId": PROJECT, "userId": USER, "attempt": 1})
     )
     return at_the_game(installation)
 
 
-def no_event_tells(installation: TimedInstallation) -> list[Person]:
+def no_event_tells(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """The task ends after a while, and the event is lost: the sweep sees it, ten minutes after the request."""
     first: list[str] = []
 
@@ -113,22 +113,22 @@ def no_event_tells(installation: TimedInstallation) -> list[Person]:
 
     installation.ran = ran
     installation.sweeps_from = installation.clock.seconds + 600
-    return [Person(installation, USER, at_game=True, comes=1000)]
+    return [VisitorOnMoto(installation, USER, at_game=True, comes=1000)]
 
 
-def no_timer_fires(installation: TimedInstallation) -> list[Person]:
+def no_timer_fires(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """Nobody plays, and the timer is gone."""
     installation.clock.after(60, installation._schedules.clear)
     installation.sweeps_from = installation.clock.seconds + 540
     return nobody_plays(installation)
 
 
-def by_the_relays(installation: TimedInstallation) -> list[Person]:
+def by_the_relays(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """A program starts its server, stops it with a delay, and a second time at once."""
     person = nobody_plays(installation)[0]
 
     def ask(relay: str, form: dict[str, str]) -> Iterator[float]:
-        for _ in range(Person.TRIES):
+        for _ in range(VisitorOnMoto.TRIES):
             answer = installation.ask(relay, "POST", {"projectId": PROJECT, "userId": USER}, form)
             if answer and answer["status"] == 202:
                 return
@@ -147,7 +147,7 @@ def by_the_relays(installation: TimedInstallation) -> list[Person]:
     return [person]
 
 
-def leftovers(installation: TimedInstallation) -> list[Person]:
+def leftovers(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """Everything of a server that is closed; the first sweep comes at once."""
     label = ids.server_label(PROJECT, USER)
     name, now = ids.server_name(label, 1), installation.clock.now()
@@ -188,12 +188,12 @@ def leftovers(installation: TimedInstallation) -> list[Person]:
     return []
 
 
-def registering(installation: TimedInstallation) -> list[Person]:
+def registering(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """A new version of the study; the researcher registers again if that failed."""
     changed = {**installation.registration, "name": "Another name"}
 
     def researcher() -> Iterator[float]:
-        for _ in range(Person.TRIES):
+        for _ in range(VisitorOnMoto.TRIES):
             try:
                 answer = installation.invoke("update_project_master_list", {"project": changed})
             except Exception as error:  # noqa: BLE001 - what Lambda tells the caller
@@ -215,16 +215,16 @@ def registered(installation: TimedInstallation) -> list[str]:
     return [] if found == expected else [f"registered: {[(project, name) for project, name, _ in found]}"]
 
 
-def erasing(installation: TimedInstallation) -> list[Person]:
+def erasing(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """A participant is erased while their server runs; the administrator repeats it if it was interrupted."""
-    Person(installation, USER, at_game=True, leaves=True)
+    VisitorOnMoto(installation, USER, at_game=True, leaves=True)
     installation.kept.clear()
     installation.put(f"{PROJECT}/users/{OTHER}/answers/1.json", b'{"answers": {"said": "stays"}}')
     installation.kept[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
 
     def administrator() -> Iterator[float]:
         yield 200  # a start message that failed comes again after 90 seconds, and would begin what was erased anew
-        for _ in range(Person.TRIES):
+        for _ in range(VisitorOnMoto.TRIES):
             try:
                 left = installation.erase(PROJECT, USER)
             except Exception as error:  # noqa: BLE001 - what the command line makes a sentence of
@@ -267,7 +267,7 @@ class Outcome:
     """What came of one run."""
 
     journey: str
-    fault: Fault | None
+    fault: AwsFault | None
     made: Made | None
     calls: list[Made]
     wrong: list[str]  # nothing where all is well
@@ -277,7 +277,7 @@ class Outcome:
         return f"{self.journey}: {self.fault} ({self.made}): {'; '.join(self.wrong)}. On the way: {self.failures}"
 
 
-def run(installation: TimedInstallation, journey: Journey, fault: Fault | None = None) -> Outcome:
+def run(installation: TimedInstallation, journey: Journey, fault: AwsFault | None = None) -> Outcome:
     """One run of a journey."""
     installation.begin(fault)
     installation.injector.spot = journey.spot
@@ -298,22 +298,22 @@ def run(installation: TimedInstallation, journey: Journey, fault: Fault | None =
     return Outcome(journey.name, fault, made, injector.calls, wrong, installation.failures)
 
 
-def plan(calls: Calls, each: int = EACH) -> dict[str, list[Fault]]:
+def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
     """The fault points of each journey, by the rule above."""
     combos = {c.action: every(c.action) for made in calls.values() for c in made}
     turn = {action: itertools.cycle(order(found)) for action, found in combos.items()}
-    points: dict[str, list[Fault]] = {name: [] for name in calls}
+    points: dict[str, list[AwsFault]] = {name: [] for name in calls}
     last: dict[str, tuple[str, int]] = {}
     for name, made in calls.items():
         for number, (_, action) in enumerate(made, 1):
             last[action] = (name, number)
             chosen = itertools.islice(turn[action], min(each, len(combos[action])))
-            points[name] += [Fault(number, kind, reach) for kind, reach in chosen]
+            points[name] += [AwsFault(number, kind, reach) for kind, reach in chosen]
     done = {(calls[name][p.number - 1].action, p.kind) for name, found in points.items() for p in found}
     for action, found in combos.items():
         name, number = last[action]
         missing = {kind: reach for kind, reach in order(found)[::-1] if (action, kind) not in done}
-        points[name] += [Fault(number, kind, reach) for kind, reach in missing.items()]
+        points[name] += [AwsFault(number, kind, reach) for kind, reach in missing.items()]
     return points
 
 
@@ -387,7 +387,7 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
 ) -> None:
     """The exploration sees what it should: the same faults, without what repairs them."""
 
-    def unswept(installation: TimedInstallation) -> list[Person]:
+    def unswept(installation: TimedInstallation) -> list[VisitorOnMoto]:
         installation.sweeps_from = math.inf
         return from_the_link(installation)
 
@@ -395,4 +395,6 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
     monkeypatch.setattr(clocked_moto, "HORIZON", 1800.0)
     installation.hold_study()
     stops = [n for n, call in enumerate(calls[JOURNEYS[0].name], 1) if call.function == "stop_server"]
-    assert all(run(installation, Journey("unswept", unswept), Fault(n, Kind.CONNECT, Reach.CALL)).wrong for n in stops)
+    assert all(
+        run(installation, Journey("unswept", unswept), AwsFault(n, Kind.CONNECT, Reach.CALL)).wrong for n in stops
+    )

@@ -34,7 +34,7 @@ from local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 from testing.servers import Servers
-from testing.simulation.people import Person
+from testing.simulation.people import SimulatedParticipant
 from testing.simulation.world import PROJECT as SIMULATED
 from testing.simulation.world import World
 from testing.studies import PAGES, installed, study
@@ -457,7 +457,7 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
         return arn
 
     tasks.run = counted  # type: ignore[method-assign]
-    arrived = [Person(world, number) for number in range(70)]
+    arrived = [SimulatedParticipant(world, number) for number in range(70)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, 240))
     world.run(2 * 3600)

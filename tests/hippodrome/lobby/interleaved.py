@@ -25,7 +25,7 @@ from hippodrome.model.records import from_json
 from hippodrome.ports import Document, Entry, Message, Topic
 from hippodrome.storage.repository import Repository
 from testing.fake_platform import FakeBus, FakeDocuments, FakePlatform
-from testing.port_faults import Crash, Fault, call_with_fault
+from testing.port_faults import Crash, PortFault, call_with_fault
 from tests.hippodrome.lobby.waiting_room import pairs, serve
 
 ENDS = (Crash, ConnectionError)
@@ -136,14 +136,14 @@ class Crossing:
             self.running.append(made)
         return made
 
-    def advance(self, one: Running, fault: Fault | None = None) -> None:
+    def advance(self, one: Running, fault: PortFault | None = None) -> None:
         """Let a function make its next call."""
         one.calls += 1
         one.thread.switch(fault)
         if one.is_over:
             self.running.remove(one)
 
-    def finish(self, one: Running, fault: Fault | None = None, at: int = 0) -> Running:
+    def finish(self, one: Running, fault: PortFault | None = None, at: int = 0) -> Running:
         """Let a function make all its calls; the one with this number, from 1, has the fault."""
         while not one.is_over:
             self.advance(one, fault if one.calls + 1 == at else None)

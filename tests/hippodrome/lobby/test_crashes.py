@@ -10,11 +10,11 @@ import pytest
 from hippodrome.lobby import decisions
 from hippodrome.lobby.lobby import LobbyState
 from testing.exploration import sample
-from testing.port_faults import Fault
+from testing.port_faults import PortFault
 from tests.hippodrome.lobby.interleaved import Crossing, Running
 from tests.hippodrome.lobby.waiting_room import pairs, serve
 
-FAULTS = [Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY, Fault.ERROR]
+FAULTS = [PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER, PortFault.REPLY, PortFault.ERROR]
 USERS = ["ann", "bob", "cem", "dan"]
 Act = Callable[[Crossing], Running]
 
@@ -75,7 +75,7 @@ JOURNEYS = [
 ]
 
 
-def play(crossing: Crossing, acts: list[Act], fault: Fault | None, at: int) -> int:
+def play(crossing: Crossing, acts: list[Act], fault: PortFault | None, at: int) -> int:
     """Play these functions one after the other; the call with this number fails. How many calls there were."""
     calls = 0
     for act in acts:
@@ -115,7 +115,7 @@ def test_what_was_interrupted_is_finished_by_the_sweep_if_no_member_asks() -> No
     count = play(crossing := Crossing(), pair(crossing)[:4], None, 0)
     for at in range(1, count + 1):
         crossing = Crossing()
-        play(crossing, pair(crossing)[:4], Fault.CRASH_AFTER, at)
+        play(crossing, pair(crossing)[:4], PortFault.CRASH_AFTER, at)
         crossing.platform.wait(seconds=60)
         crossing.finish(crossing.repair())
         assert crossing.wrong(USERS, at_rest=True) == [], at

@@ -17,12 +17,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from hippodrome.lobby.lobby import LobbyState
 from testing.exploration import examples
-from testing.port_faults import Fault
+from testing.port_faults import PortFault
 from tests.hippodrome.lobby.interleaved import Crossing
 from tests.hippodrome.lobby.waiting_room import pairs
 
 USERS = ["ann", "bob", "cem", "dan", "eve"]
-FAULTS = [Fault.CRASH_BEFORE, Fault.CRASH_AFTER, Fault.REPLY, Fault.ERROR]
+FAULTS = [PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER, PortFault.REPLY, PortFault.ERROR]
 users = st.sampled_from(USERS)
 numbers = st.integers(0, 7)
 
@@ -81,7 +81,7 @@ class Machine(RuleBasedStateMachine):
 
     @precondition(lambda self: self.crossing.running)
     @rule(which=numbers, fault=st.sampled_from(FAULTS))
-    def fail(self, which: int, fault: Fault) -> None:
+    def fail(self, which: int, fault: PortFault) -> None:
         self.crossing.advance(self.crossing.running[which % len(self.crossing.running)], fault)
 
     @rule(seconds=st.sampled_from([0.3, 1.0, 2.0, 6.0, 12.0, 45.0]))

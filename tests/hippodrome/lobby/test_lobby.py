@@ -17,7 +17,7 @@ from hippodrome.model.memberships import Membership
 from hippodrome.model.records import to_json
 from hippodrome.ports import Entry, Topic
 from protocol.keys import membership_key
-from testing.port_faults import Fault
+from testing.port_faults import PortFault
 from tests.hippodrome.lobby.interleaved import Crossing
 from tests.hippodrome.lobby.waiting_room import WaitingRoom, pairs, waits
 
@@ -637,7 +637,7 @@ def test_a_lost_reply_of_the_document_does_not_propose_twice() -> None:
     crossing.finish(crossing.visit("ann"))
     crossing.platform.wait(seconds=1)
     before = len(crossing.platform.made)
-    crossing.finish(crossing.visit("bob"), Fault.REPLY, at=6)
+    crossing.finish(crossing.visit("bob"), PortFault.REPLY, at=6)
     assert crossing.platform.made[before + 5] == f"create {decisions.key('maze')}", "this call's reply is lost"
     assert len(crossing.decisions()["proposed"]) == 1
 

@@ -10,7 +10,7 @@ import pytest
 
 from hippodrome.model import server
 from hippodrome.model.server import Reason, Server, State
-from hippodrome.participants.waiting import FAILURES, Waiting
+from hippodrome.participants.waiting import FAILURES, ServerStates
 from hippodrome.ports import Address
 from hippodrome.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
@@ -31,10 +31,12 @@ def running(seconds: float) -> Server:
     return server.ready(named, NOW + timedelta(seconds=seconds))
 
 
-def told(record: Server | None, waiting: Waiting | None = None, **changes: Any) -> dict[str, Any]:
+def told(record: Server | None, waiting: ServerStates | None = None, **changes: Any) -> dict[str, Any]:
     project = study()
     asked: dict[str, Any] = {"dns": PLATFORM.dns, "now": NOW + timedelta(seconds=7.4), **changes}
-    return (waiting or Waiting(PLATFORM.settings, SECRETS)).state(project, "alice", project.steps[2], record, **asked)
+    return (waiting or ServerStates(PLATFORM.settings, SECRETS)).state(
+        project, "alice", project.steps[2], record, **asked
+    )
 
 
 def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came() -> None:
@@ -54,7 +56,7 @@ def test_before_there_is_a_server_its_start_is_queued_since_the_participant_came
 
 
 def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> None:
-    waiting, project = Waiting(PLATFORM.settings, SECRETS), study()
+    waiting, project = ServerStates(PLATFORM.settings, SECRETS), study()
     assert waiting.state(project, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] == "3"
     no_game = study(steps=[project.steps[0], project.steps[-1]])
     assert waiting.state(no_game, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] is None
@@ -77,7 +79,7 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
 
 
 def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
-    waiting = Waiting(PLATFORM.settings, SECRETS)
+    waiting = ServerStates(PLATFORM.settings, SECRETS)
     assert told(running(10), waiting)["typical"] == 10
     for seconds in (30, 20.4, 60, 70):
         told(running(seconds), waiting)

@@ -13,6 +13,7 @@ import pytest
 
 from protocol import exits
 from testing.waiting import until
+from tests.trial.client_messages import play_to_the_end
 from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
@@ -361,14 +362,10 @@ def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
             await client.say(command="start")
             await client.say(command="good")
             await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
-        server.log.with_name("go_on").touch()
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
 
     asyncio.run(journey())
+    server.log.with_name("go_on").touch()
+    play_to_the_end(server, open_client)
     assert server.wait() == 0
     first, second = server.recordings().values()
     assert values(first) == [
@@ -400,14 +397,7 @@ def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, ope
     )
     server = launch(agent, {**TRIAL, "callbackSeconds": 0.05})
 
-    async def journey():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-
-    asyncio.run(journey())
+    play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "finished"
     assert server.answer()["answers"]["frames"] == 40
@@ -463,13 +453,6 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
             await client.say(command="start")
             await client.until(lambda: len(client.frames) > 10)
 
-    async def rest(server):
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-
     trial = {**TRIAL, "maxEpisodes": 1}
     first = launch(deterministic, trial, SERVER="a-1")
     asyncio.run(some(first))
@@ -477,7 +460,7 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
     first.log.with_name("go_on").touch()
     first.wait()
     second = launch(deterministic, trial, SERVER="a-2")
-    asyncio.run(rest(second))
+    play_to_the_end(second, open_client)
     assert second.wait() == 0
     (early,), (late,) = (list(second.recordings(server=name).values()) for name in ("a-1", "a-2"))
     recorded = [[line["value"] for line in found if line["kind"] == "callback"] for found in (early, late)]

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.trial.client_messages import play_to_the_end
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, run_experiment
 from tests.trial.sessions import SID, answer, form, member, recordings
 from trial.interactive_gym import playing
@@ -43,14 +44,7 @@ def play(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> An
     """A server of the project, whose game was played to its end."""
     server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
 
-    async def journey() -> None:
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-
-    asyncio.run(journey())
+    play_to_the_end(server, open_client)
     assert server.wait() == 0, server.said()
     return server
 

@@ -19,7 +19,7 @@ from deploy.operate.doctor import addresses
 from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from deploy.operate.doctor.play import WITHIN, upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
-from deploy.operate.doctor.play.scene import Scene
+from deploy.operate.doctor.play.scene import RehearsalContext
 from deploy.operate.doctor.play.transcript import LINES, Transcript
 from deploy.operate.doctor.play.walk import Walk, each_once
 from hippodrome.model.project import Project
@@ -63,7 +63,7 @@ class Play:
             installation["HostedZoneId"],
             installation["RootDomain"],
         )
-        self._scene = Scene(
+        self._scene = RehearsalContext(
             context,
             self._copy,
             site(context, self._copy.id),

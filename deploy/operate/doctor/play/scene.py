@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 @dataclass
-class Scene:
+class RehearsalContext:
     """What every part needs. By the time `until` of `clock`, all must be over."""
 
     context: CheckContext

@@ -45,7 +45,7 @@ LONGEST = 1_000  # characters of a line: some are a server's own words, whatever
 
 
 @dataclass(frozen=True)
-class Line:
+class TranscriptLine:
     """One line: its key, its mark, when it was said (seconds from the beginning), and what was measured."""
 
     key: str
@@ -60,7 +60,7 @@ class Transcript:
     """The lines until now. Every text goes through `clean` first."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.lines: list[Line] = []
+        self.lines: list[TranscriptLine] = []
         self._clock = clock
         self._began = clock()
         self._secrets: set[str] = set()
@@ -85,7 +85,7 @@ class Transcript:
         """Add a line. Raises KeyError for one that is not among `LINES`."""
         LINES[key]
         at = round(self._clock() - self._began, 1)
-        self.lines.append(Line(key, mark, self.clean(text), self.clean(advice), at, seconds))
+        self.lines.append(TranscriptLine(key, mark, self.clean(text), self.clean(advice), at, seconds))
 
     def good(self, key: str, text: str, **seconds: Any) -> None:
         self.say(key, Mark.GOOD, text, **seconds)
@@ -120,7 +120,7 @@ class Transcript:
         }
 
 
-def _plain(line: Line) -> dict[str, Any]:
+def _plain(line: TranscriptLine) -> dict[str, Any]:
     told = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
     return {
         **told,

@@ -13,7 +13,7 @@ from deploy.cost.prices import Prices, Usd
 from deploy.cost.spent import spent
 from deploy.operate import snapshot
 from deploy.operate.doctor.check_context import CheckFailed
-from deploy.operate.doctor.play.scene import Scene
+from deploy.operate.doctor.play.scene import RehearsalContext
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import shown
 from deploy.operate.doctor.play.walk import left
@@ -42,7 +42,7 @@ class Timer:
     at the deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: RehearsalContext) -> None:
         self._scene = scene
         bot = scene.copy.user("timer")
         self.user = ids.new_session_id() if scene.copy.players > 1 else bot
@@ -113,7 +113,7 @@ class Timer:
         return datetime.strptime(found, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
 
 
-def sweep(scene: Scene, closed: Server | None) -> None:
+def sweep(scene: RehearsalContext, closed: Server | None) -> None:
     """Run the sweep, with a timer and a name that a closed server has left: it removes both. Raises `CheckFailed`."""
     if closed is None or not closed.is_closed:
         raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
@@ -152,7 +152,7 @@ def _type_of(body: bytes) -> str:
         return ""
 
 
-def alarm(scene: Scene) -> None:
+def alarm(scene: RehearsalContext) -> None:
     """Set one of the alarms off by hand, see that its topic was told, and set it back. Raises `CheckFailed`.
 
     CloudWatch takes an alarm back to its actual state by itself, often within seconds; what it has done is in the
@@ -209,7 +209,7 @@ def _subscribed(sns: Any, topic: str) -> int:
     return sum(one["SubscriptionArn"].startswith("arn:") for page in pages for one in page["Subscriptions"])
 
 
-def times(scene: Scene, records: Iterable[Server]) -> None:
+def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
     """Say how long AWS took for each stage, beside what the simulation assumes."""
     tasks = _tasks(scene, records)
     measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
@@ -235,7 +235,7 @@ def times(scene: Scene, records: Iterable[Server]) -> None:
     scene.transcript.say("times", mark, "; ".join(told) + ".", advice, **rounded)
 
 
-def _tasks(scene: Scene, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
+def _tasks(scene: RehearsalContext, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
     """What ECS still says of the servers' tasks: of stopped ones, for about an hour."""
     ecs = scene.context.account.client("ecs")
     found: dict[str, Mapping[str, Any]] = {}
@@ -258,7 +258,7 @@ def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
     return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
 
 
-def cost(scene: Scene, records: Iterable[Server]) -> None:
+def cost(scene: RehearsalContext, records: Iterable[Server]) -> None:
     """Say what the servers did cost, by their own records."""
     sum_ = spent(records, Prices(), datetime.now(UTC), {})
     minutes = sum_.hours * 60

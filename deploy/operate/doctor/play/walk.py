@@ -15,7 +15,7 @@ from bots.http import ask
 from console.formatting import count
 from deploy.core.finding import Mark
 from deploy.operate.doctor.check_context import CheckFailed
-from deploy.operate.doctor.play.scene import Scene
+from deploy.operate.doctor.play.scene import RehearsalContext
 from deploy.operate.doctor.play.transcript import shown
 from export import run as data
 from export.source import Bucket
@@ -39,7 +39,7 @@ LOGS = "See `python -m deploy logs --errors`."
 class Walk:
     """Sends bots through the copy. After that, each method adds a line on one result."""
 
-    def __init__(self, scene: Scene, bots: int) -> None:
+    def __init__(self, scene: RehearsalContext, bots: int) -> None:
         self._scene = scene
         bots += -(bots + 1) % scene.copy.players  # with the victim, as many as play together, or a multiple of that
         self.bots = [scene.bot(f"{number}", PLAY) for number in range(1, bots + 1)]
@@ -286,7 +286,7 @@ def each_once(records: Iterable[Server]) -> list[Server]:
     return list({record.label: record for record in records}.values())
 
 
-def left(scene: Scene, user: str) -> list[str]:
+def left(scene: RehearsalContext, user: str) -> list[str]:
     """What is left of a bot's server; nothing if the bot never had one."""
     record = scene.server(user)
     if record is None:
