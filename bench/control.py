@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 from urllib.parse import urlencode
@@ -71,6 +71,7 @@ def calls_of_requests() -> Iterator[Row]:
             yardstick=HIPPO_CALLS[kind],
             at_most=most,
             judge="value",
+            bound="ours: what a request may cost in a running study",
             detail=detail,
         )
 
@@ -113,6 +114,7 @@ def calls_of_a_participant() -> Iterator[Row]:
             yardstick=len(theirs),
             at_most=most,
             judge="value",
+            bound="ours: docs/architecture.md, 'What a participant costs', has the usual figures",
             detail=detail,
         )
 
@@ -137,6 +139,11 @@ def bytes_per_answer() -> Iterator[Row]:
                 browser.post(page, ANSWERS["4"])
             written.append(sum(size(call.params["Body"]) for call in calls if call.operation == "PutObject"))
             page = browser.get()
+    yield from judged_bytes(written, theirs)
+
+
+def judged_bytes(written: Sequence[int], theirs: int) -> Iterator[Row]:
+    """The rows of the bytes that each answer writes; `theirs` is what HIPPO writes for the last one."""
     first, last = written[0], written[-1]
     detail = {
         "each answer in turn": written,
@@ -145,7 +152,7 @@ def bytes_per_answer() -> Iterator[Row]:
     yield row("bytes written by the first answer", first, "bytes")
     yield row("bytes written by the last answer, against the first", last, "bytes", yardstick=first, at_most=1)
     yield row(
-        f"bytes written by the last of {steps} answers, against HIPPO's record of {steps} requests",
+        f"bytes written by the last of {len(written)} answers, against HIPPO's record of {len(written)} requests",
         last,
         "bytes",
         yardstick=theirs,
@@ -242,6 +249,11 @@ def cold_start() -> Iterator[Row]:
         for n in range(RUNS):
             for kind, measure in kinds.items():
                 taken[kind].append(measure(n + 1))
+    yield from judged_start(taken)
+
+
+def judged_start(taken: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator[Row]:
+    """The rows of the cold start: `taken` are seconds by the wall clock and of the processor, by what was run."""
     for at, clock in ((1, "CPU"), (0, "wall")):
         times = {kind: [1000 * run[at] for run in runs] for kind, runs in taken.items()}
         detail = {kind: f"{min(t):.0f} to {max(t):.0f} ms in {len(t)} fresh processes" for kind, t in times.items()} | {

@@ -290,6 +290,7 @@ def judged_cpu(found: Played, alone: float) -> Row:
         yardstick=alone,
         at_most=MOST_CPU,
         judge="value",
+        bound="ours, for a processor and a Python as quick as that of the image: their speed is below",
         detail={"share of the frames delivered": found.share, "MB resident": found.resident, **interpreter()},
     )
 

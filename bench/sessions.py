@@ -1,6 +1,6 @@
 """Crowds that play together on the simulated account, and faults of their journeys: `python -m bench sessions`.
 
-Figures of the simulation, not of AWS; what it assumes stands in the rows of `scale`. Participants come within a minute,
+Figures of the simulation, not of AWS; what it assumes is printed beside them. Participants come within a minute,
 read two pages, meet in the lobby, and play in pairs or fours. A server for each session starts ahead, while they read.
 Waiting counts from the lobby to the first picture. Beside it stands what AWS alone would take, where the server that is
 ready first is the next session's (`testing/simulation/aws_bound.py`).
@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from bench.scale import quantile, spread
+from bench.scale import assumed, quantile, spread
 from bench.table import Row, each, row
 from deploy.cost.prices import Prices
 from hippodrome.lobby import decisions
@@ -195,6 +195,7 @@ def judged(how: str, found: Together) -> Iterator[Row]:
             "left behind": left or "nothing",
             "servers that Spot took": sum(task.interrupted for task in world.platform.tasks.tasks.values()),
             "simulated in": f"{found.seconds:.0f} s",
+            **{f"assumed: {of}": text for of, text in assumed(world.conditions).items()},
         },
     )
     waits, alone = found.waits, found.alone

@@ -6,7 +6,7 @@ import json
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -25,24 +25,32 @@ def row(
     yardstick: float | None = None,
     at_most: float | None = None,
     at_least: float | None = None,
-    judge: str = "",
+    judge: Literal["ratio", "value"] = "ratio",
     bound: str = "",
     detail: Mapping[str, Any] | None = None,
 ) -> Row:
-    """One measurement. A goal (one of `at_most` and `at_least`) is about the ratio where there is a yardstick, else the
-    value, or what `judge` says.
+    """One measurement. A goal (one of `at_most` and `at_least`) is about the ratio where there is a yardstick, unless
+    `judge` is "value"; without one, it is about the value.
 
-    A row without a goal is information and says so. A goal without a yardstick is a bound, and `bound` says whose: a
-    promise of the documentation or a limit of AWS. `detail` is printed below the table.
+    Only a goal about a ratio makes a row *compared*. A goal about a value is a bound, even if a yardstick stands beside
+    it, and `bound` says whose: a promise of the documentation or a limit of AWS. A row without a goal is information
+    and says so. `detail` is printed below the table.
+
+    Raises ValueError if a goal cannot be judged: a bound that is nobody's, or a ratio to a yardstick of 0.
     """
     ratio = value / yardstick if yardstick else None
-    about_ratio = judge == "ratio" or (not judge and ratio is not None)
-    judged = ratio if about_ratio and ratio is not None else value
+    about_ratio = judge == "ratio" and yardstick is not None
     goal, met = None, None
-    if at_most is not None:
-        goal, met = f"≤ {at_most:g}", judged <= at_most
-    elif at_least is not None:
-        goal, met = f"≥ {at_least:g}", judged >= at_least
+    if at_most is not None or at_least is not None:
+        if about_ratio and ratio is None:
+            raise ValueError(f"{name}: the yardstick is 0, and the goal is about the ratio to it")
+        if not about_ratio and not bound:
+            raise ValueError(f"{name}: nobody says whose the bound is")
+        judged = ratio if about_ratio and ratio is not None else value
+        if at_most is not None:
+            goal, met = f"≤ {at_most:g}", judged <= at_most
+        elif at_least is not None:
+            goal, met = f"≥ {at_least:g}", judged >= at_least
     made: Row = {
         "name": name,
         "value": value,
@@ -51,7 +59,7 @@ def row(
         "ratio": ratio,
         "goal": f"{goal}x" if goal and about_ratio else goal,
         "met": met,
-        "kind": INFORMATION if met is None else COMPARED if yardstick is not None else BOUND,
+        "kind": INFORMATION if met is None else COMPARED if about_ratio else BOUND,
     }
     told = {**({"bound": bound} if bound else {}), **(detail or {})}
     return {**made, "detail": told} if told else made
@@ -102,11 +110,12 @@ def line(found: Mapping[str, Any]) -> str:
 
 
 def show(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print the table, what stands behind single rows, and what could not be measured."""
+    """Print the table, what stands behind single rows, the goals that are missed, and what could not be measured."""
     table = Table(title="Measured here and now", title_justify="left")
     table.add_column("what", ratio=1)
     for heading in ("value", "yardstick", "ratio", "goal"):
         table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("kind", no_wrap=True)
     table.add_column("met")
     group = None
     for found in rows:
@@ -120,6 +129,11 @@ def show(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
             console.print(f"\n[bold]{found['name']}[/bold]")
             for key, value in found["detail"].items():
                 console.print(f"  {key}: {_plain(value)}", highlight=False, markup=False, soft_wrap=True)
+    judged = [found for found in rows if found.get("met") is not None]
+    missed = [found for found in judged if not found["met"]]
+    console.print(f"\n[bold]Goals missed: {len(missed)} of {len(judged)}[/bold]")
+    for found in missed:
+        console.print(f"  {found['name']}", highlight=False, markup=False, soft_wrap=True)
     for found in rows:
         if not measured(found):
             console.print(f"\n[bold red]Not measured: {found.get('name')}[/bold red]")
@@ -135,7 +149,8 @@ def _cells(found: Mapping[str, Any]) -> list[str]:
         f"{number(found['value'])} {unit}".rstrip() if measured(found) else "[red]—[/red]",
         f"{number(found.get('yardstick'))} {unit}".rstrip() if found.get("yardstick") is not None else "",
         f"{ratio:.3g}x" if isinstance(ratio, int | float) else "",
-        str(found.get("goal") or ("" if not measured(found) else INFORMATION)),
+        str(found.get("goal") or ""),
+        str(found.get("kind") or ""),
         "" if met is None else "[green]yes[/green]" if met else "[yellow]no[/yellow]",
     ]
 

@@ -151,7 +151,12 @@ def waiting() -> Iterator[Row]:
         before = seen.cpu_seconds(pid)
         time.sleep(IDLE_SECONDS)
         share = (seen.cpu_seconds(pid) - before) / IDLE_SECONDS
-    yield row(
+    yield judged_idle(share)
+
+
+def judged_idle(share: float) -> Row:
+    """The row of a server without a participant: the share of a core that it takes."""
+    return row(
         "CPU with nobody connected",
         100 * share,
         "% of a core",

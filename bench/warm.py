@@ -22,7 +22,7 @@ from websockets.typing import Subprotocol
 
 from bench.bill import server_seconds
 from bench.pages import Line, serving
-from bench.scale import SEED, quantile, seconds_of
+from bench.scale import SEED, assumed, quantile, seconds_of
 from bench.study_on_moto import ROOT
 from bench.table import Row, each, row
 from deploy.cost import estimate
@@ -147,6 +147,8 @@ def _compared(what: str, came: Came, without: Came, goal: float | None = None) -
                 "p50, p95, max": [quantile(mine, 0.5), quantile(mine, 0.95), max(mine)],
                 "none warm: p50, p95, max": [quantile(theirs, 0.5), quantile(theirs, 0.95), max(theirs)],
                 "who": took,
+                "they": f"read a page for {0.5 * READS:g} to {1.5 * READS:g} s",
+                **({f"assumed: {of}": text for of, text in assumed(came.world.conditions).items()} if goal else {}),
             },
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from testing.simulation import functions
 from testing.simulation.cloud import CONCURRENCY, LATENCY, QUOTAS
 from testing.simulation.conditions import SLOW_FOR, Conditions
-from testing.simulation.people import POLLS
+from testing.simulation.people import PATIENCE, PLAY, POLLS, READ, RELOADS
 from testing.simulation.ports import MAX_CHANGES, PAGE
 from testing.simulation.tasks import ADDRESSES, DEPROVISIONED
 from testing.simulation.world import HOP, LOOPS, SWEEP_EVERY, TIMEOUTS, WIRES
@@ -33,6 +33,10 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "S3": f"a read or listing shows every write answered before it; a listing is a call for {PAGE:,} keys (S3 User "
         "Guide, data consistency model); LastModified has whole seconds (minio/minio-go pull request 1638)",
         "Spot": _spot(conditions),
+        "tasks that end before they run": f"{conditions.stillborn:.0%} ({OURS})",
+        "participants": f"read a page for {_span((0.5 * READ, 1.5 * READ))} and play for {PLAY:g} s where a row says nothing "
+        f"else; load the waiting page again after {RELOADS:g} s, give up after {PATIENCE:g} s there; a game waits for "
+        f"them for {conditions.idle:g} s ({OURS})",
         "events": f"{conditions.late:.0%} come 1 to 20 s late, {conditions.repeated:.0%} come twice ({OURS})",
         "events lost": f"{conditions.lost:.1%} ({OURS}; EventBridge calls the delivery of ECS's events durable)",
         "addresses seen late": f"{conditions.late_addresses:.0%}, {_span(conditions.address_late)} after the event that the "

@@ -14,6 +14,7 @@ with the network interface (`early`), or when the task runs. Both are modelled, 
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -30,6 +31,11 @@ ATTEMPTS = 5  # of botocore's legacy mode
 AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function again that has raised
 ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
 RULES = 300  # of an event bus: EventBridge quotas
+ASSUMED = (
+    f"the interface has its address {ATTACHED[0]:g} to {ATTACHED[1]:g} s after RunTask (our assumption); functions have "
+    "no timeout, CreateCluster and PutRule no quota of rate, and who has a name has a server; the rest is its source "
+    "(IRLL/HIPPO_Gym_AWS, August 2021)"
+)
 
 
 @dataclass
@@ -118,8 +124,9 @@ class Hippo:
             self.clock.sleep(PAUSE)
             self._call("ecs:DescribeTasks")
             if task.last in (Life.PROVISIONING, Life.RUNNING) and self.clock.seconds >= there:
-                self._call("ec2:DescribeNetworkInterfaces")
-                return True
+                with contextlib.suppress(Throttled):  # what this look raises is swallowed, and the next look comes
+                    self._call("ec2:DescribeNetworkInterfaces")
+                    return True
         return False
 
 

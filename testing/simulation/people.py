@@ -14,6 +14,7 @@ from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import World
 
+READ, PLAY = 20.0, 60.0  # seconds: for a page, half as long to half as long again; in the game
 MAX_TRIES = 4  # of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
@@ -57,7 +58,7 @@ class SimulatedParticipant:
     """One participant's way through the study, as a browser walks it."""
 
     def __init__(
-        self, world: World, number: int, *, read: float = 20.0, play: float = 60.0, leaves_at: str = ""
+        self, world: World, number: int, *, read: float = READ, play: float = PLAY, leaves_at: str = ""
     ) -> None:
         self.world, self.clock = world, world.clock
         self.visit = Visit(f"p{number:05d}", world.clock.seconds)

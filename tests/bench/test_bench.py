@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import collections
+import contextlib
 import dataclasses
 import io
 import json
@@ -24,6 +25,7 @@ from bench import __main__ as command
 from bench import (
     control,
     data,
+    functions,
     gym,
     load,
     memory,
@@ -45,7 +47,7 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server
 from testing import browser
 from testing.quiet_log import quiet
-from testing.simulation import aws_bound, hippo, world
+from testing.simulation import aws_bound, cloud, hippo, world
 from testing.simulation import tasks as ecs
 from testing.simulation.conditions import Conditions
 from testing.tasks import Life
@@ -142,9 +144,10 @@ def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> No
 def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "MANY", 3)
     with quiet():
-        served, sweep, cost = scale.many_at_once()
+        served, sweep, cut_off, cost = scale.many_at_once()
     assert_well_formed([served, sweep, cost])
     assert served["value"] == 100
+    assert cut_off["met"] is True
     an_hour = Prices().server_hour(1, 2, spot=True)
     assert an_hour.low < cost["value"] < 2 * an_hour.high, "they play for an hour"
 
@@ -158,7 +161,7 @@ def test_what_warm_servers_cost_is_what_the_command_says() -> None:
 def test_a_goal_is_about_the_ratio_where_there_is_a_yardstick() -> None:
     over = table.row("a", 30, "ms", yardstick=10, at_most=2)
     assert (over["ratio"], over["goal"], over["met"]) == (3, "≤ 2x", False)
-    by_value = table.row("a", 30, "bytes", yardstick=10, at_most=40, judge="value")
+    by_value = table.row("a", 30, "bytes", yardstick=10, at_most=40, judge="value", bound="ours")
     assert (by_value["ratio"], by_value["goal"], by_value["met"]) == (3, "≤ 40", True)
     without = table.row("a", 30, "ms")
     assert (without["ratio"], without["goal"], without["met"]) == (None, None, None)
@@ -349,6 +352,23 @@ def test_hippo_gives_up_an_address_after_a_minute_and_a_run_after_three_tries() 
     assert full["billed"] > 60
 
 
+def test_hippo_swallows_what_the_look_for_an_address_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(cloud.QUOTAS, "ec2:DescribeNetworkInterfaces", (1e-9, 0.0))
+    found = scale._hippo(2, 1.0, None, early=True)
+    assert found["failed"] == {"no address after a minute": 2}, "and Lambda does not invoke the function again"
+    assert found["throttled"]["ec2:DescribeNetworkInterfaces"] == 2 * hippo.TRIES * hippo.ATTEMPTS
+
+
+def test_crowds_say_what_they_assume(crowd: scale.Crowd) -> None:
+    with quiet():
+        pairs = sessions.crowd(sessions.PAIRS, Conditions(s3=(0.1, 0.2)), people=4, within=2.0)
+    served = scale.served("a crowd", [crowd], {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}, 1.0)["detail"]
+    assert {f"assumed: {of}" for of in scale.assumed(Conditions())} <= set(served)
+    assert "after RunTask (our assumption)" in served["assumed of HIPPO's way"]
+    together_ = next(sessions.judged("in pairs", pairs))["detail"]
+    assert [of for of in together_ if of.startswith("assumed")] == ["assumed: latency of a call"]
+
+
 def goals(file: Path) -> Iterator[tuple[str, set[str]]]:
     """Where `row` is called in a file, and with what."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -360,24 +380,46 @@ def test_each_row_with_a_goal_has_a_yardstick_or_says_whose_bound_it_is() -> Non
     found = [one for file in (study_on_moto.ROOT / "bench").rglob("*.py") for one in goals(file)]
     assert len(found) > 25
     judged = {where: with_ for where, with_ in found if with_ & {"at_most", "at_least"}}
-    assert [where for where, with_ in judged.items() if not with_ & {"yardstick", "bound"}] == []
+    assert [where for where, with_ in judged.items() if "bound" not in with_ and "yardstick" not in with_] == []
+    assert [where for where, with_ in judged.items() if "judge" in with_ and "bound" not in with_] == []
 
 
 def test_a_row_says_whether_it_is_compared_or_a_bound_or_information() -> None:
-    assert table.row("a", 3, "s", yardstick=2, at_most=2)["kind"] == "compared"
-    assert table.row("a", 3, "s", bound="AWS's", at_most=2)["kind"] == "bound"
-    beside = table.row("a", 3, "s", yardstick=2)
-    assert beside["kind"] == "information"
+    compared = table.row("a", 3, "s", yardstick=2, at_most=2)
+    bound = table.row("b", 3, "s", bound="AWS's", at_most=2)
+    beside = table.row("c", 3, "s", yardstick=2)
+    assert [row["kind"] for row in (compared, bound, beside)] == ["compared", "bound", "information"]
+    by_value = table.row("d", 3, "s", yardstick=2, at_most=2, judge="value", bound="ours")
+    assert by_value["kind"] == "bound", "the yardstick beside it decides nothing"
     text = io.StringIO()
-    table.show([beside], Console(file=text, width=100))
-    assert "information" in text.getvalue()
+    table.show([compared, bound, beside], Console(file=text, width=100))
+    assert re.findall("compared|bound|information", text.getvalue())[:3] == ["compared", "bound", "information"]
+
+
+def test_goals_that_are_missed_are_named_once_more() -> None:
+    text = io.StringIO()
+    rows = [table.row(name, value, "s", at_most=2, bound="ours") for name, value in (("slow", 3), ("quick", 1))]
+    table.show([*rows, table.row("information", 1, "s")], Console(file=text, width=100))
+    assert text.getvalue().partition("Goals missed: ")[2].split() == ["1", "of", "2", "slow"]
+
+
+def test_a_goal_that_cannot_be_judged_is_an_error() -> None:
+    with pytest.raises(ValueError, match="yardstick is 0"):
+        table.row("a", 3, "s", yardstick=0, at_most=5)
+    for yardstick in (None, 2):
+        with pytest.raises(ValueError, match="whose the bound is"):
+            table.row("a", 3, "s", yardstick=yardstick, judge="value", at_least=1)
+    assert table.row("a", 3, "s", yardstick=0)["ratio"] is None
 
 
 @pytest.mark.parametrize("of", ["ratio", "value"])
 @pytest.mark.parametrize("goal", ["at_most", "at_least"])
-def test_every_goal_can_be_missed_on_both_sides_of_its_bound(of: str, goal: str) -> None:
+def test_every_goal_can_be_missed_on_both_sides_of_its_bound(of: Any, goal: str) -> None:
     """All goals are judged here; what they are given by broken parts is tested above and below."""
-    met = [table.row("a", value, "", yardstick=10, judge=of, **{goal: 1})["met"] for value in (0.5, 1, 5, 10, 20)]
+    goals: dict[str, Any] = {goal: 1}
+    met = [
+        table.row("a", value, "", yardstick=10, judge=of, bound="ours", **goals)["met"] for value in (0.5, 1, 5, 10, 20)
+    ]
     below = {"ratio": [True, True, True, True, False], "value": [True, True, False, False, False]}[of]
     above = {"ratio": [False, False, False, True, True], "value": [False, True, True, True, True]}[of]
     assert met == (below if goal == "at_most" else above)
@@ -472,6 +514,63 @@ def test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals() -> N
     assert_well_formed(rows)
     assert [row["met"] for row in rows] == [True] * 4
     assert [row["met"] for row in all_rows(0.9, 1.3, 46.0)] == [False] * 4
+
+
+def test_pictures_that_cost_more_than_hippos_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "KINDS", {"Ms. Pac-Man": list, "a texture": list})
+    monkeypatch.setattr(trial, "unchanged", lambda frames, sent: 1.0)
+    for flat, other, met in ((0.19, 1.19, True), (0.21, 1.21, False)):
+        ours = iter([flat, flat, other, other])
+        monkeypatch.setattr(
+            trial, "cost", lambda _, encoder, ours=ours: (next(ours), 1.0, []) if encoder else (1, 1, [])
+        )
+        judged = [row["met"] for row in trial.encoding() if row["name"].startswith("CPU") and row["met"] is not None]
+        assert judged == [met, met]
+
+
+def test_a_server_that_is_busy_with_nobody_misses_its_goal() -> None:
+    assert [trial.judged_idle(share)["met"] for share in (0.009, 0.011)] == [True, False]
+
+
+def test_cold_starts_that_are_slow_miss_their_goals() -> None:
+    taken = {"ours": [(0.2, 0.1), (0.4, 0.2), (0.3, 0.15)], "yardstick": [(0.2, 0.1)] * 3}
+    assert [row["met"] for row in control.judged_start(taken)] == [True, True]
+    assert [row["met"] for row in control.judged_start({**taken, "yardstick": [(0.19, 0.09)] * 3})] == [False, False]
+    imports = [functions.judged_import(name, 0.13, 0.1, {}) for name in functions.CLIENTS]
+    assert [row["met"] for row in imports] == [False, *[None] * (len(imports) - 1)], "participants wait for one"
+    assert functions.judged_import("next_step", 0.12, 0.1, {})["met"]
+
+
+def test_requests_with_more_calls_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "on_moto", contextlib.nullcontext)
+    monkeypatch.setattr(control, "warm", lambda study: None)
+    kinds = {"GET step 1": [], "POST step 1": [], "POST step 2": ["sns:Publish"], "poll at step 3": []}
+    for more, met in ((2, True), (3, False)):
+        costs = [(name, [*calls, *["s3:GetObject"] * more]) for name, calls in kinds.items()]
+        monkeypatch.setattr(control, "travel", lambda *_, costs=costs: types.SimpleNamespace(costs=costs))
+        assert [row["met"] for row in control.calls_of_requests()] == [met] * 4
+
+
+def test_answers_that_write_more_each_time_miss_their_goals() -> None:
+    assert [row["met"] for row in control.judged_bytes([300, 300], 5000)] == [None, True, True]
+    assert [row["met"] for row in control.judged_bytes([300, 301], 300)] == [None, False, False]
+
+
+def test_a_warm_server_that_is_no_quicker_for_real_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    for quick, met in ((0.4, True), (0.6, False)):
+        monkeypatch.setattr(warm, "in_local_mode", lambda servers, _, quick=quick: [quick if servers else 1.0] * 3)
+        assert [row["met"] for row in warm.for_real()] == [met]
+
+
+def test_a_sweep_that_its_timeout_cuts_off_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its time is no more than the timeout then."""
+    monkeypatch.setitem(world.TIMEOUTS, "sweep", 0.001)
+    with quiet():
+        found = world.World(7)
+        found.run(700.0)
+        longest, cut_off = scale.sweeps(found)
+    assert longest["met"] is None
+    assert (cut_off["value"], cut_off["met"]) == (2, False)
 
 
 def test_a_slow_policy_that_was_never_late_shows_nothing() -> None:
@@ -627,3 +726,52 @@ def test_clients_of_the_bench_acknowledge_as_the_page_does(monkeypatch: pytest.M
     told = re.search(r"const ACK_WAIT = (\d+);", (pictures.ROOT / "web/game/connection.js").read_text(encoding="utf-8"))
     assert told is not None
     assert int(told[1]) == 1000 * load.TOGETHER
+
+
+# Each goal
+
+
+SEEN_MISSED: dict[str, Any] = {
+    "control.calls_of_requests": test_requests_with_more_calls_miss_their_goals,
+    "control.calls_of_a_participant": test_a_participant_whose_server_costs_more_calls_misses_the_goal,
+    "control.judged_bytes": test_answers_that_write_more_each_time_miss_their_goals,
+    "control.judged_start": test_cold_starts_that_are_slow_miss_their_goals,
+    "data.download": test_memory_that_grows_with_the_study_misses_its_goal,
+    "functions.judged_import": test_cold_starts_that_are_slow_miss_their_goals,
+    "gym._single": test_a_server_of_environments_that_is_dear_misses_its_goals,
+    "gym._batched": test_a_server_of_environments_that_is_dear_misses_its_goals,
+    "load.judged_cpu": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
+    "load.judged_core": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
+    "load.judged_policy": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
+    "pages.weights": test_a_heavy_game_page_misses_its_goal,
+    "scale.costs": test_functions_that_run_for_long_miss_their_goal,
+    "scale.faults_of_journeys": test_a_fault_that_strands_somebody_misses_its_goal,
+    "scale.served": test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal,
+    "scale.served_many": test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal,
+    "scale.small_account": test_pages_that_find_no_room_miss_their_goal,
+    "scale.sweeps": test_a_sweep_that_its_timeout_cuts_off_misses_its_goal,
+    "scale.waiting": test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting,
+    "scenes.judged": test_objects_that_are_late_or_large_miss_their_goals,
+    "sessions.judged": test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal,
+    "sessions.judged_faults": test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal,
+    "together.judged_game": test_games_of_several_that_deliver_too_little_miss_their_goals,
+    "together.judged_core": test_games_of_several_that_deliver_too_little_miss_their_goals,
+    "together.judged_views": test_views_that_are_late_or_apart_miss_their_goals,
+    "trial._seen": test_frames_that_are_dear_or_late_or_changed_miss_their_goals,
+    "trial.encoding": test_pictures_that_cost_more_than_hippos_miss_their_goals,
+    "trial.judged_idle": test_a_server_that_is_busy_with_nobody_misses_its_goal,
+    "warm._compared": test_warm_servers_that_do_not_help_or_stay_miss_their_goals,
+    "warm.an_hour": test_warm_servers_that_do_not_help_or_stay_miss_their_goals,
+    "warm.for_real": test_a_warm_server_that_is_no_quicker_for_real_misses_its_goal,
+}
+
+
+def test_each_goal_has_a_test_that_sees_it_missed() -> None:
+    """A new goal needs its test, and its line in the table above."""
+    functions_with_goals = set()
+    for file in (study_on_moto.ROOT / "bench").glob("*.py"):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            calls = [call for call in ast.walk(node) if isinstance(call, ast.Call) and ast.unparse(call.func) == "row"]
+            if {keyword.arg for call in calls for keyword in call.keywords} & {"at_most", "at_least"}:
+                functions_with_goals.add(f"{file.stem}.{getattr(node, 'name', '')}")
+    assert functions_with_goals == set(SEEN_MISSED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from datetime import timedelta
 
@@ -370,6 +371,21 @@ def test_a_listing_is_a_call_for_every_thousand_keys_and_sees_what_is_written_be
 )
 def test_each_fact_stands_among_the_assumptions(what):
     assert what in assumptions(Conditions())
+
+
+WORSE = {
+    "repeated": 0.5, "late": 0.5, "lost": 0.5, "no_spot": lambda seconds: True, "interrupted": 0.5,
+    "interrupted_after": (1.0, 2.0), "untold": 0.1, "late_addresses": 0.5, "address_late": (1.0, 2.0), "stillborn": 0.5,
+    "starts": (1.0, 2.0, 3.0), "propagation": (1.0, 2.0), "slow_zone": 0.5, "slow_propagation": (1.0, 2.0),
+    "busy_zone": (1.0, 2.0), "s3": (1.0, 2.0), "idle": 1.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", [field.name for field in dataclasses.fields(Conditions)])
+def test_each_condition_is_printed(what):
+    """Some of an interruption say nothing where there are none."""
+    usual = Conditions(interrupted=0.2)
+    assert assumptions(dataclasses.replace(usual, **{what: WORSE[what]})) != assumptions(usual)
 
 
 def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():
