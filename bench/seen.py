@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from bench.bare import PAGE
-from bench.pictures import GAME, ROOT, ms_pacman, texture
+from bench.pictures import GAME, KINDS, ROOT
 from bench.trial_server import trial_server
 from testing.browser import game_page, html_page
 from trial.pictures.frames import Frame
@@ -52,7 +52,8 @@ WATCH = """(() => {
   addEventListener("keyup", press(false), true);
 })()"""
 
-# The example's game, or a texture that scrolls, with a block in the corner that is white while "left" acts.
+# The example's game, Gymnasium's CartPole, or a texture that scrolls, with a block in the corner that is white while
+# "left" acts.
 AGENTS = {
     "Ms. Pac-Man": """
 import importlib.util, sys
@@ -68,6 +69,27 @@ class Agent(example.Agent):
         picture = super().render().copy()
         picture[:16, :16] = 255 * (self.action == LEFT)
         return picture
+""",
+    "CartPole, 600 x 400": """
+import gymnasium
+class Agent:
+    def start(self, game):
+        self.env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    def reset(self):
+        self.action = 0
+        self.env.reset(seed=7)
+    def step(self, action):
+        self.action = action
+        _, _, terminated, truncated, _ = self.env.step(action)
+        if terminated or truncated:  # it goes on: no picture of another game comes between
+            self.env.reset(seed=7)
+        return None, 0.0, False, False, {}
+    def render(self):
+        picture = self.env.render().copy()
+        picture[:16, :16] = 255 * (self.action == LEFT)
+        return picture
+    def close(self):
+        self.env.close()
 """,
     "scrolling texture, 600 x 400": """
 import sys
@@ -90,7 +112,7 @@ class Agent:
         pass
 """,
 }
-LEFT = {"Ms. Pac-Man": 3, "scrolling texture, 600 x 400": 1}
+LEFT = {"Ms. Pac-Man": 3, "CartPole, 600 x 400": 1, "scrolling texture, 600 x 400": 1}
 
 
 @dataclass
@@ -137,8 +159,7 @@ def ours(picture: str, rate: int) -> Iterator[tuple[str, int]]:
 @contextlib.contextmanager
 def bare(picture: str, rate: int) -> Iterator[tuple[str, int]]:
     """The yardstick's page and server, showing pictures of the same kind as JPEGs."""
-    whole = texture(700)
-    frames = ms_pacman()[:8] if LEFT[picture] == 3 else [whole[:, 3 * n : 3 * n + 600] for n in range(8)]
+    frames = KINDS[picture]()[:8]
     with tempfile.TemporaryDirectory() as folder:
         names = []
         for value in (0, 255):

@@ -166,7 +166,7 @@ def judged_idle(share: float) -> Row:
 
 
 def rows() -> Iterator[Row]:
-    """Measure everything, one row after another; about three minutes."""
+    """Measure everything, one row after another; about four minutes."""
     yield from each((encoding, in_chromium, waiting))
 
 

@@ -6,22 +6,28 @@ from typing import Any
 
 import pytest
 
-from bench import scenes, seen
+from bench import pictures, scenes, seen
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 
+def test_all_kinds_of_picture_are_looked_at() -> None:
+    assert list(seen.AGENTS) == list(seen.LEFT) == list(pictures.KINDS)
+
+
+@pytest.mark.parametrize("picture", ["CartPole, 600 x 400", "scrolling texture, 600 x 400"])
 @pytest.mark.parametrize(
     ("setting", "seconds"),
     [(seen.ours, 1.0), (seen.bare, 4.0)],  # the yardstick makes up for pictures that it was late with
     ids=["ours", "bare"],
 )
 def test_drawn_frames_and_effects_of_keys_are_timed(
-    chromium: Any, monkeypatch: pytest.MonkeyPatch, setting: Any, seconds: float
+    chromium: Any, monkeypatch: pytest.MonkeyPatch, setting: Any, seconds: float, picture: str
 ) -> None:
+    monkeypatch.setattr(pictures, "FRAMES", 8)
     monkeypatch.setattr(seen, "SECONDS", seconds)
     monkeypatch.setattr(seen, "PRESSES", 3)
-    found = seen.look(chromium, setting, "scrolling texture, 600 x 400", (30,), 30)
+    found = seen.look(chromium, setting, picture, (30,), 30)
     assert len(found.waits) == 6
     assert all(0 < wait < seen.PATIENCE for wait in found.waits)
     assert 0 < found.share[30] <= 1.1
