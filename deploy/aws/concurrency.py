@@ -22,9 +22,9 @@ PARAMETER = "StartConcurrency"
 
 
 def starts(limit: int) -> int:
-    """MaximumConcurrency of start_server in an account that has so many executions: at least half stay for pages.
+    """MaximumConcurrency of start_server in an account with so many executions. At least half of them stay for pages.
 
-    Less where AWS takes no less than 2 for each of the three mappings: of 10 executions, 4 stay.
+    In a small account fewer stay, because each of the three mappings must have at least 2: of 10 executions, 4 stay.
     """
     return min(USUAL, max(LEAST, limit // 2 - OTHERS))
 

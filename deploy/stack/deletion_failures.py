@@ -109,7 +109,7 @@ _DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECA
 
 
 def recovery_from(failure: FailedResource) -> Recovery | None:
-    """What helps against this failure; None if nothing that passes by itself, or that we can do."""
+    """What to do about this failure before the next try; None if it does not pass by itself and we cannot mend it."""
     if _DENIED.search(failure.reason):
         return None
     for known in TABLE:

@@ -223,7 +223,7 @@ SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
 
 
 def service_roles(account: Account) -> list[str]:
-    """Those of these roles that exist."""
+    """The names of the roles that AWS makes for the whole account (`SERVICE_ROLES`), if they exist."""
     iam = account.client("iam")
     found = []
     for name in SERVICE_ROLES:

@@ -84,7 +84,7 @@ def shard_share(limit: int, shard: int) -> int:
 def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
     """Whether the rooms of all shards add up to the limit (or to the number of participants, if they are more).
 
-    A shard with more participants than room counts with its participants.
+    If a shard has more participants than room, its participants are added instead of its room.
     """
     rooms = [shard_share(limit, n) if part.room is None else part.room for n, part in enumerate(parts)]
     return sum(map(max, rooms, counts(parts))) == max(limit, sum(counts(parts)))

@@ -164,7 +164,7 @@ class Decisions(Record, frozen=True):
 
 
 def key(project_id: str) -> str:
-    """The key of the document."""
+    """The key of a project's document of decisions."""
     return f"{LOBBIES}{project_id}.json"
 
 

@@ -33,8 +33,8 @@ class StartServer(Record, frozen=True):
     """Start topic: start this participant's server. `attempt` is from 1.
 
     `user_id` may also be a warm server's id, or a session's. If sessions of the project have several players, a
-    participant's message starts no server of their own: it says that they are under way to the game. `players`: of a
-    session, for how many it is; 0 if its record says that, or for as many as are registered now.
+    participant's message starts no server of their own: it says that they are under way to the game. `players` is the
+    number of players of a session; 0: the number that its record says, or else the one that is registered now.
     """
 
     project_id: str

@@ -187,7 +187,7 @@ class Trial:
         """The agent has started: these are the environment's players, and what earlier servers recorded of the step.
 
         In a session, `places` says which player each member plays, by their id, and `vacant` are the places of humans
-        that no member has: policies are in them. In those of `gone` nobody plays any more. `answered` are the answers
+        that no member has: policies are in them. In the places of `gone` nobody plays any more. `answered`: the answers
         of this step that some members have, by their ids.
         """
         if self.phase is not Phase.STARTING:

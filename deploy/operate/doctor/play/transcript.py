@@ -72,7 +72,7 @@ class Transcript:
     def clean(self, text: str) -> str:
         """The text without ids, tokens, and anything that reveals the account.
 
-        Nothing in it commands a terminal: a study's agent may have written a part of it.
+        It has no control characters either: a study's agent may have written a part of it.
         """
         text = "".join(character if character.isprintable() else " " for character in text)
         for secret in sorted(self._secrets, key=len, reverse=True):
