@@ -127,7 +127,7 @@ class Pools:
         return {p.id for p in self._project_cache.projects(fresh=timedelta(0)) if p.live and p.warm_servers}
 
     def _projects_with_pool(self) -> set[str]:
-        """The registered projects that have a pool document, be it empty."""
+        """The registered projects that have a pool document, even an empty one."""
         registered = {warm_pool.pool_key(p.id): p.id for p in self._project_cache.projects(fresh=timedelta(0))}
         found = (entry.key for entry in self._platform.documents.list(warm_pool.POOLS))
         return {registered[key] for key in found if key in registered}
