@@ -30,13 +30,14 @@ BLOCK = 16  # pixels; the block in the corner that shows whether the key is down
 
 # Runs in the page before its own scripts. Notes each draw on the canvas, and from a key until the corner shows it.
 WATCH = """(() => {
-  const seen = (window.benchSeen = { draws: [], waits: [], wanted: null, since: 0 });
+  const seen = (window.benchSeen = { draws: [], drawn: 0, waits: [], wanted: null, since: 0 });
   const draw = (name, corner) => {
     const plain = CanvasRenderingContext2D.prototype[name];
     CanvasRenderingContext2D.prototype[name] = function (...parts) {
       plain.apply(this, parts);
       const value = seen.wanted === null ? 0 : corner(this, parts[0]);
       seen.draws.push(performance.now());
+      seen.drawn++;
       if (seen.wanted === null || value > 128 !== seen.wanted) return;
       seen.waits.push(performance.now() - seen.since);
       seen.wanted = null;
@@ -119,10 +120,15 @@ LEFT = {"Ms. Pac-Man": 3, "CartPole, 600 x 400": 1, "scrolling texture, 600 x 40
 class Seen:
     """Figures of one page. Times are milliseconds."""
 
-    share: dict[int, float] = field(default_factory=dict)  # of the frames that were due, by rate
+    share: dict[int, float] = field(
+        default_factory=dict
+    )  # of the frames that were due, by rate; above 1 if some were late
     gaps: dict[int, float] = field(default_factory=dict)  # 99th percentile between two draws
     cpu: dict[int, float] = field(default_factory=dict)  # of the server, for each frame
     waits: list[float] = field(default_factory=list)
+    since_opened: dict[int, float] = field(
+        default_factory=dict
+    )  # all draws, of the frames due since the page was opened
 
 
 @contextlib.contextmanager
@@ -238,6 +244,8 @@ def frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
     )
     spent = cpu_seconds(pid) - cpu
     seen.share[rate] = len(draws) / (rate * SECONDS)
+    drawn, opened = page.evaluate("[benchSeen.drawn, performance.now()]")
+    seen.since_opened[rate] = drawn / (rate * opened / 1000)
     seen.gaps[rate] = float(np.percentile(np.diff(draws), 99))
     seen.cpu[rate] = 1000 * spent / len(draws)
 

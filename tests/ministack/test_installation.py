@@ -524,7 +524,7 @@ def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, peo
     until(lambda: name in installed.tasks("STOPPED"), "the timer fires into the stop topic, and the task is stopped")
     until(lambda: installed.stored(server.key(label("R_bob")))["state"] == "closed", "the record is closed")
     assert installed.stored(server.key(label("R_bob")))["reason"] == "deadline"
-    assert name not in installed.timers()
+    until(lambda: name not in installed.timers(), "the timer goes last")
     assert f"{name}.servers.{DOMAIN}" not in installed.names()
     told = people.bob.poll()
     assert (told["state"], told["again"]) == ("ended", True)
@@ -546,7 +546,7 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
     assert alice.at == AFTER
     until(lambda: name in installed.tasks("STOPPED"), "the stop step stops the task")
     until(lambda: installed.stored(server.key(label(alice.user)))["state"] == "closed", "the record is closed")
-    assert name not in installed.timers()
+    until(lambda: name not in installed.timers(), "the timer goes last")
     assert f"{name}.servers.{DOMAIN}" not in installed.names()
     installed.ended(installed.tasks("STOPPED")[name])
     alice.answer(fun="7")
@@ -596,7 +596,7 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: I
     assert dave.at == AFTER
     until(lambda: installed.stored(server.key(label(dave.user)))["state"] == "closed", "dave's record is closed")
     assert (installed.tasks(), installed.names()) == ({}, {})
-    assert name not in installed.timers()
+    until(lambda: name not in installed.timers(), "the timer goes last")
     assert installed.stored(handover) is None
     assert "spares" not in installed.stored(pool)
 
@@ -637,7 +637,7 @@ def test_a_pair_has_one_server_and_each_an_answer(installed: Installation, peopl
         assert member.at == AFTER
     until(lambda: installed.stored(server.key(label(session)))["state"] == "closed", "the server is stopped")
     assert (installed.tasks(), installed.names()) == ({}, {})
-    assert name not in installed.timers()
+    until(lambda: name not in installed.timers(), "the timer goes last")
     swept = installed.invoke("sweep", {})
     assert swept["failed"] == 0, swept
     # What was registered for several is not registered for one: the entry itself is put back, for the tests after this.

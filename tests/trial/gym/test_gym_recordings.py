@@ -18,6 +18,7 @@ import pytest
 from console.problem import Exit
 from deploy.__main__ import main
 from testing.gym_server import ROOT, Client, gym_server
+from testing.waiting import until
 from trial.recordings import recording
 
 HERE = Path(__file__).parent
@@ -99,8 +100,12 @@ def test_a_client_that_goes_leaves_a_whole_recording_and_one_that_is_killed_all_
         time.sleep(1.1)
         worker.ask("step", instance_id=made, action=1)
         spawner = psutil.Process(server.pid).children()[0]
-        (process,) = [child for child in spawner.children() if child.status() != psutil.STATUS_ZOMBIE]
-        os.kill(process.pid, 9)
+
+        def running() -> list[int]:
+            return [child.pid for child in spawner.children() if child.status() != psutil.STATUS_ZOMBIE]
+
+        until(lambda: len(running()) == 1)  # the first client's has ended
+        os.kill(running()[0], 9)
         worker.websocket.socket.close()
     kinds = [[line["kind"] for line in lines] for lines in recorded(tmp_path)]
     assert sorted(kinds) == [["header", "reset", "step"], ["header", "reset", "step", "end"]]
