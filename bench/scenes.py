@@ -166,7 +166,7 @@ def judged(objects: Shown, frames: Shown) -> Iterator[Row]:
         objects.weight,
         "bytes",
         at_most=MOST_WEIGHT,
-        bound="ours: docs/objects.md",
+        bound="ours: what the game page may weigh on its way",
         detail={"without them": frames.weight},
     )
 
