@@ -100,6 +100,10 @@ def test_the_estimate_of_costs_counts_the_calls_of_the_bench(participant: list[A
         assert counted["sns:Publish"] == estimate.PUBLISHES
 
 
+def test_the_estimate_of_costs_takes_the_heaviest_page_of_the_bench() -> None:
+    assert round(max(row["value"] for row in pages.weights()) / 1000) == estimate.PAGE_KB
+
+
 def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
     pytest.importorskip("local.__main__")
     pages.project_without_game(tmp_path)
