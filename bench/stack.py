@@ -24,13 +24,13 @@ def applies() -> Iterator[Row]:
     """Seconds of the whole command, Python's start included."""
     venv = find_venv()
     if venv is None:
-        raise RuntimeError("the emulator is not installed: `make test` makes .venv-ministack")
+        raise RuntimeError("the emulator is not installed: `make bench` makes .venv-ministack")
     with tempfile.TemporaryDirectory(prefix="bench-") as folder, World(venv, Path(folder)) as world:
         first = _apply(world, "--domain", DOMAIN, "--anyway")  # the emulator has no name servers
         again = [_apply(world) for _ in range(RUNS)]
         yield row("apply, the first time (emulator, wheels in the cache)", first, "s")
         yield row(
-            "apply with nothing to change, whole command",
+            "apply with nothing to change (emulator), whole command, against the first time",
             min(again),
             "s",
             yardstick=first,
