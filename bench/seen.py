@@ -232,18 +232,29 @@ def until(page: Any, what: str, count: int) -> None:
 
 
 def frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
-    """Watch the page for SECONDS, even if its timer is late."""
+    """Watch the page for SECONDS, even if its timer is late; longer only until there are two draws.
+
+    Raises Playwright's Error, with what the page shows, after PATIENCE more.
+    """
     cpu = cpu_seconds(pid)
-    draws = page.evaluate(
-        """(ms) => new Promise((done) => {
+    draws, watched = page.evaluate(
+        """([ms, patience]) => new Promise((done, fail) => {
             benchSeen.draws = [];
             const begun = performance.now();
-            setTimeout(() => done(benchSeen.draws.map((at) => at - begun).filter((at) => at <= ms)), ms);
+            const look = () => {
+                const draws = benchSeen.draws.map((at) => at - begun);
+                const until = Math.max(ms, draws[1] ?? Infinity);
+                if (until === Infinity && performance.now() > begun + ms + patience)
+                    fail(new Error(`fewer than 2 draws: ${document.body.innerText}`));
+                else if (until === Infinity) setTimeout(look, 10);
+                else done([draws.filter((at) => at <= until), until]);
+            };
+            setTimeout(look, ms);
         })""",
-        1000 * (SECONDS + 0.5 / rate),
+        [1000 * (SECONDS + 0.5 / rate), PATIENCE],
     )
     spent = cpu_seconds(pid) - cpu
-    seen.share[rate] = len(draws) / (rate * SECONDS)
+    seen.share[rate] = len(draws) / (rate * watched / 1000 - 0.5)
     drawn, opened = page.evaluate("[benchSeen.drawn, performance.now()]")
     seen.since_opened[rate] = drawn / (rate * opened / 1000)
     seen.gaps[rate] = float(np.percentile(np.diff(draws), 99))

@@ -131,11 +131,13 @@ def test_two_pages_of_one_participant_are_one_player(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
 
     async def play():
-        async with hippo_page(server.address) as first, hippo_page(server.address) as second:
-            await second.frames(1)
-            assert await first.closed() == 4409
-            await second.command("start")
-            await second.frames(5)
+        async with hippo_page(server.address) as first:
+            await first.frames(1)  # it is the first that the server knows
+            async with hippo_page(server.address) as second:
+                await second.frames(1)
+                assert await first.closed() == 4409
+                await second.command("start")
+                await second.frames(5)
 
     asyncio.run(play())
 
