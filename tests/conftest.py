@@ -45,10 +45,11 @@ _PLACES = sorted(
 
 gc.disable()  # until all is imported; see `pytest_collection_finish`
 # A shell's background jobs inherit SIGINT as ignored, `make test` tells the commands of its tests that they are
-# part of it, and a shell may have a path for Python: all would change what the processes that tests start do.
+# part of it and which Python it takes, and a shell may have a path for Python: all would change what the processes that
+# tests start do.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHONPATH"):
+for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHON", "PYTHONPATH"):
     os.environ.pop(_name, None)
 memoized_aws.keep()
 exploration.load_profile()
