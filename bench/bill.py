@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from deploy.cost.estimate import DNS_QUERIES
 from deploy.cost.prices import FARGATE_MINIMUM, Prices, Usd
 from testing import template
-from testing.simulation.world import World
+from testing.simulation.world import SimulatedWorld
 
 HOUR = 3600.0
 SQS_REQUESTS = 3  # of a message: sent, received, deleted
 
 
-def bill(world: World, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
+def bill(world: SimulatedWorld, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
     """US dollars by what they are paid for. Servers are billed as if all of them had run on Spot, or on demand."""
     calls = world.cloud.calls
     writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deleting is free
@@ -36,14 +36,14 @@ def bill(world: World, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
     }
 
 
-def server_seconds(world: World) -> float:
+def server_seconds(world: SimulatedWorld) -> float:
     """Of all tasks, from RunTask on, which is a little before Fargate begins to count; those that run, until now."""
     now = world.clock.seconds
     tasks = world.platform.tasks.tasks.values()
     return sum(max(FARGATE_MINIMUM, (now if task.closed is None else task.closed) - task.born) for task in tasks)
 
 
-def _functions(world: World, prices: Prices) -> float:
+def _functions(world: SimulatedWorld, prices: Prices) -> float:
     """Billed seconds by the memory that the template gives each function, and a fee for each invocation."""
     named, properties = template.functions(), template.resources("AWS::Lambda::Function")
     usd = 0.0

@@ -22,7 +22,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from bench.moto_server import moto_server
-from bench.study_on_moto import ANSWERS, ROOT, Browser, http_event, on_moto, travel, warm
+from bench.study_on_moto import ANSWERS, ROOT, MeasuredBrowser, http_event, on_moto, travel, warm
 from bench.table import Row, each, row
 from bench.trial_server import trial_server
 from hippodrome.config import read_project
@@ -129,7 +129,7 @@ def bytes_per_answer() -> Iterator[Row]:
     pages.append({"key": "finalStep", "page": "debrief", "variants": 0})
     registration = {"id": "long", "live": True, "maxRuntime": 30, "steps": pages}
     with on_moto(registration) as study:
-        browser, kept = Browser(study, "P1"), hippo.Record()
+        browser, kept = MeasuredBrowser(study, "P1"), hippo.HippoRecord()
         written: list[int] = []
         page = browser.get()
         for _ in range(steps):

@@ -28,7 +28,7 @@ WHEN = "2026-11-21T14:46:40.123456Z"
 FRAMES = 1_800  # of a recording: a minute of play
 
 
-class Ran(NamedTuple):
+class DataRun(NamedTuple):
     """A run of the command: seconds, the most memory that it held (MB), and what it says it did."""
 
     seconds: float
@@ -75,13 +75,13 @@ def download() -> Iterator[Row]:
     )
 
 
-def _measured(people: int) -> tuple[Ran, Ran]:
+def _measured(people: int) -> tuple[DataRun, DataRun]:
     """The first run and the second, on a bucket with that many participants."""
     with _served(people) as env, tempfile.TemporaryDirectory() as folder:
         return _run(env, Path(folder)), _run(env, Path(folder))
 
 
-def _run(env: dict[str, str], folder: Path) -> Ran:
+def _run(env: dict[str, str], folder: Path) -> DataRun:
     arguments = ["data", str(folder / "out"), "--project", "maze", "--json"]
     begun = time.perf_counter()
     with (folder / "told.json").open("w+b") as out, (folder / "said.txt").open("w+b") as err:
@@ -91,7 +91,7 @@ def _run(env: dict[str, str], folder: Path) -> Ran:
         err.seek(0)
         if status:
             raise RuntimeError(f"data ended with {status}: {err.read().decode()[-2000:]}")
-        return Ran(seconds, held, json.loads(out.read()))
+        return DataRun(seconds, held, json.loads(out.read()))
 
 
 # The server

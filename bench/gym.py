@@ -48,7 +48,7 @@ _SEED = 3
 # The client
 
 
-class Connection:
+class FrameConnection:
     """A WebSocket whose requests are frames that were made before."""
 
     def __init__(self, url: str, subprotocol: str | None = None) -> None:
@@ -88,7 +88,7 @@ def frame(said: str | bytes) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class GymRun:
     """A measurement: µs of server CPU per request, requests a second, waits in µs."""
 
     cpu: float
@@ -104,7 +104,7 @@ Next = Callable[[bytes], bytes]
 """The next request of a connection after this answer."""
 
 
-def drive(pid: int, clients: Sequence[tuple[Connection, Next]], requests: int) -> Run:
+def drive(pid: int, clients: Sequence[tuple[FrameConnection, Next]], requests: int) -> GymRun:
     """Let each client send a request, and the next one when it is answered."""
     selector = selectors.DefaultSelector()
     sent, waits = {}, []
@@ -127,7 +127,7 @@ def drive(pid: int, clients: Sequence[tuple[Connection, Next]], requests: int) -
             else:
                 waiting -= 1
     took = time.perf_counter() - begun
-    return Run(1e6 * (cpu(pid) - used) / len(waits), len(waits) / took, waits)
+    return GymRun(1e6 * (cpu(pid) - used) / len(waits), len(waits) / took, waits)
 
 
 def cpu(pid: int) -> float:
@@ -210,9 +210,9 @@ def alone() -> float:
 # One request for a step
 
 
-def cartpole(url: str) -> tuple[Connection, Next]:
+def cartpole(url: str) -> tuple[FrameConnection, Next]:
     """A client of Gymie's with an environment, which steps it and resets it after each episode."""
-    connection = Connection(url)
+    connection = FrameConnection(url)
     instance = connection.ask(frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')).decode()
     reset = frame(json.dumps({"method": "reset", "params": {"instance_id": instance}}, separators=(",", ":")))
     steps = [
@@ -234,11 +234,11 @@ REPLY = "[[0.027395604178309441,-0.0061121615581214428,0.035859793424606323,0.01
 """Of the length of a step's answer."""
 
 
-def echoed(url: str) -> tuple[Connection, Next]:
+def echoed(url: str) -> tuple[FrameConnection, Next]:
     """A client that sends what looks like a step."""
     said = {"method": "step", "params": {"action": 1, "instance_id": "0" * 32}}
     step = frame(json.dumps(said, separators=(",", ":")))
-    return Connection(url), lambda _: step
+    return FrameConnection(url), lambda _: step
 
 
 def single_steps() -> Iterator[Row]:
@@ -256,7 +256,7 @@ def single_steps() -> Iterator[Row]:
         yield from _single(count, found, bare, min(step))
 
 
-def _single(count: int, found: Sequence[Run], bare: Sequence[Run], step: float) -> Iterator[Row]:
+def _single(count: int, found: Sequence[GymRun], bare: Sequence[GymRun], step: float) -> Iterator[Row]:
     ours_, echo_ = min(found, key=lambda run: run.cpu), min(bare, key=lambda run: run.cpu)
     who = "one client" if count == 1 else f"{count} clients"
     rate, used = THEIRS[count]
@@ -291,7 +291,7 @@ def batched_steps() -> Iterator[Row]:
     from trial.gym import arrays, spaces
 
     with ours() as (url, pid):
-        connection = Connection(url, arrays.SUBPROTOCOL)
+        connection = FrameConnection(url, arrays.SUBPROTOCOL)
         made = json.loads(connection.ask(frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')))
         actions = arrays.layout(spaces.build(made["action_space"]), action=True)
         connection.ask(frame(arrays.reset_request(made["handle"], _SEED, None)))
@@ -305,7 +305,7 @@ def batched_steps() -> Iterator[Row]:
     yield from _batched(found, min(step))
 
 
-def _batched(found: Sequence[Run], step: float) -> Iterator[Row]:
+def _batched(found: Sequence[GymRun], step: float) -> Iterator[Row]:
     yield row(
         f"server CPU per step, {MANY} in a request, raw arrays, against env.step alone",
         min(run.cpu for run in found) / MANY,
@@ -334,12 +334,12 @@ def idle() -> Iterator[Row]:
 _MAKE = frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')
 
 
-def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[Connection], Any] = lambda _: None) -> float:
+def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[FrameConnection], Any] = lambda _: None) -> float:
     """KB of memory that each of `count` connections adds to a server."""
-    opened = [Connection(url)]  # what the first one loads is not counted
+    opened = [FrameConnection(url)]  # what the first one loads is not counted
     then(opened[0])
     before = memory(pid)
-    opened += [Connection(url) for _ in range(count)]
+    opened += [FrameConnection(url) for _ in range(count)]
     for connection in opened[1:]:
         then(connection)
     time.sleep(0.2)

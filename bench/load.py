@@ -91,7 +91,7 @@ class Partner:
 
 
 @dataclass
-class Played:
+class ServerLoad:
     """What a server delivered and cost. `cpu` is ms for each frame, `memory` and `resident` are MB."""
 
     share: float
@@ -212,15 +212,15 @@ def _since(now: Count, before: Count) -> Count:
     return Count(now.pictures - before.pictures, now.bytes - before.bytes)
 
 
-async def played(servers: Sequence[tuple[str, int]]) -> list[Played]:
+async def played(servers: Sequence[tuple[str, int]]) -> list[ServerLoad]:
     """Play on all of these servers at once; what each delivered and cost."""
     found = await delivered(servers, [play])
     return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
 
 
-def _played(pid: int, found: Delivered) -> Played:
+def _played(pid: int, found: Delivered) -> ServerLoad:
     (client,) = found.clients
-    return Played(client.pictures / found.due, 1000 * found.cpu / max(client.pictures, 1), *memory(pid))
+    return ServerLoad(client.pictures / found.due, 1000 * found.cpu / max(client.pictures, 1), *memory(pid))
 
 
 def memory(pid: int) -> tuple[float, float]:
@@ -281,7 +281,7 @@ def one_trial() -> Iterator[Row]:
     yield judged_cpu(found, alone)
 
 
-def judged_cpu(found: Played, alone: float) -> Row:
+def judged_cpu(found: ServerLoad, alone: float) -> Row:
     """The row of processor time."""
     return row(
         f"server's CPU per frame of the example at {RATE}/s, against its game alone",
@@ -302,7 +302,7 @@ def one_core() -> Iterator[Row]:
     yield from judged_core(found)
 
 
-def judged_core(found: list[Played]) -> Iterator[Row]:
+def judged_core(found: list[ServerLoad]) -> Iterator[Row]:
     """The rows of trials that share a core."""
     yield row(
         f"frames delivered at {RATE}/s by {len(found)} trials of the example on one core",

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from bench.study_on_moto import ANSWERS, ROOT, Browser, Study, on_moto, warm
+from bench.study_on_moto import ANSWERS, ROOT, MeasuredBrowser, MeasuredStudy, on_moto, warm
 from bench.table import Row, each, row
 from hippodrome.model import ids
 from testing.aws_events import FORM
@@ -80,9 +80,9 @@ def weights() -> Iterator[Row]:
     )
 
 
-def _walk(study: Study) -> Iterator[tuple[str, tuple[bytes, int]]]:
+def _walk(study: MeasuredStudy) -> Iterator[tuple[str, tuple[bytes, int]]]:
     """Every page of the study with the bytes that go over the line for it."""
-    browser = Browser(study, "P1")
+    browser = MeasuredBrowser(study, "P1")
     for step in study.steps:
         answer = browser.open()
         page = body_of(answer)
@@ -105,7 +105,7 @@ class Exchange(NamedTuple):
     body: bytes
 
 
-class Line:
+class KeptConnection:
     """One kept connection. Plain HTTP/1.1: a lighter client leaves more of the machine to the server."""
 
     def __init__(self, address: str) -> None:
@@ -138,7 +138,7 @@ class Line:
 Walk = Callable[[int, Callable[..., Awaitable[Exchange]]], Awaitable[None]]
 
 
-class Crowd(NamedTuple):
+class PageCrowd(NamedTuple):
     """What a crowd met: how long it took, and how long each request."""
 
     seconds: float
@@ -153,12 +153,12 @@ class Crowd(NamedTuple):
         return statistics.quantiles(self.waits, n=100)[-1]
 
 
-async def send_crowd(address: str, people: int, walk: Walk) -> Crowd:
+async def send_crowd(address: str, people: int, walk: Walk) -> PageCrowd:
     """All of them at once, each on a connection of their own."""
     waits: list[float] = []
 
     async def person(number: int) -> None:
-        connection = Line(address)
+        connection = KeptConnection(address)
 
         async def ask(method: str, target: str, body: bytes = b"") -> Exchange:
             begun = time.perf_counter()
@@ -174,7 +174,7 @@ async def send_crowd(address: str, people: int, walk: Walk) -> Crowd:
     begun = time.perf_counter()
     async with asyncio.timeout(SECONDS):
         await asyncio.gather(*(person(number) for number in range(people)))
-    return Crowd(time.perf_counter() - begun, waits)
+    return PageCrowd(time.perf_counter() - begun, waits)
 
 
 async def through_the_study(number: int, ask: Callable[..., Awaitable[Exchange]]) -> None:

@@ -30,9 +30,9 @@ from testing.simulation.cloud import CONCURRENCY, QUOTAS
 from testing.simulation.conditions import Conditions
 from testing.simulation.functions import Wire
 from testing.simulation.hippo import ASSUMED, Hippo
-from testing.simulation.people import SimulatedParticipant, Visit
+from testing.simulation.people import SimulatedParticipant, SimulatedVisit
 from testing.simulation.tasks import ADDRESSES
-from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, World
+from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
 SEEDS = range(2026, 2044)  # of the crowds whose waits are judged: slow spans let the p95 of six of them vary by 3 %
@@ -66,11 +66,11 @@ def rows() -> Iterator[Row]:
 
 
 @dataclass(frozen=True)
-class Crowd:
+class ServedCrowd:
     """How it went for those who came. Times are virtual seconds."""
 
-    world: World
-    visits: Sequence[Visit]
+    world: SimulatedWorld
+    visits: Sequence[SimulatedVisit]
     seed: int
     conditions: Conditions
 
@@ -100,15 +100,15 @@ def crowd(
     *,
     wires: Mapping[str, Wire] = WIRES,
     concurrency: int = CONCURRENCY,
-) -> Crowd:
+) -> ServedCrowd:
     """So many participants who come within so many seconds, until all of them are through."""
     conditions = conditions or Conditions()
-    world = World(seed, conditions, wires=wires, concurrency=concurrency)
+    world = SimulatedWorld(seed, conditions, wires=wires, concurrency=concurrency)
     arrived = [SimulatedParticipant(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, within))
     world.settle(HOURS * 3600)
-    return Crowd(world, [person.visit for person in arrived], seed, conditions)
+    return ServedCrowd(world, [person.visit for person in arrived], seed, conditions)
 
 
 def crowds() -> Iterator[Row]:
@@ -170,7 +170,7 @@ def small_account() -> Iterator[Row]:
     )
 
 
-def served(what: str, made: Sequence[Crowd], theirs: Mapping[str, Any], seconds: float) -> Row:
+def served(what: str, made: Sequence[ServedCrowd], theirs: Mapping[str, Any], seconds: float) -> Row:
     """Everybody is served and nothing is left, beside the share that HIPPO's way gives a server."""
     left = Counter[str]()
     for one in made:
@@ -203,7 +203,7 @@ def assumed(conditions: Conditions) -> Mapping[str, str]:
     return changed(conditions) or assumptions(conditions)
 
 
-def waiting(made: Sequence[Crowd]) -> Row:
+def waiting(made: Sequence[ServedCrowd]) -> Row:
     """How long participants wait for their servers."""
     waits, alone = [wait for one in made for wait in one.waits], [wait for one in made for wait in one.alone]
     return row(
@@ -220,7 +220,7 @@ def waiting(made: Sequence[Crowd]) -> Row:
     )
 
 
-def costs(came: Crowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
+def costs(came: ServedCrowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
     """Billed seconds and calls of one crowd."""
     world, people = came.world, len(came.visits)
     yield row(
@@ -254,7 +254,7 @@ def costs(came: Crowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
 
 def many_at_once() -> Iterator[Row]:
     """10,000 servers that run at the same time for an hour."""
-    world = World(SEED, project=msgspec.structs.replace(PROJECT, max_runtime=110))
+    world = SimulatedWorld(SEED, project=msgspec.structs.replace(PROJECT, max_runtime=110))
     people = [SimulatedParticipant(world, number, play=HOUR) for number in range(MANY)]
     for person in people:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, MANY_WITHIN))
@@ -267,7 +267,7 @@ def many_at_once() -> Iterator[Row]:
         before = world.cloud.calls.copy()
     rates = {api: f"{rate:.1f} of {QUOTAS[api][0]:g} calls/s" for api, rate in sorted(busiest.items())}
     yield served_many(
-        Crowd(world, [person.visit for person in people], SEED, world.conditions),
+        ServedCrowd(world, [person.visit for person in people], SEED, world.conditions),
         {
             **needs(world),
             "assumed": f"they play for {HOUR:g} s; the rest is as in the rows above",
@@ -279,7 +279,7 @@ def many_at_once() -> Iterator[Row]:
     yield _cost(world)
 
 
-def sweeps(world: World) -> Iterator[Row]:
+def sweeps(world: SimulatedWorld) -> Iterator[Row]:
     """The rows of the sweeps. The longest one says nothing if it was cut off: its time is the timeout then."""
     yield row(
         "the longest sweep among them, beside its function's timeout",
@@ -298,7 +298,7 @@ def sweeps(world: World) -> Iterator[Row]:
     )
 
 
-def served_many(came: Crowd, detail: Mapping[str, Any]) -> Row:
+def served_many(came: ServedCrowd, detail: Mapping[str, Any]) -> Row:
     """Everybody is served in the network that the template makes."""
     left = {thing: count for thing, count in came.world.left().items() if count}
     return row(
@@ -311,7 +311,7 @@ def served_many(came: Crowd, detail: Mapping[str, Any]) -> Row:
     )
 
 
-def needs(world: World) -> Mapping[str, str]:
+def needs(world: SimulatedWorld) -> Mapping[str, str]:
     """What the run needed at once, and what a Region allows."""
     tasks = world.platform.tasks.most_interfaces
     most = {
@@ -326,7 +326,7 @@ def needs(world: World) -> Mapping[str, str]:
     return {"addresses at once": f"{tasks:,} of {ADDRESSES:,} in the template's subnets", **quotas}
 
 
-def _cost(world: World) -> Row:
+def _cost(world: SimulatedWorld) -> Row:
     """What the run costs for each who took part."""
     prices = Prices()
     spot, on_demand = (
@@ -391,7 +391,7 @@ def hippo(people: int, within: float, conditions: Conditions | None = None) -> d
 
 
 def _hippo(people: int, within: float, conditions: Conditions | None, *, early: bool) -> dict[str, Any]:
-    world = World(SEED, conditions)
+    world = SimulatedWorld(SEED, conditions)
     starts = Hippo(world, early=early)
     for number in range(people):
         delay = world.clock.random.uniform(0, within)

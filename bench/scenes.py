@@ -33,14 +33,14 @@ SCENE = {"width": 600, "height": 400, "background": "#202830"}
 AGENT = """
 import math, sys
 sys.path.insert(0, ROOT)
-from protocol.trial_sections import Scene
+from protocol.trial_sections import SceneSection
 from trial.pictures.assets import Assets
 from trial.pictures.scene import as_scene
 class Agent:
     def start(self, game):
         if not OBJECTS:
             from trial.pictures.raster import Raster
-            self.raster = Raster(Scene(width=600, height=400, background="#202830"), Assets())
+            self.raster = Raster(SceneSection(width=600, height=400, background="#202830"), Assets())
     def reset(self):
         self.t = self.action = 0
     def step(self, action):

@@ -28,8 +28,8 @@ from testing.quiet_log import quiet
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.aws_bound import aws_alone_together
 from testing.simulation.conditions import Conditions
-from testing.simulation.members import Habits, Member
-from testing.simulation.world import PROJECT, World
+from testing.simulation.members import Habits, SimulatedMember
+from testing.simulation.world import PROJECT, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
 SMALLER, SMALLER_WITHIN = 340, 20.0  # as many a second: where something goes wrong, and crowds that come several times
@@ -52,8 +52,8 @@ def rows() -> Iterator[Row]:
 class Together:
     """How it went for those who came. Times are virtual seconds."""
 
-    world: World
-    came: Sequence[Member]
+    world: SimulatedWorld
+    came: Sequence[SimulatedMember]
     seconds: float  # that the simulation took
 
     @property
@@ -110,8 +110,8 @@ def crowd(
 ) -> Together:
     """So many participants who come within so many seconds, until all of them are through."""
     begun = time.perf_counter()
-    world = World(seed, conditions, project)
-    came = [Member(world, number, habits=habits(number)) for number in range(people)]
+    world = SimulatedWorld(seed, conditions, project)
+    came = [SimulatedMember(world, number, habits=habits(number)) for number in range(people)]
     for one in came:
         world.clock.spawn(one.walk, delay=world.clock.random.uniform(0, within))
     world.settle(HOURS * 3600)

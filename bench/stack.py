@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bench.table import Row, each, row
-from testing.ministack.world import DOMAIN, World, find_venv
+from testing.ministack.world import DOMAIN, MinistackWorld, find_venv
 
 RUNS = 3
 
@@ -25,7 +25,7 @@ def applies() -> Iterator[Row]:
     venv = find_venv()
     if venv is None:
         raise RuntimeError("the emulator is not installed: `make bench` makes .venv-ministack")
-    with tempfile.TemporaryDirectory(prefix="bench-") as folder, World(venv, Path(folder)) as world:
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder, MinistackWorld(venv, Path(folder)) as world:
         first = _apply(world, "--domain", DOMAIN, "--anyway")  # the emulator has no name servers
         again = [_apply(world) for _ in range(RUNS)]
         yield row("apply, the first time (emulator, wheels in the cache)", first, "s")
@@ -38,7 +38,7 @@ def applies() -> Iterator[Row]:
         )
 
 
-def _apply(world: World, *options: str) -> float:
+def _apply(world: MinistackWorld, *options: str) -> float:
     begun = time.monotonic()
     ran = world.deploy("apply", *options, "--yes")
     if ran.code:
@@ -46,6 +46,6 @@ def _apply(world: World, *options: str) -> float:
     return time.monotonic() - begun
 
 
-def _within(world: World) -> float:
+def _within(world: MinistackWorld) -> float:
     """Seconds that the command itself says a run without changes took."""
     return float(json.loads(world.deploy("apply", "--json").out)["seconds"])

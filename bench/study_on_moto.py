@@ -26,7 +26,7 @@ from lambdas import (
 from protocol.keys import answer_key
 from testing import aws_events
 from testing.aws_events import FORM
-from testing.iam.enforcement import Call
+from testing.iam.enforcement import ApiCall
 from testing.moto_world import MotoWorld
 from testing.visitors import body_of, hidden
 
@@ -50,13 +50,13 @@ class AgingPlatform(AwsPlatform):
         return self.clock
 
 
-class Study:
+class MeasuredStudy:
     """The example project in an AWS account on moto, and its functions, each with a memory (its caches) of its own."""
 
     def __init__(self, world: MotoWorld, registration: Mapping[str, Any] | None = None) -> None:
         self.world = world
         self.platform = AgingPlatform(world.env)
-        self.calls: dict[str, list[Call]] = {}
+        self.calls: dict[str, list[ApiCall]] = {}
         self._memory: dict[str, dict[Any, Any]] = {}
         installed.use(self.platform)
         project = dict(registration) if registration else read_project(ROOT).registration()
@@ -93,10 +93,10 @@ class Study:
         self.platform.clock += time
 
 
-class Browser:
+class MeasuredBrowser:
     """A participant's browser: opens the link, sends forms, follows redirects. Notes what each request cost."""
 
-    def __init__(self, study: Study, user: str) -> None:
+    def __init__(self, study: MeasuredStudy, user: str) -> None:
         self.study, self.user = study, user
         self.query = urlencode({"projectId": study.id, "userId": user})
         self.costs: list[tuple[str, list[str]]] = []
@@ -162,7 +162,7 @@ def http_event(
 
 
 @contextlib.contextmanager
-def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[Study]:
+def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[MeasuredStudy]:
     """The study in a fresh account; what the functions log is not shown."""
     quiet = io.StringIO()
     handler = logger.registered_handler
@@ -170,7 +170,7 @@ def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[Study]:
     before = handler.setStream(quiet)
     try:
         with MotoWorld(enforce=False) as world:
-            yield Study(world, registration)
+            yield MeasuredStudy(world, registration)
     finally:
         installed.use(None)
         if before is not None:
@@ -180,13 +180,13 @@ def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[Study]:
 # A whole participant
 
 
-def travel(study: Study, user: str, pause: timedelta = timedelta()) -> Browser:
+def travel(study: MeasuredStudy, user: str, pause: timedelta = timedelta()) -> MeasuredBrowser:
     """One participant from the link until nothing of them is left but their data.
 
     `pause` passes before each thing they do. The server starts while they fill in the questionnaire; the waiting page
     asks once. As in Route 53, a change of names is PENDING when it is first asked for, and in sync the second time.
     """
-    world, browser = study.world, Browser(study, user)
+    world, browser = study.world, MeasuredBrowser(study, user)
     study.wait(pause)
     page = browser.get()
     study.wait(pause)
@@ -219,7 +219,7 @@ def travel(study: Study, user: str, pause: timedelta = timedelta()) -> Browser:
     return browser
 
 
-def warm(study: Study) -> None:
+def warm(study: MeasuredStudy) -> None:
     """Others have been there before the one that is measured: every function has project and pages in its cache."""
     for n in range(6):
         travel(study, f"before-{n}")

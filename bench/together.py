@@ -96,7 +96,7 @@ WATCH = """(() => {
 
 
 @dataclass
-class Played:
+class TogetherLoad:
     """What one server delivered and cost. `cpu` is ms for each tick, `memory` MB."""
 
     shares: list[float]  # of the ticks that were due, by member
@@ -152,17 +152,17 @@ async def play(user: str, url: str, count: load.Count) -> None:
                 await client.send(json.dumps({"action": keys.choice(ACTIONS[1:]), "held": keys.random() < 0.5}))
 
 
-async def played(servers: Sequence[tuple[str, int]], players: int) -> list[Played]:
+async def played(servers: Sequence[tuple[str, int]], players: int) -> list[TogetherLoad]:
     """Play on all of these servers at once; what each delivered and cost."""
     found = await load.delivered(servers, [partial(play, user) for user in members(players)])
     return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
 
 
-def _played(pid: int, found: load.Delivered) -> Played:
+def _played(pid: int, found: load.Delivered) -> TogetherLoad:
     ticks = [client.pictures for client in found.clients]
     size = sum(client.bytes for client in found.clients)
     cpu = 1000 * found.cpu / max(ticks)
-    return Played([one / found.due for one in ticks], size / sum(ticks), cpu, load.memory(pid)[0])
+    return TogetherLoad([one / found.due for one in ticks], size / sum(ticks), cpu, load.memory(pid)[0])
 
 
 # On sockets
@@ -176,7 +176,7 @@ def on_sockets() -> Iterator[Row]:
         yield from judged_game(players, found)
 
 
-def judged_game(players: int, found: Played) -> Iterator[Row]:
+def judged_game(players: int, found: TogetherLoad) -> Iterator[Row]:
     """The rows of one game."""
     yield row(
         f"ticks delivered at {RATE}/s to each of {players} participants in one game",
@@ -202,7 +202,7 @@ def one_core() -> Iterator[Row]:
     yield from judged_core(found)
 
 
-def judged_core(found: Sequence[Played]) -> Iterator[Row]:
+def judged_core(found: Sequence[TogetherLoad]) -> Iterator[Row]:
     """The rows of games that share a core."""
     cpu = statistics.mean(one.cpu for one in found)
     yield row(
@@ -230,7 +230,7 @@ def judged_core(found: Sequence[Played]) -> Iterator[Row]:
 
 
 @dataclass
-class Seen:
+class PairSeen:
     """What two participants saw. Times are milliseconds."""
 
     shares: list[float]  # of the ticks that were due, by participant
@@ -244,7 +244,7 @@ def in_two_browsers() -> Iterator[Row]:
         yield from judged_views(look(browser))
 
 
-def look(browser: Any) -> Seen:
+def look(browser: Any) -> PairSeen:
     """Let both watch; then each presses keys."""
     with server(2) as (url, pid), contextlib.ExitStack() as opened:
         pages = []
@@ -268,7 +268,7 @@ def look(browser: Any) -> Seen:
             seen.frames(page, pid, RATE, one)
             one.waits = seen.presses(page)
         ticks = [page.evaluate("benchSeen.ticks") for page in pages]
-        return Seen([one.share[RATE] for one in both], [one.waits for one in both], apart(*ticks))
+        return PairSeen([one.share[RATE] for one in both], [one.waits for one in both], apart(*ticks))
 
 
 def apart(one: Sequence[Sequence[float]], other: Sequence[Sequence[float]]) -> list[int]:
@@ -285,7 +285,7 @@ def apart(one: Sequence[Sequence[float]], other: Sequence[Sequence[float]]) -> l
     return found
 
 
-def judged_views(found: Seen) -> Iterator[Row]:
+def judged_views(found: PairSeen) -> Iterator[Row]:
     """The rows of what two participants saw."""
     yield row(
         f"ticks drawn at {RATE}/s in each of two browsers",

@@ -21,7 +21,7 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from bench.bill import server_seconds
-from bench.pages import Line, serving
+from bench.pages import KeptConnection, serving
 from bench.scale import SEED, assumed, quantile, seconds_of
 from bench.study_on_moto import ROOT
 from bench.table import Row, each, row
@@ -30,7 +30,7 @@ from deploy.cost.prices import Prices
 from hippodrome.model import ids, server, warm_pool
 from testing.quiet_log import quiet
 from testing.simulation.people import SimulatedParticipant
-from testing.simulation.world import PROJECT, World
+from testing.simulation.world import PROJECT, SimulatedWorld
 from testing.visitors import hidden
 
 WARM = 10  # servers
@@ -58,7 +58,7 @@ def rows() -> Iterator[Row]:
 class Came:
     """How it went for those who came. Times are seconds, of each participant."""
 
-    world: World
+    world: SimulatedWorld
     took_warm_server: float  # the share that was given a warm server
     to_shown: list[float]  # from sending the answer that asks for the server until the page shows it
     at_game: list[float]  # from the first sight of the game page until there is a server
@@ -67,7 +67,7 @@ class Came:
 
 def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends: float = ENDS) -> Came:
     """Participants who come at these seconds to a study with so many warm servers, which is closed afterwards."""
-    world = World(SEED, project=msgspec.structs.replace(PROJECT, warm_servers=warm))
+    world = SimulatedWorld(SEED, project=msgspec.structs.replace(PROJECT, warm_servers=warm))
     world.open()
     people = [SimulatedParticipant(world, number, read=READS) for number in range(len(arrivals))]
     for person, comes in zip(people, arrivals, strict=True):
@@ -153,7 +153,7 @@ def _compared(what: str, came: Came, without: Came, goal: float | None = None) -
         )
 
 
-def _waited(world: World) -> float:
+def _waited(world: SimulatedWorld) -> float:
     """Seconds that servers waited for a participant, in all."""
     records = [
         json.loads(body) for key, (body, _, _) in world.platform.documents.kept.items() if _is_warm_server(key, body)
@@ -239,7 +239,7 @@ def _read(file: Path) -> Mapping[str, Any]:
 
 
 async def _to_first_picture(address: str, user: str) -> float:
-    line, target = Line(address), f"/next?projectId=warm&userId={user}"
+    line, target = KeptConnection(address), f"/next?projectId=warm&userId={user}"
     try:
         page = (await line.ask("GET", target)).body.decode()
         begun = time.perf_counter()

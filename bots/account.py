@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Play:
+class PlayedStep:
     """One game step."""
 
     step: str
@@ -32,14 +32,14 @@ class Play:
 
 
 @dataclass
-class Account:
+class BotReport:
     """What one bot has sent, seen and run into."""
 
     user_id: str
     stage: str = "waits for its turn"
     finished: bool = False
     answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step
-    plays: list[Play] = field(default_factory=list)
+    plays: list[PlayedStep] = field(default_factory=list)
     final_page: str = ""
     code: str | None = None
     errors: list[str] = field(default_factory=list)

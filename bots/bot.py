@@ -19,12 +19,12 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
 from bots import form_filling, forms
-from bots.account import Account, Play
+from bots.account import BotReport, PlayedStep
 from bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
-from bots.game import Game
+from bots.game import GameConnection
 from bots.http import Reply, ask
 from bots.links import with_user
-from bots.page import Page
+from bots.page import VisitedPage
 from trial.pictures.frames import FrameError
 
 SUBPROTOCOLS = [Subprotocol(f"hippodrome.{version}") for version in (3, 2, 1)]
@@ -72,10 +72,10 @@ class Bot:
         self.random = random
         self.play = play
         self.patience = patience
-        self.account = Account(user_id)
+        self.account = BotReport(user_id)
         self._restarts = 0
 
-    async def run(self) -> Account:
+    async def run(self) -> BotReport:
         """Walk through the whole study."""
         account, began = self.account, time.monotonic()
         try:
@@ -96,7 +96,7 @@ class Bot:
         account.seconds = time.monotonic() - began
         return account
 
-    async def do(self, page: Page) -> Page | None:
+    async def do(self, page: VisitedPage) -> VisitedPage | None:
         """What the page asks for; the next page, or None after the last. Raises Failed."""
         if page.game is not None:
             return await self.game(page)
@@ -111,11 +111,11 @@ class Bot:
 
     # Pages
 
-    async def open(self) -> Page:
+    async def open(self) -> VisitedPage:
         """The page where the participant stands."""
-        return Page(self.address, (await self._ask(self.address)).text)
+        return VisitedPage(self.address, (await self._ask(self.address)).text)
 
-    async def answer(self, page: Page, form: forms.Form) -> Page:
+    async def answer(self, page: VisitedPage, form: forms.Form) -> VisitedPage:
         """Fill in the form, send it, and go where that leads."""
         step = dict(forms.hidden(form)).get("hippodrome-step", page.step)
         if step in self.account.answers:
@@ -125,13 +125,13 @@ class Bot:
         self.account.answers[step] = form_filling.gathered(pairs)
         return await self.post(urljoin(page.address, form.action or page.address), pairs)
 
-    async def post(self, address: str, pairs: form_filling.Pairs) -> Page:
+    async def post(self, address: str, pairs: form_filling.Pairs) -> VisitedPage:
         """Send a form and follow the redirect. Sending it twice does no harm."""
         reply = await self._ask(address, urlencode(pairs).encode())
         if reply.status not in (302, 303) or "location" not in reply.headers:
             raise Failed(f"a form was answered with status {reply.status} instead of 303")
         following = urljoin(address, reply.headers["location"])
-        return Page(following, (await self._ask(following)).text)
+        return VisitedPage(following, (await self._ask(following)).text)
 
     async def _ask(self, address: str, body: bytes | None = None) -> Reply:
         """One request, repeated until there is an answer."""
@@ -164,10 +164,10 @@ class Bot:
 
     # The game
 
-    async def game(self, page: Page) -> Page:
+    async def game(self, page: VisitedPage) -> VisitedPage:
         """Wait for the server, play, and go on; the page after the game."""
         data, step = page.game or {}, page.step
-        play = Play(step)
+        play = PlayedStep(step)
         self.account.plays.append(play)
         until = time.monotonic() + self.patience + self.play
         while True:
@@ -184,7 +184,7 @@ class Bot:
                 raise Failed("the game does not end")
             await asyncio.sleep(AGAIN_SECONDS)
 
-    async def _ready(self, page: Page, data: dict[str, Any], play: Play, until: float) -> dict[str, Any]:
+    async def _ready(self, page: VisitedPage, data: dict[str, Any], play: PlayedStep, until: float) -> dict[str, Any]:
         """Wait for the server as the game page does; its state when it is ready."""
         state, poll = data["state"], urljoin(page.address, data["poll"])
         if state["state"] == LOBBY:
@@ -205,7 +205,7 @@ class Bot:
         play.waited += time.monotonic() - began
         return dict(state)
 
-    async def _lobby(self, state: dict[str, Any], poll: str, play: Play) -> dict[str, Any]:
+    async def _lobby(self, state: dict[str, Any], poll: str, play: PlayedStep) -> dict[str, Any]:
         """Wait for others to play with, as the lobby's page does; the first state after it."""
         self.account.stage = "waits for others"
         began = time.monotonic()
@@ -218,7 +218,7 @@ class Bot:
         play.lobby = time.monotonic() - began
         return state
 
-    async def _restart(self, page: Page, state: dict[str, Any]) -> None:
+    async def _restart(self, page: VisitedPage, state: dict[str, Any]) -> None:
         form = page.form
         if not state.get("again") or form is None or self._restarts >= RESTARTS:
             raise Failed(f"no server: {state['state']} ({state.get('reason')})")
@@ -226,7 +226,7 @@ class Bot:
         self.account.troubles.append(f"the server was {state['state']} ({state.get('reason')}): started again")
         await self.post(urljoin(page.address, form.action), form_filling.fill(form, self.random))
 
-    async def _connect(self, state: dict[str, Any], play: Play) -> None:
+    async def _connect(self, state: dict[str, Any], play: PlayedStep) -> None:
         """Play on one connection until it ends."""
         self.account.stage = "plays"
         address = self.where.server(state["url"])
@@ -252,7 +252,7 @@ class Bot:
             ):
                 if websocket.subprotocol not in SUBPROTOCOLS:
                     raise Failed("the server speaks none of hippodrome.3, hippodrome.2 and hippodrome.1")
-                await Game(websocket, play, self.account, self.random, self.play).run(hello)
+                await GameConnection(websocket, play, self.account, self.random, self.play).run(hello)
         except ConnectionClosed as closed:
             code = closed.rcvd.code if closed.rcvd else 1006
             if code >= 4400:

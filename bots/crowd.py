@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from bots.account import Account
+from bots.account import BotReport
 from bots.bot import Bot
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -15,8 +15,8 @@ T = TypeVar("T")
 
 
 async def walk(
-    crowd: Sequence[Bot], *, at_once: int, ramp: float, watch: Callable[[Sequence[Account]], None]
-) -> list[Account]:
+    crowd: Sequence[Bot], *, at_once: int, ramp: float, watch: Callable[[Sequence[BotReport]], None]
+) -> list[BotReport]:
     """Send these bots through their study, `at_once` at a time; what happened to each. Cancelling ends all of them."""
     places = asyncio.Semaphore(at_once)
 

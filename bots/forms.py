@@ -16,7 +16,7 @@ _TYPES = {*_TEXTS, *_TIMES, *PRESSED, *_NEVER_SENT, "color", "number", "range", 
 
 
 @dataclass(frozen=True)
-class Option:
+class SelectOption:
     """One choice of a select."""
 
     value: str
@@ -30,7 +30,7 @@ class Control:
 
     kind: str
     given: Mapping[str, str]
-    options: list[Option] = field(default_factory=list)
+    options: list[SelectOption] = field(default_factory=list)
     text: str = ""  # of a textarea
 
     @property
@@ -170,7 +170,7 @@ class _Reader(HTMLParser):
             given = self._option
             text = " ".join("".join(self._label).split())
             disabled = "disabled" in given or self._group_disabled
-            self._select.options.append(Option(given.get("value", text), "selected" in given, disabled))
+            self._select.options.append(SelectOption(given.get("value", text), "selected" in given, disabled))
         self._option = None
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
-from bots.account import Account, Play
+from bots.account import BotReport, PlayedStep
 from protocol import keyboard
 from trial.core.choices import NOT_POSSIBLE
 from trial.pictures.frames import Decoder
@@ -62,11 +62,11 @@ def _offered(action: str, shown: Sequence[str]) -> bool:
     return all(key in shown for key in re.findall("up|down|left|right", action))
 
 
-class Game:
+class GameConnection:
     """One connection to a trial server. It plays for `seconds` where the game may be stopped; 0: to the end."""
 
     def __init__(
-        self, websocket: ClientConnection, play: Play, account: Account, random: Random, seconds: float
+        self, websocket: ClientConnection, play: PlayedStep, account: BotReport, random: Random, seconds: float
     ) -> None:
         self._websocket = websocket
         self._play = play

@@ -12,7 +12,7 @@ from bots import forms
 
 
 @dataclass(frozen=True)
-class Page:
+class VisitedPage:
     """A page of the study."""
 
     address: str

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bots.account import Account, Play
+from bots.account import BotReport, PlayedStep
 
 LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
 BETWEEN = ("presence", "ping")  # lines of a session that may stand anywhere, also after an episode's end
@@ -19,7 +19,7 @@ PIECE = 1024**2  # bytes unpacked at once
 
 
 @dataclass
-class Recording:
+class StoredRecording:
     """One recording as it lies in the data folder."""
 
     name: str
@@ -30,9 +30,9 @@ class Recording:
     counted: bool = False  # in a `Verification`
 
 
-def read_recording(path: Path) -> Recording:
+def read_recording(path: Path) -> StoredRecording:
     """Read a recording to its end. Never raises: what cannot be read is not complete."""
-    found = Recording(path.name)
+    found = StoredRecording(path.name)
     unpack, counts = zlib.decompressobj(31), Counter[str]()
     first, last = None, ("", "")
     try:
@@ -93,7 +93,7 @@ class Verification:
 def verify(
     data: Path,
     project_id: str,
-    accounts: Sequence[Account],
+    accounts: Sequence[BotReport],
     *,
     recorded: bool = True,
     last_error: Callable[[str], str] = lambda _: "",
@@ -102,7 +102,7 @@ def verify(
 
     `last_error` gives what the log of a participant's last server says of its last error, where that is known.
     """
-    found, read = Verification(recorded=recorded), dict[Path, list[Recording]]()
+    found, read = Verification(recorded=recorded), dict[Path, list[StoredRecording]]()
     for account in accounts:
         folder = data / project_id / "users" / account.user_id
         membership = document(folder / "session.json")
@@ -127,7 +127,7 @@ def verify(
     return found
 
 
-def _look_at_answers(found: Verification, account: Account, folder: Path) -> None:
+def _look_at_answers(found: Verification, account: BotReport, folder: Path) -> None:
     """Compare the answers to pages with what the bot has sent."""
     for step, sent in account.answers.items():
         found.answers_sent += 1
@@ -139,9 +139,9 @@ def _look_at_answers(found: Verification, account: Account, folder: Path) -> Non
 
 def _look_at_plays(
     found: Verification,
-    account: Account,
+    account: BotReport,
     folder: Path,
-    recordings: list[Recording],
+    recordings: list[StoredRecording],
     last_error: Callable[[str], str],
 ) -> None:
     """Compare each game step with its answer and its recordings."""
@@ -158,14 +158,14 @@ def _look_at_plays(
             found.missing.append(f"{who}: no recording")
 
 
-def _recordings(trials: Path, read: dict[Path, list[Recording]]) -> list[Recording]:
+def _recordings(trials: Path, read: dict[Path, list[StoredRecording]]) -> list[StoredRecording]:
     """The recordings in this folder. Those of a session are several bots', and are read once."""
     if trials not in read:
         read[trials] = [read_recording(path) for path in sorted(trials.glob("*/*.gz"))]
     return read[trials]
 
 
-def _look_at_unmatched(found: Verification, who: str, play: Play, answers: dict[str, Any]) -> None:
+def _look_at_unmatched(found: Verification, who: str, play: PlayedStep, answers: dict[str, Any]) -> None:
     """Whether the answer to a game says that its bot found no others."""
     found.games_played += 1
     if answers.get("outcome") == play.outcome:
@@ -175,7 +175,7 @@ def _look_at_unmatched(found: Verification, who: str, play: Play, answers: dict[
 
 
 def _look_at_game(
-    found: Verification, who: str, play: Play, answers: dict[str, Any], recordings: list[Recording]
+    found: Verification, who: str, play: PlayedStep, answers: dict[str, Any], recordings: list[StoredRecording]
 ) -> None:
     """Compare what a bot has seen of a game with its answer and its recordings."""
     found.games_played += 1

@@ -13,7 +13,7 @@ from typing import Any
 from export import scrub
 from export.recording_columns import when
 from export.scrub import clean, texts
-from export.state import Participant, State
+from export.state import ExportedParticipant, ExportState
 from export.table_files import Column, fit, json_text
 from hippodrome.model.project import Project
 from protocol.session import is_session_id
@@ -48,10 +48,10 @@ class Field:
         return next(iter(kinds)) if len(kinds) == 1 else "text"
 
 
-class Answers:
+class StudyAnswers:
     """All answers of a study. Made by one pass that finds the columns; the tables are further passes."""
 
-    def __init__(self, state: State, project: Project | None, apart: bool) -> None:
+    def __init__(self, state: ExportState, project: Project | None, apart: bool) -> None:
         self._state = state
         self._project = project
         self._apart = apart
@@ -80,7 +80,7 @@ class Answers:
         self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
         self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK
 
-    def _participants(self) -> Iterator[tuple[Participant, dict[str, Mapping[str, Any]]]]:
+    def _participants(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
         """Everybody, with their documents as they may be shown."""
         for participant, found in self._state.answers():
             if not self._apart:
@@ -189,7 +189,7 @@ class Answers:
 _MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "truth"), Column("waited", "number"))
 
 
-def _membership(participant: Participant) -> list[Any]:
+def _membership(participant: ExportedParticipant) -> list[Any]:
     """In which session a participant plays and at which seat, or that in none; seconds that they waited for others."""
     about = participant.membership
     session, seat, unmatched = about.get("session"), about.get("seat"), about.get("unmatched")

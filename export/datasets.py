@@ -28,7 +28,7 @@ from typing import Any
 
 from export import episodes
 from export.episodes import Spec
-from export.state import State
+from export.state import ExportState
 
 OF_HUMAN = (
     "Several players played: actions, rewards and observations are those of {who}. An action by none is the "
@@ -56,7 +56,7 @@ class Dataset:
     left_out: Counter[str] = field(default_factory=Counter)
 
 
-def build(folder: Path, state: State, project: str, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
+def build(folder: Path, state: ExportState, project: str, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
     """Make `folder/minari` anew from the converted recordings; what there is now. Raises OSError."""
     import minari
 
@@ -91,7 +91,7 @@ def build(folder: Path, state: State, project: str, progress: Callable[[int, int
     ]
 
 
-def _datasets(folder: Path, state: State, project: str) -> list[Dataset]:
+def _datasets(folder: Path, state: ExportState, project: str) -> list[Dataset]:
     found: dict[Spec, Dataset] = {}
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         first = next(several)[2]

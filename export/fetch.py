@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from export import keys, recording, scrub
-from export.keys import Item, Kind
+from export.keys import Item, KeyKind
 from export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
 from export.recording_columns import when
-from export.source import PARALLEL, Gone, Source, TooLarge
-from export.state import File, Kept, Participant, State
+from export.source import PARALLEL, FileGone, Source, TooLarge
+from export.state import ExportedParticipant, ExportState, File, Kept
 from protocol import session as sessions
 from protocol.session import is_session_id
 
@@ -36,7 +36,7 @@ LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
 class Work:
     """What one worker is to fetch for one participant or one session."""
 
-    owner: Participant | Members | None
+    owner: ExportedParticipant | Members | None
     fetch: list[Item]
     seen: list[str]
     then: Unit | None = None  # what follows when the session's own document is here
@@ -45,7 +45,7 @@ class Work:
     def user(self) -> str:
         """The id of the participant or of the session."""
         match self.owner:
-            case Participant(user=user):
+            case ExportedParticipant(user=user):
                 return user
             case Members(session=session):
                 return session
@@ -60,7 +60,7 @@ class Fetcher:
         project: str,
         *,
         source: Source,
-        state: State,
+        state: ExportState,
         folder: Path,
         wanted: Wanted,
         progress: Callable[[int, int], None],
@@ -109,7 +109,7 @@ class Fetcher:
 
         try:
             for unit in units(self._project, lines(self._source, self._project, self._state)):
-                while unit.is_session and any(isinstance(work.owner, Participant) for work in running.values()):
+                while unit.is_session and any(isinstance(work.owner, ExportedParticipant) for work in running.values()):
                     collect()  # who plays there has to be known first
                 begin(self._work(unit, tally))
                 while len(running) >= MAX_WAITING:
@@ -129,12 +129,12 @@ class Fetcher:
 
     def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
         """What is to be done for a unit. Of a session first its own document; the rest when its members are `known`."""
-        owner: Participant | Members | None = known
+        owner: ExportedParticipant | Members | None = known
         then = None
         if unit.is_session and known is None:
             about, rest = list[Item](), list[Item]()
             for item in unit.items:
-                (about if item.kind is Kind.SESSION else rest).append(item)
+                (about if item.kind is KeyKind.SESSION else rest).append(item)
             owner, unit, then = Members(unit.user), Unit(unit.user, about), Unit(unit.user, rest)
         elif unit.user and known is None:
             owner = self._state.find_or_add(unit.user, self._wanted.apart)
@@ -176,22 +176,22 @@ class Fetcher:
             mark = owner.mark if isinstance(owner, Members) else ""
             file = File(item.listed.key, item.kind, version_of(item, mark), item.listed.size, step=item.step)
             try:
-                if item.kind is Kind.FOREIGN or owner is None:
+                if item.kind is KeyKind.FOREIGN or owner is None:
                     file.problems.append(f"not one of ours: {item.why}")
-                elif item.kind is Kind.RECORDING:
+                elif item.kind is KeyKind.RECORDING:
                     self._recording(item, owner, file)
                 else:
                     self._document(item, owner, file)
-            except Gone:
+            except FileGone:
                 continue  # the next run sees what has become of it
-            if isinstance(owner, Participant) and item.kind is Kind.PARTICIPANT:
+            if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.PARTICIPANT:
                 owner = owner._replace(document=file.document or {})
-            if isinstance(owner, Participant) and item.kind is Kind.MEMBERSHIP:
+            if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.MEMBERSHIP:
                 owner = owner._replace(membership=file.document or {})
             made.append(file)
         return made
 
-    def _document(self, item: Item, owner: Participant | Members, file: File) -> None:
+    def _document(self, item: Item, owner: ExportedParticipant | Members, file: File) -> None:
         try:
             body = self._source.read(item.listed.key, LARGEST_DOCUMENT)
         except TooLarge:
@@ -211,10 +211,10 @@ class Fetcher:
         file.document = found
         file.problems += _doubts(item, found)
 
-    def _recording(self, item: Item, owner: Participant | Members, file: File) -> None:
+    def _recording(self, item: Item, owner: ExportedParticipant | Members, file: File) -> None:
         attempt = keys.attempt(self._project, item.user, item.server)
         place = str(attempt) if attempt is not None else f"other-{self._token(item.server)}"
-        if isinstance(owner, Participant):
+        if isinstance(owner, ExportedParticipant):
             whose, theirs, people = {"participant": owner.number}, scrub.identities(owner), None
         else:
             whose, theirs, people = {"session": owner.session}, dict(owner.identities), owner.people
@@ -261,12 +261,12 @@ class Fetcher:
         return Kept(path, size, digest)
 
 
-def _folder(owner: Participant | Members) -> str:
+def _folder(owner: ExportedParticipant | Members) -> str:
     """The name of a participant's or a session's folder among ours."""
-    return owner.folder if isinstance(owner, Participant) else owner.session
+    return owner.folder if isinstance(owner, ExportedParticipant) else owner.session
 
 
-def forget_gone(state: State, folder: Path) -> int:
+def forget_gone(state: ExportState, folder: Path) -> int:
     """Remove here what is gone from the source, such as an erased participant. Return how many files that were."""
     count = 0
     with state.in_transactions():
@@ -300,16 +300,16 @@ def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
     group = found.get("group")
     if group is not None and (not isinstance(group, int) or isinstance(group, bool)):
         doubts.append("group is no whole number")
-    if item.kind is Kind.PARTICIPANT:
+    if item.kind is KeyKind.PARTICIPANT:
         if when(found.get("arrived")) is None:
             doubts.append("arrived is no time")
         if not isinstance(found.get("link", {}), dict):
             doubts.append("link is no object")
         return doubts
-    if item.kind is Kind.MEMBERSHIP:
+    if item.kind is KeyKind.MEMBERSHIP:
         known = found.get("session")
         return doubts if known is None or is_session_id(known) else [*doubts, "session is the id of none"]
-    if item.kind is Kind.SESSION:
+    if item.kind is KeyKind.SESSION:
         try:
             sessions.parse(json.dumps(found).encode())
         except sessions.BadSession as bad:

@@ -18,7 +18,7 @@ _RECORDING = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64}?)-(?P<rest>(?:trial|episo
 _END = ".jsonl.gz"
 
 
-class Kind(StrEnum):
+class KeyKind(StrEnum):
     PARTICIPANT = "participant"
     ANSWER = "answer"
     RECORDING = "recording"
@@ -41,7 +41,7 @@ class Item(NamedTuple):
     `user` is whose file it is: a participant's id, or a session's, which no participant can have.
     """
 
-    kind: Kind
+    kind: KeyKind
     listed: Listed
     user: str = ""
     step: str = ""
@@ -65,21 +65,21 @@ def read(project: str, listed: Listed) -> Item:
     parts = listed.key.removeprefix(prefix(project)).split("/")
     user = parts[0] if len(parts) > 1 and ids.is_user_id(parts[0]) else ""
     if not user:
-        return Item(Kind.FOREIGN, listed, why="it is in no participant's folder")
+        return Item(KeyKind.FOREIGN, listed, why="it is in no participant's folder")
 
     def foreign(why: str) -> Item:
-        return Item(Kind.FOREIGN, listed, user, why=why)
+        return Item(KeyKind.FOREIGN, listed, user, why=why)
 
     if listed.key.endswith((".part", ".new")):
         return foreign("it was still being written")
     match parts[1:]:
         case [("participant.json" | "session.json") as name]:
-            return Item(Kind.PARTICIPANT if name == "participant.json" else Kind.MEMBERSHIP, listed, user)
+            return Item(KeyKind.PARTICIPANT if name == "participant.json" else KeyKind.MEMBERSHIP, listed, user)
         case ["answers", name] if name.endswith(".json"):
             step = name.removesuffix(".json")
             if not NAME.fullmatch(step) or step in RESERVED:
                 return foreign("no step can have that name")
-            return Item(Kind.ANSWER, listed, user, step)
+            return Item(KeyKind.ANSWER, listed, user, step)
         case ["trials", server, name] if name.endswith(_END):
             return _recording(listed, user, server, name) or foreign("no recording has that name")
     return foreign("Hippodrome writes no such file")
@@ -94,19 +94,19 @@ def _read_session(project: str, listed: Listed) -> Item:
     elif listed.key.endswith((".part", ".new")):
         why = "it was still being written"
     elif parts[1:] == ["session.json"]:
-        return Item(Kind.SESSION, listed, session)
+        return Item(KeyKind.SESSION, listed, session)
     elif len(parts) == 4 and parts[1] == "trials" and parts[3].endswith(_END):
         if found := _recording(listed, session, parts[2], parts[3]):
             return found
         why = "no recording has that name"
-    return Item(Kind.FOREIGN, listed, session, why=why)
+    return Item(KeyKind.FOREIGN, listed, session, why=why)
 
 
 def _recording(listed: Listed, user: str, server: str, name: str) -> Item | None:
     found = _RECORDING.fullmatch(name.removesuffix(_END))
     if not found or not SERVER_NAME.fullmatch(server):
         return None
-    return Item(Kind.RECORDING, listed, user, found["step"], server, found[0])
+    return Item(KeyKind.RECORDING, listed, user, found["step"], server, found[0])
 
 
 def attempt(project: str, user: str, server: str) -> int | None:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from export import keys, scrub
-from export.keys import Item, Kind, Listed
+from export.keys import Item, KeyKind, Listed
 from export.source import Source
-from export.state import State
+from export.state import ExportState
 from protocol import session as sessions
 from protocol.keys import sessions_folder
 from protocol.session import is_session_id
@@ -66,7 +66,7 @@ class Tally:
         return self.new + self.changed
 
 
-def lines(source: Source, project: str, state: State) -> Iterator[Listed]:
+def lines(source: Source, project: str, state: ExportState) -> Iterator[Listed]:
     """Everything that participants have left, then what their sessions have, if there are any."""
     found = state.has_sessions()
     for line in source.list(keys.prefix(project)):
@@ -76,7 +76,7 @@ def lines(source: Source, project: str, state: State) -> Iterator[Listed]:
         yield from source.list(sessions_folder(project))
 
 
-def members(state: State, session: str) -> Members:
+def members(state: ExportState, session: str) -> Members:
     """Who plays in a session, as far as it is known here by now."""
     version = next((known.version for key, known in state.files_of(session).items() if _is_session(key)), "")
     if not version:
@@ -115,7 +115,7 @@ def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
 
 
 def choose(
-    state: State, unit: Unit, wanted: Wanted, tally: Tally, damaged: frozenset[str], *, mark: str = ""
+    state: ExportState, unit: Unit, wanted: Wanted, tally: Tally, damaged: frozenset[str], *, mark: str = ""
 ) -> tuple[list[Item], list[str]]:
     """What of a unit has to be fetched, and the keys that may stay as they are. `damaged` are paths of ours.
 
@@ -126,33 +126,33 @@ def choose(
     everything = False
     for item in sorted(unit.items, key=lambda item: _ORDER.get(item.kind, len(_ORDER))):
         before = known.get(item.listed.key)
-        skipped = item.kind is Kind.RECORDING and not wanted.recordings
+        skipped = item.kind is KeyKind.RECORDING and not wanted.recordings
         same = (
             before is not None
             and before.version == version_of(item, mark)
             and not everything
             and damaged.isdisjoint((before.path, before.raw))
         )
-        raw_missing = wanted.raw and item.kind is not Kind.FOREIGN and (before is None or before.raw is None)
+        raw_missing = wanted.raw and item.kind is not KeyKind.FOREIGN and (before is None or before.raw is None)
         if skipped or (same and not raw_missing):
             tally.unchanged += 1
             seen.append(item.listed.key)
             continue
         tally.new, tally.changed = tally.new + (before is None), tally.changed + (before is not None)
-        tally.bytes += item.listed.size if item.kind is not Kind.FOREIGN else 0
+        tally.bytes += item.listed.size if item.kind is not KeyKind.FOREIGN else 0
         fetch.append(item)
         # With another participant.json a participant has other identities, which must leave all their files; with
         # another document a session may have other members.
-        everything = everything or (item.kind in _NAMING and wanted.apart) or item.kind is Kind.SESSION
+        everything = everything or (item.kind in _NAMING and wanted.apart) or item.kind is KeyKind.SESSION
     tally.participants += bool(unit.user) and not unit.is_session
     return fetch, seen
 
 
-_NAMING = (Kind.PARTICIPANT, Kind.MEMBERSHIP)
-_ORDER = {kind: order for order, kind in enumerate((*_NAMING, Kind.SESSION))}
+_NAMING = (KeyKind.PARTICIPANT, KeyKind.MEMBERSHIP)
+_ORDER = {kind: order for order, kind in enumerate((*_NAMING, KeyKind.SESSION))}
 """Documents of these kinds come first, in this order: what they say is needed to read the others."""
 
 
 def version_of(item: Item, mark: str) -> str:
     """The version of what is made of a file: of a recording it changes with the session's members too."""
-    return item.listed.version + (mark if item.kind is Kind.RECORDING else "")
+    return item.listed.version + (mark if item.kind is KeyKind.RECORDING else "")

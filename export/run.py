@@ -20,11 +20,11 @@ import msgspec
 from console import screen
 from console.problem import Problem
 from export import datasets, fetch, keys, listing, manifest, table_files, tables
-from export.answers import Answers
+from export.answers import StudyAnswers
 from export.fetch import Fetcher
 from export.listing import Tally, Wanted
-from export.source import Gone, Source, TooLarge
-from export.state import Kept, State
+from export.source import FileGone, Source, TooLarge
+from export.state import ExportState, Kept
 from hippodrome.model.project import MASTER_LIST, Project, read_list
 
 PRIVATE = "private"
@@ -52,7 +52,7 @@ def find_project(source: Source, project_id: str) -> Project | None:
     """The study as it is registered: its steps and their order. None if that is not known here."""
     try:
         listed = read_list(source.read(MASTER_LIST, _MASTER_LIST_MOST))
-    except Gone:
+    except FileGone:
         return None
     except (TooLarge, ValueError, RecursionError):
         screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
@@ -77,10 +77,12 @@ def look(source: Source, project_id: str, folder: Path, options: Options) -> Tal
 
 
 @contextlib.contextmanager
-def _checked(folder: Path, source: Source, project_id: str, options: Options) -> Iterator[tuple[State, frozenset[str]]]:
+def _checked(
+    folder: Path, source: Source, project_id: str, options: Options
+) -> Iterator[tuple[ExportState, frozenset[str]]]:
     _refuse_foreign(folder)
     try:
-        state = State.read_only(folder / _STATE)
+        state = ExportState.read_only(folder / _STATE)
     except sqlite3.DatabaseError:
         raise _broken_state(folder) from None
     try:
@@ -122,7 +124,7 @@ def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Op
         raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
     with _locked(folder):
         try:
-            state = State(folder / _STATE)
+            state = ExportState(folder / _STATE)
         except sqlite3.DatabaseError:
             raise _broken_state(folder) from None
         try:
@@ -136,7 +138,7 @@ def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Op
 
 
 def _run(
-    source: Source, project_id: str, project: Project | None, *, folder: Path, state: State, options: Options
+    source: Source, project_id: str, project: Project | None, *, folder: Path, state: ExportState, options: Options
 ) -> dict[str, Any]:
     _same_study(state, folder, source, project_id, options, write=True)
     salt = folder / PRIVATE / "salt"
@@ -164,7 +166,7 @@ def _run(
     style = table_files.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
     with _bar("Writing tables") as told:
-        answers = Answers(state, project, options.apart)
+        answers = StudyAnswers(state, project, options.apart)
         either = style if style.csv or style.parquet else table_files.Style(parquet=False)
         columns = answers.columns
         written += table_files.write(folder / "answers", columns, answers.rows(), either)
@@ -212,12 +214,12 @@ def _run(
     return {"folder": str(folder), **about, **{"run": asdict(tally)}}
 
 
-def _chain(shown: list[Kept], state: State) -> Iterator[Kept]:
+def _chain(shown: list[Kept], state: ExportState) -> Iterator[Kept]:
     yield from shown
     yield from state.kept()
 
 
-def _datasets(folder: Path, state: State, project_id: str, options: Options) -> list[dict[str, Any]]:
+def _datasets(folder: Path, state: ExportState, project_id: str, options: Options) -> list[dict[str, Any]]:
     """Minari datasets: made if asked for; thrown away where they no longer fit the recordings."""
     now, before = state.recordings_fingerprint(), state.fact("minari")
     if "minari" not in options.formats and before != now:
@@ -292,7 +294,9 @@ def _refuse_foreign(folder: Path) -> None:
         raise Problem(f"{folder} holds other things already.", "Name an empty folder, or one that does not exist yet.")
 
 
-def _same_study(state: State, folder: Path, source: Source, project_id: str, options: Options, *, write: bool) -> None:
+def _same_study(
+    state: ExportState, folder: Path, source: Source, project_id: str, options: Options, *, write: bool
+) -> None:
     """What must not change from run to run in one folder."""
     mode = "apart" if options.apart else "together"
     fixed = {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
@@ -318,7 +322,7 @@ def _same_study(state: State, folder: Path, source: Source, project_id: str, opt
         _numbers_of_before(state, folder, write)
 
 
-def _numbers_of_before(state: State, folder: Path, write: bool) -> None:
+def _numbers_of_before(state: ExportState, folder: Path, write: bool) -> None:
     """The state is gone: the numbers that people had stand in identities.csv."""
     path = folder / PRIVATE / "identities.csv"
     if not path.exists():
@@ -337,7 +341,7 @@ def _numbers_of_before(state: State, folder: Path, write: bool) -> None:
                 state.find_or_add(user, True, number)
 
 
-def _damaged(folder: Path, state: State) -> frozenset[str]:
+def _damaged(folder: Path, state: ExportState) -> frozenset[str]:
     """Files of ours that have changed or are gone: their sources are fetched again."""
     if not state.file_count():
         return frozenset()

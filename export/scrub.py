@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from export.state import Participant
+from export.state import ExportedParticipant
 
 SHORTEST = 6  # characters; a shorter id or value stands in too many texts by chance
 _SURROGATES = re.compile("[\ud800-\udfff]")
@@ -52,7 +52,7 @@ def nothing() -> Scrub:
     return Scrub({})
 
 
-def identities(participant: Participant) -> dict[str, str]:
+def identities(participant: ExportedParticipant) -> dict[str, str]:
     """What gives a participant away, from `participant.json` and `session.json`, and what to write instead."""
     found = {value: f"({name})" for name, value in texts(participant.document.get("link")).items()}
     for document in (participant.document, participant.membership):
@@ -61,7 +61,7 @@ def identities(participant: Participant) -> dict[str, str]:
     return {**found, participant.user: participant.number}
 
 
-def completion_code(participant: Participant) -> str | None:
+def completion_code(participant: ExportedParticipant) -> str | None:
     """The code that the participant was shown at the end: one without a partner has another than the usual one."""
     codes = (document.get("completionCode") for document in (participant.membership, participant.document))
     return next((clean(code) for code in codes if isinstance(code, str) and code), None)

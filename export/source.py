@@ -27,7 +27,7 @@ _PIECE = 256 * 1024  # bytes
 _CUT_OFF = (ConnectionClosedError, IncompleteReadError, ReadTimeoutError, ResponseStreamingError)
 
 
-class Gone(Exception):
+class FileGone(Exception):
     """The file was there when it was listed, and is not any more, or is another one now."""
 
 
@@ -50,10 +50,10 @@ class Source(Protocol):
         """Everything below a prefix, however much there is; all of one participant stand together."""
 
     def read(self, key: str, most: int) -> bytes:
-        """A small document. Raises `Gone`, `TooLarge`."""
+        """A small document. Raises `FileGone`, `TooLarge`."""
 
     def fetch(self, listed: Listed, to: Path) -> None:
-        """The very version that was listed, into a file. Raises `Gone`."""
+        """The very version that was listed, into a file. Raises `FileGone`."""
 
 
 class Bucket:
@@ -96,7 +96,7 @@ class Bucket:
             return self._client.get_object(**what, **self._place)
         except ClientError as error:
             if errors.code(error) in {"NoSuchKey", "PreconditionFailed", "404", "412"}:
-                raise Gone(what["Key"]) from None
+                raise FileGone(what["Key"]) from None
             raise
 
 
@@ -123,7 +123,7 @@ class Folder:
             with (self._root / key).open("rb") as file:
                 body = file.read(most + 1)
         except (FileNotFoundError, NotADirectoryError):
-            raise Gone(key) from None
+            raise FileGone(key) from None
         if len(body) > most:
             raise TooLarge(key)
         return body
@@ -132,11 +132,11 @@ class Folder:
         try:
             with (self._root / listed.key).open("rb") as source, to.open("wb") as file:
                 if _version(os.fstat(source.fileno())) != listed.version:
-                    raise Gone(listed.key)
+                    raise FileGone(listed.key)
                 while piece := source.read(_PIECE):
                     file.write(piece)
         except FileNotFoundError:
-            raise Gone(listed.key) from None
+            raise FileGone(listed.key) from None
 
     def _walk(self, folder: Path, key: str) -> Iterator[Listed]:
         with os.scandir(folder) as found:

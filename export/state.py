@@ -71,7 +71,7 @@ class Known(NamedTuple):
     raw: str | None
 
 
-class Participant(NamedTuple):
+class ExportedParticipant(NamedTuple):
     """A participant: the id, the number that stands for it, the folder's name, and participant.json.
 
     `membership` says in which session they play (`session.json` of their folder); empty if in none.
@@ -88,7 +88,7 @@ _OF_SESSIONS = ("membership", "session")
 """Kinds of `session.json`: that of a participant's folder, and that of the session's. Both are kept in one table."""
 
 
-class State:
+class ExportState:
     """One connection; use it in one thread. Nothing is lost that was committed."""
 
     def __init__(self, path: Path | None) -> None:
@@ -98,7 +98,7 @@ class State:
         self._db.executescript(_TABLES)
 
     @classmethod
-    def read_only(cls, path: Path) -> State:
+    def read_only(cls, path: Path) -> ExportState:
         """For a look: nothing can be written. An empty one if there is no such file.
 
         Opened like any other all the same: what a killed run left half-written must be taken back first.
@@ -124,13 +124,13 @@ class State:
 
     # -- participants
 
-    def participant(self, user: str) -> Participant | None:
+    def participant(self, user: str) -> ExportedParticipant | None:
         row = self._db.execute(
             "SELECT user, number, folder, document, membership FROM people WHERE user=?", (user,)
         ).fetchone()
         return _participant(row) if row else None
 
-    def present(self, user: str) -> Participant | None:
+    def present(self, user: str) -> ExportedParticipant | None:
         """The participant, if the source still has something of them."""
         seen = self._db.execute("SELECT 1 FROM participants WHERE user=? AND seen=?", (user, self.run)).fetchone()
         return self.participant(user) if seen else None
@@ -144,7 +144,7 @@ class State:
         """Whether anything of sessions is known here."""
         return self._db.execute("SELECT 1 FROM files WHERE kind IN ('session', 'membership')").fetchone() is not None
 
-    def find_or_add(self, user: str, apart: bool, number: str = "") -> Participant:
+    def find_or_add(self, user: str, apart: bool, number: str = "") -> ExportedParticipant:
         """The participant. A new one gets this number; else a random one if ids are kept `apart`, or their id."""
         known = self.participant(user)
         if known:
@@ -159,7 +159,7 @@ class State:
             except sqlite3.IntegrityError:
                 number = ""  # the same number twice: one in 20 million million
                 continue
-            return Participant(user, number, self._folder_of(user), {})
+            return ExportedParticipant(user, number, self._folder_of(user), {})
 
     def _folder_of(self, user: str) -> str:
         return str(self._db.execute("SELECT folder FROM participants WHERE user=?", (user,)).fetchone()[0])
@@ -173,7 +173,7 @@ class State:
             name = f"{base}~{count}"
         return name
 
-    def participants(self) -> Iterator[Participant]:
+    def participants(self) -> Iterator[ExportedParticipant]:
         """Everybody who was seen in the last run, in the order of their numbers."""
         query = "SELECT user, number, folder, document, membership FROM people WHERE seen=? ORDER BY number"
         for row in self._db.execute(query, (self.run,)):
@@ -292,14 +292,14 @@ class State:
         for row in self._db.execute("SELECT raw, raw_bytes, raw_sha256 FROM files WHERE raw IS NOT NULL ORDER BY raw"):
             yield Kept(*row)
 
-    def answers(self) -> Iterator[tuple[Participant, dict[str, Mapping[str, Any]]]]:
+    def answers(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
         """Everybody in the order of their numbers, each with the documents of their answers by step."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, a.step, a.document FROM people p"
             " LEFT JOIN answers a ON a.user = p.user WHERE p.seen=? ORDER BY p.number, a.step",
             (self.run,),
         )
-        participant: Participant | None = None
+        participant: ExportedParticipant | None = None
         found: dict[str, Mapping[str, Any]] = {}
         for row in rows:
             if participant is None or row[0] != participant.user:
@@ -311,7 +311,7 @@ class State:
         if participant is not None:
             yield participant, found
 
-    def episodes(self) -> Iterator[tuple[Participant | None, str, Mapping[str, Any]]]:
+    def episodes(self) -> Iterator[tuple[ExportedParticipant | None, str, Mapping[str, Any]]]:
         """Every episode with its participant and its file, in the order of numbers and files; first those of sessions.
 
         A session's episode has no participant here; it says `session` and, by player, the `people`'s numbers.
@@ -324,7 +324,7 @@ class State:
         for row in rows:
             yield _participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
 
-    def problems(self) -> Iterator[tuple[Participant | None, str, str]]:
+    def problems(self) -> Iterator[tuple[ExportedParticipant | None, str, str]]:
         """Who, which file, what is wrong with it."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, f.key, f.problems FROM files f"
@@ -357,8 +357,8 @@ class State:
         return digest.hexdigest()
 
 
-def _participant(row: Any) -> Participant:
-    return Participant(
+def _participant(row: Any) -> ExportedParticipant:
+    return ExportedParticipant(
         row[0], row[1], row[2], json.loads(row[3]) if row[3] else {}, json.loads(row[4]) if row[4] else {}
     )
 

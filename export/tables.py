@@ -17,7 +17,7 @@ from typing import Any
 from export import scrub
 from export.recording_columns import MOST_PLAYERS, as_number, when
 from export.scrub import clean, texts
-from export.state import Participant, State
+from export.state import ExportedParticipant, ExportState
 from export.table_files import BATCH, Column, fit
 from protocol.keys import sessions_folder
 from protocol.session import is_session_id
@@ -43,12 +43,12 @@ _BY_POLICY = Column("framesByPolicy", "whole")
 """Of an episode of a session: the frames in which the substitute played in the participant's place."""
 
 
-def in_sessions(state: State) -> bool:
+def in_sessions(state: ExportState) -> bool:
     """Whether there are episodes of sessions."""
     return any("session" in found for _, _, found in state.episodes())
 
 
-def players(state: State) -> tuple[str, ...]:
+def players(state: ExportState) -> tuple[str, ...]:
     """The players of all episodes; none if no game has several players."""
     names = (name for _, _, found in state.episodes() for name in (*found.get("players", ()), *found.get("scores", ())))
     return tuple(dict.fromkeys(names))[:MOST_PLAYERS]
@@ -61,7 +61,7 @@ def of_episodes(players: Sequence[str], in_sessions: bool = False) -> list[Colum
     return [*EPISODES, *((*_OF_SESSIONS, _BY_POLICY) if in_sessions else ()), *who, *scores]
 
 
-def episodes(state: State, players: Sequence[str], in_sessions: bool = False) -> Iterator[list[Any]]:
+def episodes(state: ExportState, players: Sequence[str], in_sessions: bool = False) -> Iterator[list[Any]]:
     """One row per episode: its outcome, where its frames are, and of each player who played it and its score.
 
     An episode of a session has a row for each human player, with their own score.
@@ -100,7 +100,7 @@ def _in_session(found: Mapping[str, Any], player: str | None) -> list[Any]:
 
 
 def _whose(
-    participant: Participant | None, found: Mapping[str, Any]
+    participant: ExportedParticipant | None, found: Mapping[str, Any]
 ) -> list[tuple[str | None, str | None, float | None]]:
     """Whose an episode is: number, player and score. A session's is each human player's.
 
@@ -135,7 +135,7 @@ def of_callbacks(in_sessions: bool) -> list[Column]:
     return [*CALLBACKS, *(_OF_SESSIONS if in_sessions else ())]
 
 
-def callbacks(state: State, folder: Path, in_sessions: bool = False) -> Iterator[list[Any]]:
+def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> Iterator[list[Any]]:
     """One row per line that a callback of the agent left. `folder` holds the converted recordings.
 
     In a session, a line has the participant whose player it names, if it names one.
@@ -170,7 +170,7 @@ PRESENCE = (
 )
 
 
-def presence(state: State, folder: Path) -> Iterator[list[Any]]:
+def presence(state: ExportState, folder: Path) -> Iterator[list[Any]]:
     """Who of a session came, left and was back, and each round trip: a row for each member whom a line names.
 
     `folder` holds the converted recordings. Round trips are in milliseconds.
@@ -204,8 +204,8 @@ def _seen(more: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
 
 
 def _lines(
-    state: State, folder: Path, has: str, kinds: Sequence[str]
-) -> Iterator[tuple[Participant | None, Mapping[str, Any], str, Mapping[str, Any]]]:
+    state: ExportState, folder: Path, has: str, kinds: Sequence[str]
+) -> Iterator[tuple[ExportedParticipant | None, Mapping[str, Any], str, Mapping[str, Any]]]:
     """The lines of these kinds, of the recordings in one of whose episodes `has` stands.
 
     Whose the recording is, what is known of its first episode, its file, and the line.
@@ -247,7 +247,7 @@ def _callback(row: Mapping[str, Any], more: Mapping[str, Any]) -> list[Any]:
     ]
 
 
-def identities(state: State, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
+def identities(state: ExportState, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
     """The table of identities, which is kept apart."""
     columns = [Column("participant"), Column("userId"), Column("completionCode")]
     columns += [Column(f"link.{clean(name)}") for name in links]
@@ -268,7 +268,7 @@ def identities(state: State, links: Sequence[str]) -> tuple[list[Column], Iterat
 PROBLEMS = (Column("participant"), Column("file"), Column("problem"))
 
 
-def problems(state: State, project: str, apart: bool) -> Iterator[list[Any]]:
+def problems(state: ExportState, project: str, apart: bool) -> Iterator[list[Any]]:
     """What could not be read as it should be, with the file's key; without ids where they are apart."""
     for participant, key, problem in state.problems():
         shown = key.removeprefix(f"{project}/users/")
@@ -293,7 +293,7 @@ def _of_session(key: str) -> str:
 _RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:trial|episode)[0-9-]*\.jsonl\.gz")
 
 
-def _without_ids(key: str, participant: Participant | None, project: str) -> str:
+def _without_ids(key: str, participant: ExportedParticipant | None, project: str) -> str:
     """A key without ids: known parts stay, others are left out."""
     if participant is None:
         return "(somewhere in users/)"

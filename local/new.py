@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from hippodrome.config import ConfigErrors
-from hippodrome.config.folder import Source, read_source
+from hippodrome.config.folder import ConfigSource, read_source
 from hippodrome.model import ids
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +37,7 @@ class NotMade(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Template:
+class StudyTemplate:
     """A study to copy: its folder, its title, and whether it lies at the top, in Hippodrome's own folder."""
 
     folder: Path
@@ -45,26 +45,26 @@ class Template:
     at_top: bool = False
 
 
-def templates(root: Path = ROOT) -> dict[str, Template]:
+def templates(root: Path = ROOT) -> dict[str, StudyTemplate]:
     """Every template by its name: the examples by their folders' names, the study at the top by its id."""
-    found: dict[str, Template] = {}
+    found: dict[str, StudyTemplate] = {}
     top = _source(root)
     if top is not None:
-        found[_text(top, _ID)] = Template(root, _text(top, ("project", "name")), at_top=True)
+        found[_text(top, _ID)] = StudyTemplate(root, _text(top, ("project", "name")), at_top=True)
     for folder in sorted((root / EXAMPLES).glob("*/")):
         source = _source(folder)
         if source is not None:
-            found[folder.name] = Template(folder, _text(source, ("project", "name")))
+            found[folder.name] = StudyTemplate(folder, _text(source, ("project", "name")))
     return found
 
 
-def listing(known: Mapping[str, Template]) -> str:
+def listing(known: Mapping[str, StudyTemplate]) -> str:
     """The templates, a line for each."""
     width = max(map(len, known), default=0)
     return "\n".join(["There are these templates:", *(f"  {name:{width}}  {known[name].title}" for name in known)])
 
 
-def make_study(template: Template, folder: Path) -> str:
+def make_study(template: StudyTemplate, folder: Path) -> str:
     """Copy the template to `folder`, with an id of its own that is made of the folder's name; the id.
 
     Raises NotMade if the folder holds something already, if its name makes no id, or if it cannot be written.
@@ -94,7 +94,7 @@ def what_next(folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _refuse_what_is_there(template: Template, folder: Path) -> None:
+def _refuse_what_is_there(template: StudyTemplate, folder: Path) -> None:
     there, inside = folder.resolve(), template.folder.resolve()
     if folder.exists() and not folder.is_dir():
         raise NotMade(f"{folder} is a file; name a folder that does not exist yet")
@@ -104,7 +104,7 @@ def _refuse_what_is_there(template: Template, folder: Path) -> None:
         raise NotMade(f"{folder} lies in the template itself; name a folder outside of it")
 
 
-def _copy(template: Template, folder: Path) -> None:
+def _copy(template: StudyTemplate, folder: Path) -> None:
     if not template.at_top:
         shutil.copytree(template.folder, folder, ignore=LEFT_OUT, dirs_exist_ok=True)
         return
@@ -129,7 +129,7 @@ def _name(folder: Path, project_id: str) -> None:
     file.write_text("".join(lines), encoding="utf-8")
 
 
-def _lead(template: Template, folder: Path) -> None:
+def _lead(template: StudyTemplate, folder: Path) -> None:
     """Let the commands and links in README.md and config.yml lead to the new folder, and to Hippodrome from there."""
     example = re.compile(rf"(?<![\w/]){EXAMPLES}/{re.escape(template.folder.name)}(?=[/\s`,.;:)]|$)")
     for file in (folder / README, folder / OF_A_STUDY[0]):
@@ -154,7 +154,7 @@ def _id_of(folder: Path) -> str:
     return found
 
 
-def _source(folder: Path) -> Source | None:
+def _source(folder: Path) -> ConfigSource | None:
     try:
         source = read_source(folder)
     except ConfigErrors:
@@ -162,7 +162,7 @@ def _source(folder: Path) -> Source | None:
     return source if _text(source, _ID) else None
 
 
-def _text(source: Source, path: tuple[str, ...]) -> str:
+def _text(source: ConfigSource, path: tuple[str, ...]) -> str:
     return str(source.adapted.at(path) or "")
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol import keyboard, values
-from protocol.values import LONGEST_NAME, Keys, Problem, checked
+from protocol.values import LONGEST_NAME, Keys, SectionProblem, checked
 
 MAX_KEYS = 100
 """Keys of one player, and labels."""
@@ -17,7 +17,7 @@ _LABEL = values.text("the text of a button", LONGEST_NAME)
 _NAME = values.text("what participants read", LONGEST_NAME)
 
 
-def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[Problem]]:
+def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[SectionProblem]]:
     """What the keys do: `{key: action}`, or such a map for each player."""
     if not value or not all(isinstance(each, dict) for each in value.values()):
         return _one_players_keys(value, path)
@@ -25,9 +25,9 @@ def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], 
     return {player: found for player, (found, _) in read.items()}, [one for _, many in read.values() for one in many]
 
 
-def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
-    problems: list[Problem] = []
+    problems: list[SectionProblem] = []
     known: dict[frozenset[str], str] = {}
     for name, action in value.items():
         here = (*path, name)
@@ -38,26 +38,26 @@ def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str]
             continue
         same = known.setdefault(frozenset(keyboard.parts(key)), name)
         if same != name:
-            problems.append(Problem(here, f"is the same as {keyboard.shown(same)}; keep one of them"))
+            problems.append(SectionProblem(here, f"is the same as {keyboard.shown(same)}; keep one of them"))
         found[key] = named
     return found, _few(value, problems, path)
 
 
-def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
     """The texts of buttons: `{action: text}`."""
     return _texts(value, path, _action, _LABEL)
 
 
-def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Problem]]:
+def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
     """What participants read of players: `{player: text}`."""
     return _texts(value, path, str, _NAME)
 
 
 def _texts(
     value: dict[str, Any], path: Keys, key: Callable[[Any], Any], text: Callable[[Any], Any]
-) -> tuple[dict[str, str], list[Problem]]:
+) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
-    problems: list[Problem] = []
+    problems: list[SectionProblem] = []
     for given, said in value.items():
         here = (*path, given)
         name, wrong = checked(key, given, here)
@@ -68,10 +68,10 @@ def _texts(
     return found, _few(value, problems, path)
 
 
-def _few(value: Mapping[str, Any], problems: list[Problem], path: Keys) -> list[Problem]:
+def _few(value: Mapping[str, Any], problems: list[SectionProblem], path: Keys) -> list[SectionProblem]:
     if len(value) <= MAX_KEYS:
         return problems
-    return [*problems, Problem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
+    return [*problems, SectionProblem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
 
 
 def _action(value: object) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from protocol import key_maps, values
 from protocol import players as who
 from protocol import trial_keys as keyed
-from protocol.trial_sections import Scene, Ui, usual_ui
+from protocol.trial_sections import SceneSection, Ui, usual_ui
 from protocol.values import Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
@@ -50,7 +50,7 @@ def _rate(default: int, meaning: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class TrialSection:
     """What happens on the participant's server."""
 
     action_buffer_lifespan: int = keyed.whole(
@@ -151,13 +151,13 @@ class Trial:
         "What programs that have the server's token may do at its path /gym: nothing, see each step, also advise, or "
         "make environments of their own.",
     )
-    scene: Scene | None = field(
+    scene: SceneSection | None = field(
         default=None,
         metadata=keyed.about(
             values.section("width: 600"),
             "The game is drawn by objects that render() returns, in a picture of this size. Without it, by frames.",
-            {"$ref": "#/$defs/Scene"},
-            section=Scene,
+            {"$ref": "#/$defs/SceneSection"},
+            section=SceneSection,
         ),
     )
     players: dict[str, Any] = field(
@@ -328,5 +328,5 @@ class Trial:
 
     def registered(self) -> dict[str, Any]:
         """The section as servers are told it, in few characters: without what of sessions is as by default."""
-        usual = Trial().document()
+        usual = TrialSection().document()
         return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != usual[key]}

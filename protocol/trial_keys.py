@@ -1,6 +1,6 @@
 """How a key of the section `trial` is declared: its check, its default, its meaning and its JSON Schema.
 
-The fields of `Trial`, and of the sections in it, are made by these functions.
+The fields of `TrialSection`, and of the sections in it, are made by these functions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol import values
-from protocol.values import Check, Keys, Problem
+from protocol.values import Check, Keys, SectionProblem
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Key:
     """If the value is a list: the check of each item."""
     section: type[Any] | None = None
     """If the value is a section of its own: the class of its keys."""
-    entries: Callable[[Any, Keys], tuple[Any, list[Problem]]] | None = None
+    entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]] | None = None
     """If the value is a map of names of the project's own: what is good of it at this path, and what is wrong."""
 
 
@@ -65,7 +65,9 @@ def choice(words: tuple[str, ...], meaning: str) -> Any:
     return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
 
 
-def texts(example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[Problem]]]) -> dict[str, Any]:
+def texts(
+    example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]]
+) -> dict[str, Any]:
     """As `about`: a map of names of the project's own to texts."""
     schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
     return about(values.section(example), meaning, schema, entries=entries)

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator
 from protocol import values
 from protocol.players import GYM_PLAYER
 from protocol.similar import did_you_mean
-from protocol.trial import Trial
-from protocol.values import Problem
+from protocol.trial import TrialSection
+from protocol.values import SectionProblem
 
 
-def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
+def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProblem]:
     """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is told at a key that is given."""
     rates = {
         "minFrameRate": trial.min_frame_rate,
@@ -32,10 +32,10 @@ def _frame_rates(trial: Trial, given: set[str]) -> Iterator[Problem]:
         default = "" if other in given else " by default"
         hint = f"; set {other} too" if default else ""
         sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
-        yield Problem((key,), sentence, (lower, upper))
+        yield SectionProblem((key,), sentence, (lower, upper))
 
 
-def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     """Keys and labels name actions of actionSpace, if that is given."""
     names = [action.lower() for action in trial.action_space]
     if not names:
@@ -47,55 +47,57 @@ def _actions_that_exist(trial: Trial, _given: set[str]) -> Iterator[Problem]:
             continue
         hint = did_you_mean(action, names) or f"; the actions are {values.printable(', '.join(names), 100)}"
         sentence = f"there is no action {values.show(action)} in actionSpace{hint}"
-        yield Problem((section, *path), sentence, ("actionSpace", section))
+        yield SectionProblem((section, *path), sentence, ("actionSpace", section))
 
 
-def _players_of_keys(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _players_of_keys(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     """Keys by player name players of `players`, if that is given."""
     known = trial.named_players()
     for player, keys in trial.keys.items():
         if known and isinstance(keys, dict) and player not in known:
             sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
-            yield Problem(("keys", player), sentence, ("players", "keys"))
+            yield SectionProblem(("keys", player), sentence, ("players", "keys"))
 
 
-def _players_of_names(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _players_of_names(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     """Names name players of `players`, if that is given."""
     known = trial.named_players()
     for player in trial.player_names:
         if known and player not in known:
             sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
-            yield Problem(("playerNames", player), sentence, ("players", "playerNames"))
+            yield SectionProblem(("playerNames", player), sentence, ("players", "playerNames"))
 
 
-def _different_actions(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     first: dict[str, int] = {}
     for index, action in enumerate(trial.action_space):
         name = action.lower()  # as the trial has it
         if first.setdefault(name, index) != index:
             sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
-            yield Problem(("actionSpace", index), sentence, ("actionSpace",))
+            yield SectionProblem(("actionSpace", index), sentence, ("actionSpace",))
 
 
-def _programs(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     """A program that plays needs a way in."""
     if trial.gym == "advise":
         return
     for _, players in trial.player_maps():
         for name, plays in players.items():
             if plays.startswith(GYM_PLAYER):
-                yield Problem(("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",))
+                yield SectionProblem(
+                    ("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",)
+                )
                 return
 
 
-def _substitute(trial: Trial, _given: set[str]) -> Iterator[Problem]:
+def _substitute(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
     """A policy that takes a place."""
     if trial.after_absent == "policy" and trial.substitute is None:
         what = "afterAbsent: policy needs a policy that takes the place, such as substitute: random"
-        yield Problem(("substitute",), f"missing; {what}", ("afterAbsent", "substitute"))
+        yield SectionProblem(("substitute",), f"missing; {what}", ("afterAbsent", "substitute"))
 
 
-RULES: tuple[Callable[[Trial, set[str]], Iterator[Problem]], ...] = (
+RULES: tuple[Callable[[TrialSection, set[str]], Iterator[SectionProblem]], ...] = (
     _frame_rates,
     _different_actions,
     _actions_that_exist,

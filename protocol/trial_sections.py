@@ -66,7 +66,7 @@ def _pixels(default: int, meaning: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SceneSection:
     """How a game is shown that is drawn by objects (docs/objects.md)."""
 
     width: int = _pixels(600, "Width of the picture, in pixels of its own; the page makes it larger or smaller.")

@@ -35,7 +35,7 @@ class Plain:
     text: str
 
 
-class Problem(NamedTuple):
+class SectionProblem(NamedTuple):
     """A mistake in the section: the path of the key below `trial`, and the sentence that says what to write.
 
     `compared` are the keys of a rule between two values; it is empty if the value is wrong by itself.
@@ -46,12 +46,12 @@ class Problem(NamedTuple):
     compared: tuple[str, ...] = ()
 
 
-def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[Problem]]:
+def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[SectionProblem]]:
     """What the check returns, or None and the problem at this path."""
     try:
         return check(value), []
     except ValueError as error:
-        return None, [Problem(path, str(error))]
+        return None, [SectionProblem(path, str(error))]
 
 
 def show(value: object) -> str:

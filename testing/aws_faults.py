@@ -33,7 +33,7 @@ from hippodrome.aws import dns, documents
 from hippodrome.aws.retry import retry_while_busy
 
 
-class Kind(StrEnum):
+class FaultKind(StrEnum):
     """What goes wrong."""
 
     THROTTLED = "throttled"  # in the service's own words
@@ -57,11 +57,11 @@ class AwsFault(NamedTuple):
     """The `number`-th call of the functions (from 1) goes wrong."""
 
     number: int
-    kind: Kind
+    kind: FaultKind
     reach: Reach
 
 
-class Made(NamedTuple):
+class MadeCall(NamedTuple):
     """A call: which function made it, and what it was, as `service:Operation`."""
 
     function: str
@@ -114,43 +114,43 @@ NOT_NOW: dict[str, Error | dict[str, Any]] = {
 SOLD_OUT = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time. Please try again later"}]}
 
 
-def kinds(action: str) -> list[Kind]:
+def kinds(action: str) -> list[FaultKind]:
     """What can go wrong with a call of `service:Operation`."""
     return [
-        Kind.THROTTLED,
-        Kind.INTERNAL,
-        *([Kind.NOT_NOW] if action in NOT_NOW else []),
-        Kind.CONNECT,
-        Kind.CLOSED,
-        Kind.READ,
-        *([Kind.BROKEN] if action == "s3:GetObject" else []),
+        FaultKind.THROTTLED,
+        FaultKind.INTERNAL,
+        *([FaultKind.NOT_NOW] if action in NOT_NOW else []),
+        FaultKind.CONNECT,
+        FaultKind.CLOSED,
+        FaultKind.READ,
+        *([FaultKind.BROKEN] if action == "s3:GetObject" else []),
     ]
 
 
 # What the ports try again themselves, beyond botocore: documents.py, dns.py, timers.py.
 PATIENT = {
-    ("s3:PutObject", Kind.NOT_NOW),
-    ("route53:ChangeResourceRecordSets", Kind.NOT_NOW),
-    ("route53:ChangeResourceRecordSets", Kind.THROTTLED),
-    ("scheduler:CreateSchedule", Kind.NOT_NOW),
+    ("s3:PutObject", FaultKind.NOT_NOW),
+    ("route53:ChangeResourceRecordSets", FaultKind.NOT_NOW),
+    ("route53:ChangeResourceRecordSets", FaultKind.THROTTLED),
+    ("scheduler:CreateSchedule", FaultKind.NOT_NOW),
 }
 
 
-def reaches(action: str, kind: Kind) -> list[Reach]:
+def reaches(action: str, kind: FaultKind) -> list[Reach]:
     """How far it can reach. botocore retries neither a body nor an error that it does not count as transient."""
-    single = kind is Kind.BROKEN or (kind is Kind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
+    single = kind is FaultKind.BROKEN or (kind is FaultKind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
     spell = [Reach.SPELL] if (action, kind) in PATIENT else []
     return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
 
 
-def invisible(fault: AwsFault, made: Made) -> bool:
+def invisible(fault: AwsFault, made: MadeCall) -> bool:
     """Whether botocore alone should hide the fault from the functions.
 
     It cannot hide the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
     The outcome must still be right, but a message may come again.
     """
-    again = fault.kind is Kind.READ and made.action == "s3:PutObject"
-    return fault.reach is Reach.ATTEMPT and fault.kind not in (Kind.NOT_NOW, Kind.BROKEN) and not again
+    again = fault.kind is FaultKind.READ and made.action == "s3:PutObject"
+    return fault.reach is Reach.ATTEMPT and fault.kind not in (FaultKind.NOT_NOW, FaultKind.BROKEN) and not again
 
 
 class AwsFaultInjector:
@@ -168,7 +168,7 @@ class AwsFaultInjector:
     def begin(self, fault: AwsFault | None) -> None:
         """Count from 1 again, with this fault."""
         self.fault = fault
-        self.calls: list[Made] = []  # so far
+        self.calls: list[MadeCall] = []  # so far
         self.struck = 0  # HTTP requests that went wrong
         self.waited = 0.0  # seconds: timeouts and pauses since `invocation`
         self._action = ""  # of the call under way
@@ -216,7 +216,7 @@ class AwsFaultInjector:
 
     def _before_call(self, model: Any, context: dict[str, Any], **_: Any) -> None:
         self._action = f"{model.service_model.service_name}:{model.name}"
-        self.calls.append(Made(self._function, self._action))
+        self.calls.append(MadeCall(self._function, self._action))
         self._attempts = 0
         self._protocol = model.service_model.metadata["protocol"]
         self._config = context["client_config"]
@@ -244,22 +244,22 @@ class AwsFaultInjector:
         assert self.fault is not None
         self.struck += 1
         match self.fault.kind:
-            case Kind.THROTTLED:
+            case FaultKind.THROTTLED:
                 return self._answer(request, THROTTLED[self._action.split(":")[0]])
-            case Kind.INTERNAL:
+            case FaultKind.INTERNAL:
                 return self._answer(request, INTERNAL[self._action.split(":")[0]])
-            case Kind.NOT_NOW:
+            case FaultKind.NOT_NOW:
                 return self._not_now(request)
-            case Kind.CONNECT:
+            case FaultKind.CONNECT:
                 self.wait(self._config.connect_timeout)
                 raise ConnectTimeoutError(endpoint_url=request.url, error="timed out")
-            case Kind.CLOSED:
+            case FaultKind.CLOSED:
                 raise ConnectionClosedError(endpoint_url=request.url)
-            case Kind.READ:
+            case FaultKind.READ:
                 serve()
                 self.wait(self._config.read_timeout)
                 raise ReadTimeoutError(endpoint_url=request.url, error="timed out")
-            case Kind.BROKEN:
+            case FaultKind.BROKEN:
                 return _cut(serve())
 
     def _not_now(self, request: Any) -> Any:

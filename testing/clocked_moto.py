@@ -78,7 +78,7 @@ GONE = 15.0  # seconds from then until the network interface is gone: STOPPED
 HORIZON = 4 * 3600.0  # seconds until everything must be over
 
 
-class Platform(AwsPlatform):
+class ClockedPlatform(AwsPlatform):
     """The adapters with the installation's clock. All functions share the clients, which cost more than a journey to make."""
 
     def __init__(self, env: Any, clock: Clock, session: Any, clients: dict[str, Any]) -> None:
@@ -147,8 +147,8 @@ class TimedInstallation:
         installed.use(None)
         self._stack.__exit__(*error)
 
-    def _platform(self, env: Any) -> Platform:
-        return Platform(env, self.clock, self.injector.session, self._clients)
+    def _platform(self, env: Any) -> ClockedPlatform:
+        return ClockedPlatform(env, self.clock, self.injector.session, self._clients)
 
     def _env(self, function: str) -> dict[str, str]:
         iam = self.world.iam

@@ -23,7 +23,7 @@ SECONDS = 60.0  # that an answer may take: environments on a participant's serve
 
 
 @dataclass(frozen=True, slots=True)
-class GymServer:
+class GymServerProcess:
     """A server that runs. `pid` is that of the process that listens."""
 
     port: int
@@ -41,7 +41,7 @@ def gym_server(
     program: Sequence[str] = ("-m", "trial.gym"),
     cwd: Path = ROOT,
     env: Mapping[str, str] | None = None,
-) -> Iterator[GymServer]:
+) -> Iterator[GymServerProcess]:
     """`python -m trial.gym` with these arguments, at a port of its own; it is interrupted at the end, as by Ctrl-C."""
     paths = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     process = subprocess.Popen(
@@ -55,7 +55,7 @@ def gym_server(
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        yield GymServer(int(line.split("/gym")[0].rpartition(":")[2]), process.pid)
+        yield GymServerProcess(int(line.split("/gym")[0].rpartition(":")[2]), process.pid)
     finally:
         process.send_signal(signal.SIGINT)
         try:
@@ -67,7 +67,7 @@ def gym_server(
             process.stdout.close()  # type: ignore[union-attr]
 
 
-class Client:
+class TextClient:
     """Sends and receives text, as Gymie's client does: the next message is the answer."""
 
     def __init__(self, url: str, *, arrays: bool = False) -> None:
@@ -98,7 +98,7 @@ class Client:
         """Close the connection."""
         self._stack.close()
 
-    def __enter__(self) -> Client:
+    def __enter__(self) -> TextClient:
         return self
 
     def __exit__(self, *_: object) -> None:

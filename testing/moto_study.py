@@ -214,7 +214,7 @@ PAIRS: dict[str, Any] = {
 """What makes the example study one that participants play in pairs."""
 
 
-class Member(Person):
+class MotoMember(Person):
     """A participant of a study that several play together."""
 
     def poll(self) -> Any:
@@ -235,7 +235,7 @@ class Member(Person):
         return self.study.stored(membership_key(PROJECT, self.user))
 
 
-def come(study: StudyOnMoto, *members: Member) -> None:
+def come(study: StudyOnMoto, *members: MotoMember) -> None:
     """They come to the game. Their servers are started ahead, while they answer the page before it."""
     for member in members:
         member.look()
@@ -245,7 +245,7 @@ def come(study: StudyOnMoto, *members: Member) -> None:
         member.answer(age="33")
 
 
-def meet(*members: Member, polls: int = 6) -> list[Any]:
+def meet(*members: MotoMember, polls: int = 6) -> list[Any]:
     """They wait in the lobby together, and ask in turn until none of them is in it any more; their last states."""
     states: list[Any] = []
     for _ in range(polls):
@@ -255,7 +255,7 @@ def meet(*members: Member, polls: int = 6) -> list[Any]:
     raise AssertionError(f"not matched: {states}")
 
 
-def play_together(study: StudyOnMoto, *members: Member, score: int = 120) -> None:
+def play_together(study: StudyOnMoto, *members: MotoMember, score: int = 120) -> None:
     """The trial writes each member's answer, and their browsers come back."""
     session = members[0].membership["session"]
     for member in members:

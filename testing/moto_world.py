@@ -55,11 +55,11 @@ from moto.sqs.models import sqs_backends
 from hippodrome.aws import AwsPlatform
 from testing import aws_events
 from testing.aws_events import ACCOUNT, IMAGE
-from testing.iam.enforcement import Call, IamEnforcement
+from testing.iam.enforcement import ApiCall, IamEnforcement
 
 
 @dataclass
-class Answer:
+class ScriptedAnswer:
     """What the next calls of an operation get instead of moto's own answer."""
 
     service: str
@@ -82,12 +82,12 @@ class MotoWorld:
         self.region = region
         self.root_domain = "example.org"
         self.raw_delivery = raw_delivery
-        self.calls: list[Call] = []
+        self.calls: list[ApiCall] = []
         self.in_sync = True  # False: Route 53 answers PENDING to every GetChange
         self.env: dict[str, str] = {}
         self.ids: dict[str, str] = {}  # made along the way: vpc, zone, queue URLs and ARNs
         self._lock = threading.RLock()
-        self._answers: list[Answer] = []
+        self._answers: list[ScriptedAnswer] = []
         self._tokens: dict[tuple[str, str], tuple[str, list[Any]]] = {}
         self._versions: Counter[str] = Counter()
         self._stack = contextlib.ExitStack()
@@ -131,9 +131,9 @@ class MotoWorld:
         return [call.action for call in self.calls]
 
     @contextlib.contextmanager
-    def recording(self) -> Iterator[list[Call]]:
+    def recording(self) -> Iterator[list[ApiCall]]:
         """The calls made within the block."""
-        seen: list[Call] = []
+        seen: list[ApiCall] = []
         start = len(self.calls)
         yield seen
         seen.extend(self.calls[start:])
@@ -141,7 +141,7 @@ class MotoWorld:
     def answer(self, action: str, parsed: dict[str, Any], status: int = 200, times: int = 1) -> None:
         """Let the next `times` calls of `action` ("ecs:RunTask") be answered by `parsed` and never reach moto."""
         service, operation = action.split(":")
-        self._answers.append(Answer(service, operation, parsed, status, times))
+        self._answers.append(ScriptedAnswer(service, operation, parsed, status, times))
 
     def fail(
         self, action: str, code: str, message: str = "made up", status: int = 400, times: int = 1, **more: Any
@@ -153,14 +153,14 @@ class MotoWorld:
         """Let every call of `action` from now on fail whose parameters are such."""
         service, operation = action.split(":")
         parsed = {"Error": {"Code": code, "Message": message}}
-        self._answers.append(Answer(service, operation, parsed, 400, sys.maxsize, when))
+        self._answers.append(ScriptedAnswer(service, operation, parsed, 400, sys.maxsize, when))
 
     def _record(self) -> None:
         def before_build(params: Mapping[str, Any], model: Any, context: dict[str, Any], **_: Any) -> None:
             context["hippodrome_params"] = {name: _summary(value) for name, value in params.items()}
 
         def before_call(model: Any, params: Any, context: dict[str, Any], **_: Any) -> Any:
-            call = Call(model.service_model.service_name, model.name, context.get("hippodrome_params", {}))
+            call = ApiCall(model.service_model.service_name, model.name, context.get("hippodrome_params", {}))
             with self._lock:
                 self.calls.append(call)
                 refusal = self.iam.judge(call) if self.iam else None

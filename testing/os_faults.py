@@ -1,13 +1,13 @@
 """Faults of one machine, as the operating system reports them: at single calls for files, processes, threads, sockets.
 
 Everything is injected *below* `local/`, in the functions of Python's library that make the system call. A call is known
-by its operation and by what kind of file it is about (`Call`), since threads make calls in an order that changes from
+by its operation and by what kind of file it is about (`OsCall`), since threads make calls in an order that changes from
 run to run; the n-th call of one kind is nearly always the same.
 
-* `Reach.ONCE`: this call fails.
-* `Reach.SPELL`: it fails, and so does for a moment every call that can fail for this reason, as on a full disk.
-* `Reach.EVER`: the data folder is another file system than the state folder: no link leads from one to the other.
-* `Reach.BEFORE`, `Reach.AFTER`: the process is killed (`kill -9`) just before the call, or just after it. None of its
+* `OsReach.ONCE`: this call fails.
+* `OsReach.SPELL`: it fails, and so does for a moment every call that can fail for this reason, as on a full disk.
+* `OsReach.EVER`: the data folder is another file system than the state folder: no link leads from one to the other.
+* `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill -9`) just before the call, or just after it. None of its
   threads makes another call.
 """
 
@@ -35,7 +35,7 @@ from unittest import mock
 SPELL_SECONDS = 0.4
 
 
-class Reach(StrEnum):
+class OsReach(StrEnum):
     """How far a fault reaches, see above."""
 
     ONCE = "once"
@@ -45,10 +45,10 @@ class Reach(StrEnum):
     AFTER = "killed after"
 
 
-KILLS = (Reach.BEFORE, Reach.AFTER)
+KILLS = (OsReach.BEFORE, OsReach.AFTER)
 
 
-class Call(NamedTuple):
+class OsCall(NamedTuple):
     """A kind of call: what is done, and to which kind of file."""
 
     operation: str
@@ -58,9 +58,9 @@ class Call(NamedTuple):
 class OsFault(NamedTuple):
     """The `number`-th call of this kind (from 1) goes wrong; `number` is an errno for all but kills."""
 
-    call: Call
+    call: OsCall
     number: int
-    reach: Reach
+    reach: OsReach
     errno: int = 0
 
     def __str__(self) -> str:
@@ -113,7 +113,7 @@ class OsFaultInjector:
     def __init__(self, root: Path, fault: OsFault | None = None, *, only: Callable[[], bool] = lambda: True) -> None:
         self.root = os.path.realpath(root)
         self.fault = fault
-        self.calls: Counter[Call] = Counter()
+        self.calls: Counter[OsCall] = Counter()
         self.struck = 0
         self.dead = threading.Event()  # the process has been killed, and the next has not begun
         self.off = _Off()
@@ -168,20 +168,20 @@ class OsFaultInjector:
         if place is None or self.off.deep or not self._only():
             return act()
         self._alive()
-        call = Call("process" if place == "proc" else operation, place)
+        call = OsCall("process" if place == "proc" else operation, place)
         error = self._error(call)
-        if error is Reach.BEFORE:
+        if error is OsReach.BEFORE:
             self.dead.set()
             raise Killed
         if isinstance(error, int):
             raise OSError(error, os.strerror(error))
         result = act()
-        if error is Reach.AFTER:
+        if error is OsReach.AFTER:
             self.dead.set()
             raise Killed
         return result
 
-    def _error(self, call: Call) -> int | Reach | None:
+    def _error(self, call: OsCall) -> int | OsReach | None:
         """What goes wrong with the call that is made now."""
         with self._lock:
             self.calls[call] += 1
@@ -191,12 +191,12 @@ class OsFaultInjector:
             if time.monotonic() < self._spell and fault.errno in ERRORS[call.operation]:
                 return fault.errno
             here = fault.call == call and fault.number == self.calls[call]
-            if not here or fault.reach is Reach.EVER:
+            if not here or fault.reach is OsReach.EVER:
                 return None
             self.struck += 1
             if fault.reach in KILLS:
                 return fault.reach
-            if fault.reach is Reach.SPELL:
+            if fault.reach is OsReach.SPELL:
                 self._spell = time.monotonic() + SPELL_SECONDS
             return fault.errno
 
@@ -255,7 +255,7 @@ class OsFaultInjector:
     def _link(self, do: Any, source: Any, target: Any, **options: Any) -> Any:
         here, there = self.place(source), self.place(target)
         two = bool(here and there and here.startswith("data/") != there.startswith("data/"))
-        if two and self.fault and self.fault.reach is Reach.EVER and not self.off.deep:
+        if two and self.fault and self.fault.reach is OsReach.EVER and not self.off.deep:
             self.struck += 1
             raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
         return self._call("link", there, lambda: do(source, target, **options))

@@ -21,7 +21,7 @@ from unittest import mock
 Chance = Callable[[], bool]
 
 
-class Change(NamedTuple):
+class DiskChange(NamedTuple):
     """One line of the record."""
 
     kind: str  # "name", "bytes", "sync"
@@ -36,7 +36,7 @@ class Disk:
 
     def __init__(self, root: Path) -> None:
         self.root = Path(os.path.realpath(root))
-        self.record: list[Change] = []
+        self.record: list[DiskChange] = []
         self._things = {self.root: 0}  # what the paths of the moment mean
         self._count = 0
 
@@ -107,7 +107,7 @@ class Disk:
         self._name(path, self._count)
 
     def _name(self, path: Path, thing: int | None) -> None:
-        self.record.append(Change("name", self._things[path.parent], path.name, thing))
+        self.record.append(DiskChange("name", self._things[path.parent], path.name, thing))
 
     def _open(self, do: Any, path: Any, mode: str = "r", *args: Any, **options: Any) -> Any:
         found = self._path(path)
@@ -158,5 +158,5 @@ class Disk:
             return
         thing = self._things[found]
         if not found.is_dir():
-            self.record.append(Change("bytes", thing, body=found.read_bytes()))
-        self.record.append(Change("sync", thing))
+            self.record.append(DiskChange("bytes", thing, body=found.read_bytes()))
+        self.record.append(DiskChange("sync", thing))

@@ -42,7 +42,7 @@ class StrictS3(FakePlatform):
         self.lock = threading.RLock()
         self.seen: list[tuple[str, str, int]] = []  # method, path and status of all that came
         self.failing: list[int] = []  # what the next requests to the bucket get instead of an answer
-        self.judge = Judge(cfn.Account(known={"Bucket": BUCKET})) if evaluator() else None
+        self.judge = Judge(cfn.ReferenceValues(known={"Bucket": BUCKET})) if evaluator() else None
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
         self.endpoint = f"http://127.0.0.1:{self._server.server_port}"
         self.url = f"{self.endpoint}/sign"

@@ -56,7 +56,7 @@ def functions(of: Mapping[str, Any] | None = None) -> dict[str, str]:
 
 
 @dataclass
-class Account:
+class ReferenceValues:
     """What references become. `known` has what was made outside, by `Ref` ("Bucket") or attribute ("Bucket.Arn")."""
 
     stack: str = "hippodrome"

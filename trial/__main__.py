@@ -11,12 +11,12 @@ import sys
 from protocol import environment, exits
 from trial.server import assignment
 from trial.server.preauth_limit import PortNotPermitted
-from trial.server.server import Server
-from trial.settings import Settings, SettingsError
+from trial.server.server import TrialServer
+from trial.settings import SettingsError, TrialSettings
 
 
-async def _serve(settings: Settings) -> tuple[int, bool]:
-    server = Server(settings)
+async def _serve(settings: TrialSettings) -> tuple[int, bool]:
+    server = TrialServer(settings)
 
     loop = asyncio.get_running_loop()
     serving = asyncio.create_task(server.run())
@@ -38,7 +38,7 @@ def main() -> int:
     )
     sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
     try:
-        settings = Settings.from_env(os.environ)
+        settings = TrialSettings.from_env(os.environ)
         for secret in environment.SECRETS:
             os.environ.pop(secret, None)  # the researcher's code has no use for them
         if not settings.assigned:

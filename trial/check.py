@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protocol import environment
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from protocol.trial_check import check
 from trial.agent import tracebacks
 from trial.server import process_group
@@ -126,7 +126,7 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
         _play_jointly(player, config, folder)
 
 
-def _play_jointly(adapter: JointAdapter, config: Trial, folder: Path) -> None:
+def _play_jointly(adapter: JointAdapter, config: TrialSection, folder: Path) -> None:
     """One step, in which all who are to act take their first action and each policy is asked for one."""
     from trial.core.players import who_plays  # noqa: PLC0415 - as above
     from trial.policies.places import load_policies  # noqa: PLC0415

@@ -13,7 +13,7 @@ from typing import Any
 from protocol import environment as variables
 from protocol.keys import NAME, SERVER_NAME, recordings_folder, session_recordings_folder
 from protocol.session import Member, is_session_id
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from protocol.trial_check import check
 from protocol.values import where_of
 
@@ -25,7 +25,7 @@ class SettingsError(ValueError):
     """The environment or the `trial` section cannot be used; the message says which key and why."""
 
 
-def trial_section(section: Mapping[str, Any]) -> Trial:
+def trial_section(section: Mapping[str, Any]) -> TrialSection:
     """The section `trial`, checked: with a game, and with the names of actions in small letters.
 
     Unknown keys are left alone. Raises SettingsError with the first problem.
@@ -38,7 +38,7 @@ def trial_section(section: Mapping[str, Any]) -> Trial:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class TrialSettings:
     """Everything that one trial server is started with. Durations are seconds; `deadline` is seconds since the epoch.
 
     A warm server without a participant has no `user_id` and no `group`, and `server` is its own name. The server of a
@@ -51,7 +51,7 @@ class Settings:
     token: str = field(repr=False)
     game_steps: tuple[str, ...]
     store: str
-    trial: Trial
+    trial: TrialSection
     group: int | None = None
     warm_server: bool = False
     session: str = ""
@@ -110,7 +110,7 @@ class Settings:
         return recordings_folder(self.project_id, self.user_id) + self.server
 
     @classmethod
-    def from_env(cls, env: Mapping[str, str]) -> Settings:
+    def from_env(cls, env: Mapping[str, str]) -> TrialSettings:
         """Read the environment of a trial server. Raises SettingsError naming the variable that is wrong."""
         steps = tuple(part.strip() for part in _required(env, variables.GAME_STEPS).split(",") if part.strip())
         if not steps or not all(NAME.fullmatch(step) for step in steps):
@@ -162,7 +162,7 @@ class Settings:
         )
 
 
-def _trial_of(env: Mapping[str, str]) -> Trial:
+def _trial_of(env: Mapping[str, str]) -> TrialSection:
     text = env.get(variables.TRIAL, "")
     if text.strip():
         try:

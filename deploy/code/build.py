@@ -106,9 +106,9 @@ def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[
     """The wheel's Python files that these imports reach without passing through `ends`."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
-    def source(module: str) -> Source | None:
+    def source(module: str) -> SourceModule | None:
         path = None if f"{module}.".startswith(tuple(f"{end}." for end in ends)) else paths.get(module)
-        return Source(wheel.members[path].read().decode(), path.endswith("__init__.py")) if path else None
+        return SourceModule(wheel.members[path].read().decode(), path.endswith("__init__.py")) if path else None
 
     starts = [name for name in wanted if name.partition(".")[0] in wheel.modules]
     reached = _closure(starts, source, tuple(wheel.modules))
@@ -119,7 +119,7 @@ def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[
 
 
 @dataclass(frozen=True)
-class Source:
+class SourceModule:
     """A module's text, and whether it is a package's `__init__`."""
 
     text: str
@@ -141,9 +141,9 @@ class _Tree:
                 found.append(path.stem)
         return found
 
-    def sources(self, module: str) -> Source | None:
+    def sources(self, module: str) -> SourceModule | None:
         path = self._path(module)
-        return Source(self._body(path).decode(), path.name == "__init__.py") if path else None
+        return SourceModule(self._body(path).decode(), path.name == "__init__.py") if path else None
 
     def files(self, module: str) -> Iterator[ZipMember]:
         """The module's own file, and the files that it reads at run time."""
@@ -182,7 +182,7 @@ class Closure:
     outside: frozenset[str]
 
 
-def _closure(starts: Iterable[str], find: Callable[[str], Source | None], tops: tuple[str, ...]) -> Closure:
+def _closure(starts: Iterable[str], find: Callable[[str], SourceModule | None], tops: tuple[str, ...]) -> Closure:
     inside: set[str] = set()
     outside: set[str] = set()
     waiting = list(starts)
@@ -206,7 +206,7 @@ def _with_parents(name: str) -> Iterator[str]:
 
 
 @cache
-def imported(source: Source, module: str) -> set[str]:
+def imported(source: SourceModule, module: str) -> set[str]:
     """Every name that the module imports, anywhere in it. `from a import b` gives `a` and `a.b`: b may be a module."""
     found: set[str] = set()
     for node in _statements(_parse(source.text, module)):

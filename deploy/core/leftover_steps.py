@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from deploy.core.stages import Step, step
+from deploy.core.stages import PlanStep, step
 from hippodrome.model import messages
 from hippodrome.model.server import Reason
 from hippodrome.ports import Platform
@@ -11,7 +11,7 @@ from hippodrome.servers.resources import Resources
 STOP_REASON = f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}"
 
 
-def removal_steps(platform: Platform, left: Resources) -> list[Step]:
+def removal_steps(platform: Platform, left: Resources) -> list[PlanStep]:
     """Stop the tasks, delete the DNS records with one change, cancel the timers."""
     from hippodrome.servers.dns import delete_dns_records  # noqa: PLC0415 - imports Powertools, which other commands do without
 
@@ -20,6 +20,6 @@ def removal_steps(platform: Platform, left: Resources) -> list[Step]:
     return steps + [step(platform.timers.cancel, timer) for timer in left.timers]
 
 
-def cluster_steps(platform: Platform, left: Resources) -> list[Step]:
+def cluster_steps(platform: Platform, left: Resources) -> list[PlanStep]:
     """Delete the clusters. ECS refuses while a task in a cluster is ending."""
     return [step(platform.tasks.delete_cluster, cluster) for cluster in left.clusters]

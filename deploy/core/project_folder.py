@@ -19,7 +19,7 @@ from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 
 @dataclass(frozen=True)
-class Study:
+class ProjectFolder:
     """A project folder that fits the installation. `registration` is what `update_project_master_list` takes."""
 
     folder: Path
@@ -37,7 +37,7 @@ class Study:
         return bool(self.config.game_steps)
 
 
-def read(folder: Path, installation: Installation | None = None) -> Study:
+def read(folder: Path, installation: Installation | None = None) -> ProjectFolder:
     """The project in `folder`. The installation's values complete what config.yml leaves out.
 
     Raises `Problem` with every mistake in config.yml and the step files, and then everything in which the project and
@@ -58,7 +58,7 @@ def read(folder: Path, installation: Installation | None = None) -> Study:
         registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
         registration["maxRuntime"] = min(config.project.max_runtime, int(installation["MaxRuntime"]))
         remarks = _place(folder, [*_no_effect(config, installation)], remark=True)
-    return Study(folder, config, registration, tuple(remarks))
+    return ProjectFolder(folder, config, registration, tuple(remarks))
 
 
 def id_in(folder: Path) -> str | None:

@@ -24,16 +24,16 @@ PAUSE = 3.0  # seconds between two looks
 
 
 @dataclass(frozen=True)
-class Step:
+class PlanStep:
     """One instruction of a plan: an operation and its arguments."""
 
     operation: Callable[..., object]
     arguments: tuple[Any, ...] = ()
 
 
-def step(operation: Callable[..., object], *arguments: Any) -> Step:
+def step(operation: Callable[..., object], *arguments: Any) -> PlanStep:
     """The instruction to call `operation` with these arguments."""
-    return Step(operation, arguments)
+    return PlanStep(operation, arguments)
 
 
 class Executor:
@@ -49,7 +49,7 @@ class Executor:
         """Wait for so many seconds."""
         (self._given_sleep or time.sleep)(seconds)
 
-    def execute(self, steps: Sequence[Step], note: Callable[[Exception], None] | None = None) -> None:
+    def execute(self, steps: Sequence[PlanStep], note: Callable[[Exception], None] | None = None) -> None:
         """Execute the steps in their order.
 
         With `note` they are independent: the exception of one goes there, and the others are executed all the same.
@@ -65,7 +65,7 @@ class Executor:
     def converge(
         self,
         look: Callable[[], F],
-        plan: Callable[[F], Sequence[Step]],
+        plan: Callable[[F], Sequence[PlanStep]],
         *,
         note: Callable[[Exception], None] | None = None,
         rounds: int | None = None,

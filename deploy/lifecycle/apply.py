@@ -17,14 +17,14 @@ from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
 from deploy.core import options, register_function
 from deploy.core.finding import Finding
-from deploy.core.project_folder import Study
+from deploy.core.project_folder import ProjectFolder
 from deploy.core.stages import Executor
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
 from deploy.stack import cooldown, domain_change, states
 from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
 from deploy.stack.deletion import StackDeletion
-from deploy.stack.settings import Settings, taking_settings
+from deploy.stack.settings import StackSettings, taking_settings
 from deploy.stack.stack import GOOD, Stack
 from hippodrome.aws import errors
 
@@ -42,7 +42,7 @@ def _hint(python: str | None) -> None:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ApplyOutcome:
     """The result of an apply: whether it changed something, how many seconds it took, and the stack's outputs."""
 
     changed: bool
@@ -58,7 +58,7 @@ class ApplyRequest:
     `yes` agrees to the loss of something. `anyway`: go on although something is in the way.
     """
 
-    study: Study | None = None
+    study: ProjectFolder | None = None
     wrong: Sequence[Finding] = ()
     yes: bool = False
     anyway: bool = False
@@ -67,9 +67,9 @@ class ApplyRequest:
 def apply(
     account: Account,
     stack: str,
-    settings: Settings,
+    settings: StackSettings,
     request: ApplyRequest = ApplyRequest(),
-) -> Outcome:
+) -> ApplyOutcome:
     """Bring the stack to what template and settings say, and print what is done. May be repeated after an interruption.
 
     Looks first whether anything is in the way, and asks before anything is lost. Raises `Problem`.
@@ -92,19 +92,19 @@ def apply(
         executor.sleep(ROLE_PAUSE)
         return True
 
-    def once() -> Outcome:
+    def once() -> ApplyOutcome:
         now = replace(prepared, found=prepared.stack.describe())
         return _carry_out(_without_remains(now), request, began)
 
     return executor.retry(once, wait_for_role, ROLE_TRIES)
 
 
-def _prepare(account: Account, stack: str, settings: Settings, request: ApplyRequest) -> Prepared:
+def _prepare(account: Account, stack: str, settings: StackSettings, request: ApplyRequest) -> Prepared:
     """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
     try:
         return prepare(account, stack, settings)
     except Problem as problem:
-        if states.action_for(Stack(account, stack).status) is states.Action.UPDATE:
+        if states.action_for(Stack(account, stack).status) is states.StackAction.UPDATE:
             raise
         preflight.check_account(account, [*request.wrong, preflight.of_problem("installation", problem)], request.study)
         raise
@@ -118,7 +118,7 @@ def _without_remains(prepared: Prepared) -> Prepared:
     return replace(prepared, found=None)
 
 
-def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Outcome:
+def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> ApplyOutcome:
     """Upload, plan, ask, execute."""
     account, stack = prepared.account, prepared.stack.name
     if prepared.bucket.make():
@@ -145,13 +145,13 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Outco
         register_function.hide_secrets(account, installation)
     seconds = time.monotonic() - began
     screen.success(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
-    return Outcome(True, seconds, prepared.existing is None, dict(installation.outputs))
+    return ApplyOutcome(True, seconds, prepared.existing is None, dict(installation.outputs))
 
 
-def _nothing(account: Account, stack: str, began: float) -> Outcome:
+def _nothing(account: Account, stack: str, began: float) -> ApplyOutcome:
     seconds = time.monotonic() - began
     screen.success(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
-    return Outcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
+    return ApplyOutcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
 
 
 def _clear_away(prepared: Prepared) -> None:
@@ -211,7 +211,7 @@ def command(
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    settings: Settings,
+    settings: StackSettings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     anyway: options.Anyway = False,
@@ -229,7 +229,7 @@ def command(
     return Exit.DONE
 
 
-def report(outcome: Outcome, settings: Settings, as_json: bool) -> None:
+def report(outcome: ApplyOutcome, settings: StackSettings, as_json: bool) -> None:
     """Print where participants go, and what the administrator still has to do."""
     if as_json:
         answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}

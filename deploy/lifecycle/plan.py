@@ -16,12 +16,12 @@ from deploy.code.template import Template
 from deploy.core import options
 from deploy.core.finding import Finding
 from deploy.core.finding import show as show_findings
-from deploy.core.project_folder import Study
+from deploy.core.project_folder import ProjectFolder
 from deploy.lifecycle import preflight
 from deploy.stack import states
 from deploy.stack.changes import Prepared, change_set, prepare
-from deploy.stack.settings import Settings, taking_settings
-from deploy.stack.states import Action
+from deploy.stack.settings import StackSettings, taking_settings
+from deploy.stack.states import StackAction
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
     "AWS::S3::Bucket": "participants' data",
@@ -232,7 +232,7 @@ def show(plan: Plan, answer: bool = False) -> None:
 # -- the command ------------------------------------------------------------------------------------------------------
 
 
-def plan(account: Account, stack: str, settings: Settings, *, study: Study | None = None) -> Plan:
+def plan(account: Account, stack: str, settings: StackSettings, *, study: ProjectFolder | None = None) -> Plan:
     """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
 
     Raises `Problem`.
@@ -245,11 +245,11 @@ def plan(account: Account, stack: str, settings: Settings, *, study: Study | Non
         seconds = time.monotonic() - began
         return Plan(stack, account.region, "create", found, {}, seconds, findings, new_site(prepared))
     act = states.action_for(prepared.status)
-    if act is Action.STOP:
+    if act is StackAction.STOP:
         raise states.problem(stack, prepared.status)
-    if act is Action.WAIT:
+    if act is StackAction.WAIT:
         raise Problem(f"The stack {stack} is in {prepared.status}.", "Wait until CloudFormation is done.")
-    if act is not Action.UPDATE:
+    if act is not StackAction.UPDATE:
         raise Problem(
             f"The stack {stack} is in {prepared.status}: an update of it failed.",
             "`python -m deploy apply` takes that back first.",
@@ -273,7 +273,9 @@ def new_site(prepared: Prepared) -> str:
     return hosts[1] if hosts[0] != hosts[1] else ""
 
 
-def run(account: Account, stack: str, settings: Settings, as_json: bool, study: Study | None = None) -> int:
+def run(
+    account: Account, stack: str, settings: StackSettings, as_json: bool, study: ProjectFolder | None = None
+) -> int:
     """Make the plan, print it and what would be in its way, and return the command's exit code."""
     found = plan(account, stack, settings, study=study)
     if as_json:
@@ -290,7 +292,7 @@ def command(
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    settings: Settings,
+    settings: StackSettings,
     as_json: options.Json = False,
 ) -> int:
     """Show what `apply` would change. Exit code 0: nothing; 3: something."""

@@ -20,7 +20,7 @@ from deploy.aws.account import Account, parameters_of
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
 from deploy.aws.resource_names import TAG
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
-from deploy.core.project_folder import Study
+from deploy.core.project_folder import ProjectFolder
 from deploy.stack import domain_change, inventory
 from deploy.stack.changes import Prepared
 from deploy.study.image import docker
@@ -36,7 +36,7 @@ class InstallationCheck:
     """An installation that is about to be made or changed, and the study that is to be put there, if there is one."""
 
     prepared: Prepared
-    study: Study | None = None
+    study: ProjectFolder | None = None
 
     @property
     def account(self) -> Account:
@@ -44,7 +44,7 @@ class InstallationCheck:
 
 
 def check(
-    prepared: Prepared, study: Study | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
+    prepared: Prepared, study: ProjectFolder | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
 ) -> None:
     """Check all that is new, and show what is wrong, also what is known to be `wrong` already.
 
@@ -53,7 +53,7 @@ def check(
     _stop(list(wrong) + look_at(InstallationCheck(prepared, study)), anyway)
 
 
-def check_account(account: Account, wrong: Sequence[Finding], study: Study | None = None) -> None:
+def check_account(account: Account, wrong: Sequence[Finding], study: ProjectFolder | None = None) -> None:
     """Check the account before a first installation; show what is wrong, also what is known. Raises `Problem`."""
     _stop([*wrong, *examine((account, study), _OF_ACCOUNT)])
 
@@ -98,7 +98,7 @@ def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
 
 # -- the account ------------------------------------------------------------------------------------------------------
 
-Newcomer = tuple[Account, Study | None]  # an account without an installation, and what is to be put there
+Newcomer = tuple[Account, ProjectFolder | None]  # an account without an installation, and what is to be put there
 
 
 def _region(newcomer: Newcomer) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from console.formatting import count
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import VersionedBucket
-from deploy.core.stages import Executor, Step, step
+from deploy.core.stages import Executor, PlanStep, step
 from deploy.operate.stop import Stopper
 from deploy.stack import acm_records, inventory, policies
 from deploy.stack.acm_records import Validation
@@ -84,9 +84,9 @@ class Removal:
             [*filter(None, attached)],
         )
 
-    def plan(self, found: FoundInstallation, data: bool) -> list[Step]:
+    def plan(self, found: FoundInstallation, data: bool) -> list[PlanStep]:
         """The steps in their order: the stack, what is beside it, and last the data, only with `data`."""
-        steps: list[Step] = [step(self._prepare_stack, found.stack)] if found.stack else []
+        steps: list[PlanStep] = [step(self._prepare_stack, found.stack)] if found.stack else []
         steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
         steps += [step(self._remember, found), step(self._delete_stack, found)]
         steps += [step(self._acme_records, addresses) for addresses in found.addresses]

@@ -19,7 +19,7 @@ from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
 from deploy.stack import certificate, certificate_transfer
 from deploy.stack.certificate import Choice, Report
-from deploy.stack.settings import Settings, taking_settings
+from deploy.stack.settings import StackSettings, taking_settings
 from deploy.study import register
 from hippodrome.aws import errors
 from hippodrome.certificates.rules import PRODUCTION, STAGING, Verdict
@@ -40,7 +40,7 @@ def may_apply(account: Account, stack: str) -> bool:
     return True
 
 
-def study_in(folder: Path) -> project_folder.Study | None:
+def study_in(folder: Path) -> project_folder.ProjectFolder | None:
     """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
     if folder.is_dir() and not layout.has_config(folder):
         screen.info(f"{folder} has no config.yml: there is no study to put there.")
@@ -90,7 +90,7 @@ def command(
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
-    settings: Settings,
+    settings: StackSettings,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
     anyway: options.Anyway = False,
@@ -126,7 +126,7 @@ def command(
     return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
 
 
-def _study(folder: Path) -> tuple[project_folder.Study | None, list[Problem]]:
+def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Problem]]:
     """The study, and what is wrong with it: with a first installation, that is told together with all else."""
     try:
         return study_in(folder), []
@@ -148,7 +148,7 @@ def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> A
     return account
 
 
-def _certify(account: Account, stack: str, found: project_folder.Study | None) -> None:
+def _certify(account: Account, stack: str, found: project_folder.ProjectFolder | None) -> None:
     try:
         report = certify(account, stack)
     except Problem as problem:

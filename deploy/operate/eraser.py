@@ -27,7 +27,7 @@ from deploy.aws.versions import Version, VersionedBucket
 from deploy.core.captured_log import functions_log
 from deploy.core.leftover_steps import cluster_steps, removal_steps
 from deploy.core.server_records import keys_of_warm_servers, warm_servers_of
-from deploy.core.stages import Executor, Step, step
+from deploy.core.stages import Executor, PlanStep, step
 from deploy.operate.lobby_eraser import LobbyEraser
 from deploy.operate.receipt import ProjectReceipt
 from deploy.operate.session_eraser import FoundSession, SessionEraser
@@ -143,9 +143,9 @@ class Eraser:
         self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
         return found
 
-    def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+    def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
         """The steps of one round: server, documents, and last the slot, so that nobody takes it too early."""
-        steps: list[Step] = [step(self._begin_round)]
+        steps: list[PlanStep] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
             steps += cluster_steps(self._platform, found.resources)

@@ -24,7 +24,7 @@ from deploy.stack.stack import Stack
 from hippodrome.certificates.rules import renew_at
 from hippodrome.model import ids
 from hippodrome.model.project import Project, UnreadableEntry
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Documents
 from hippodrome.servers.causes import Cause, FailureCategory, parse_cause
 from hippodrome.servers.sessions import readable_session
@@ -37,7 +37,7 @@ DAILY = timedelta(days=1)  # how often the function renew_certificate looks
 
 
 @dataclass(frozen=True)
-class Queue:
+class StackQueue:
     """A queue of the stack. `dead`: it is a dead-letter queue."""
 
     name: str
@@ -101,7 +101,7 @@ class Snapshot:
     recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
     tasks: int | None = None  # that ECS says are running
     spent: Spent = field(default_factory=Spent)
-    queues: list[Queue] = field(default_factory=list)
+    queues: list[StackQueue] = field(default_factory=list)
     certificate: CertificateState | None = None
     alarms: list[str] = field(default_factory=list)
     problems: dict[str, str] = field(default_factory=dict)
@@ -128,14 +128,14 @@ class Snapshot:
         """The warm servers of a project."""
         mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
         taken = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
-        return WarmServers(sum(r.state is State.READY for r in mine), len(mine), len(taken))
+        return WarmServers(sum(r.state is ServerState.READY for r in mine), len(mine), len(taken))
 
     def _closed_today(self) -> list[Server]:
         day = midnight(self.at)
         return [r for r in self.recent if r.closed and r.closed >= day]
 
 
-class Monitor:
+class InstallationMonitor:
     """Looks at an installation again and again. It keeps what need not be read twice."""
 
     def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
@@ -233,7 +233,7 @@ def midnight(now: datetime) -> datetime:
     return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
 
 
-def queues(account: Account, stack: str) -> list[Queue]:
+def queues(account: Account, stack: str) -> list[StackQueue]:
     """The stack's queues; those that others send their dead letters to are the dead-letter queues."""
     client = account.client("sqs")
     urls = [
@@ -246,7 +246,7 @@ def queues(account: Account, stack: str) -> list[Queue]:
         found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
     policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in found.values())
     return [
-        Queue(
+        StackQueue(
             name=url.rpartition("/")[2],
             waiting=int(attributes.get("ApproximateNumberOfMessages", 0)),
             in_flight=int(attributes.get("ApproximateNumberOfMessagesNotVisible", 0)),

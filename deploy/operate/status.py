@@ -21,7 +21,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
 from deploy.core import options, participants
 from deploy.cost.billed import Billed, billed_or_why
-from deploy.operate.snapshot import Monitor, Snapshot
+from deploy.operate.snapshot import InstallationMonitor, Snapshot
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 
@@ -52,7 +52,7 @@ def command(
     installation = find_installation(account, stack)
     if project:
         participants.choose(participants.registered_projects(account.platform(installation).documents), project)
-    watcher = Monitor(account, installation, project)
+    watcher = InstallationMonitor(account, installation, project)
     if watch:
         _watch(watcher, installation)
         return Exit.DONE
@@ -69,7 +69,7 @@ def command(
     return Exit.DONE
 
 
-def _watch(watcher: Monitor, installation: Installation) -> None:
+def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
     """Until Ctrl-C. A look takes its time: the next one begins no sooner than that again."""
     console = Console(highlight=False)  # unlike `screen.out` it breaks lines, which Live would cut off
     try:

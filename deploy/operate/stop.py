@@ -18,7 +18,7 @@ from deploy.core import explain, options, participants
 from deploy.core.captured_log import functions_log
 from deploy.core.leftover_steps import cluster_steps, removal_steps
 from deploy.core.server_records import Records
-from deploy.core.stages import Executor, Step, step
+from deploy.core.stages import Executor, PlanStep, step
 from hippodrome.aws import AwsPlatform
 from hippodrome.model.messages import StopServer
 from hippodrome.model.project import Project
@@ -101,7 +101,7 @@ class Stopper:
             [task for task in draining if self._scope.covers(owners.get(task.name))],
         )
 
-    def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[Step]:
+    def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
         """The steps that stop what was found; none if it only has to be waited for."""
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
         steps += removal_steps(self._platform, found.leftovers)

@@ -27,7 +27,7 @@ from hippodrome.certificates.rules import (
     Decision,
     FailureReason,
     OrderFailed,
-    Stage,
+    OrderStage,
     StoredCertificate,
     Verdict,
     names_of,
@@ -154,7 +154,7 @@ def obtain(
     installation: Installation,
     choice: Choice = Choice(),
     *,
-    tell: Callable[[Stage], None] = lambda _: None,
+    tell: Callable[[OrderStage], None] = lambda _: None,
 ) -> Report:
     """Order a certificate if one is due. Raises `Problem`; the present one stays then."""
     renewal, wish = renewal_of(account, installation, choice, tell)
@@ -174,18 +174,18 @@ def obtain_visibly(account: Account, installation: Installation, choice: Choice)
     """`obtain`, with a progress bar."""
     with screen.progress() as bar:
         which = {STAGING: "test ", PRODUCTION: "real "}.get(choice.directory, "")
-        task = bar.add_task(f"Looking at the {which}certificate", total=len(Stage))
+        task = bar.add_task(f"Looking at the {which}certificate", total=len(OrderStage))
 
-        def tell(stage: Stage) -> None:
-            bar.update(task, description=stage.value, completed=list(Stage).index(stage))
+        def tell(stage: OrderStage) -> None:
+            bar.update(task, description=stage.value, completed=list(OrderStage).index(stage))
 
         report = obtain(account, installation, choice, tell=tell)
-        bar.update(task, description="Certificate", completed=len(Stage))
+        bar.update(task, description="Certificate", completed=len(OrderStage))
     return report
 
 
 def renewal_of(
-    account: Account, installation: Installation, choice: Choice, tell: Callable[[Stage], None]
+    account: Account, installation: Installation, choice: Choice, tell: Callable[[OrderStage], None]
 ) -> tuple[Renewal, RenewalRequest]:
     """What looks after the installation's certificate, and what to ask of it for this choice."""
     from hippodrome.certificates.renewal import Renewal, RenewalRequest

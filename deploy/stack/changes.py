@@ -21,9 +21,9 @@ from deploy.code.packages import Target
 from deploy.code.template import Template
 from deploy.stack import states
 from deploy.stack.code_bucket import CodeBucket
-from deploy.stack.settings import Settings, option
+from deploy.stack.settings import StackSettings, option
 from deploy.stack.stack import Stack
-from deploy.stack.states import Action
+from deploy.stack.states import StackAction
 from hippodrome.aws import errors
 
 PREFIX = "hippodrome-"  # of the names of our change sets
@@ -49,7 +49,7 @@ class Prepared:
     @property
     def existing(self) -> Mapping[str, Any] | None:
         """The described stack; None if there is none, or none that was ever complete."""
-        makes = states.action_for(self.status) in {Action.CREATE, Action.RECREATE}
+        makes = states.action_for(self.status) in {StackAction.CREATE, StackAction.RECREATE}
         return None if makes else self.found
 
     @cached_property
@@ -65,7 +65,11 @@ class Prepared:
 
     def unchanged(self) -> bool:
         """Whether the stack has this template, code, parameters and tags, so that no change set is needed."""
-        if self.existing is None or states.action_for(self.status) is not Action.UPDATE or self.changed_parameters():
+        if (
+            self.existing is None
+            or states.action_for(self.status) is not StackAction.UPDATE
+            or self.changed_parameters()
+        ):
             return False
         tags = {tag["Key"]: tag["Value"] for tag in self.existing.get("Tags", ())}
         return tags.get(TAG) == self.stack.name and _same_text(self.stack.template(), self.template.text)
@@ -79,7 +83,7 @@ def _same_text(stored: str, ours: str) -> bool:
     return re.sub(r"[^\x00-\x7f]", "?", stored).strip() == re.sub(r"[^\x00-\x7f]", "?", ours).strip()
 
 
-def prepare(account: Account, name: str, settings: Settings) -> Prepared:
+def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
     """Build the functions, read the stack, decide on the parameters. Changes nothing in AWS. Raises `Problem`."""
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()

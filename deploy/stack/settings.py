@@ -40,7 +40,7 @@ def option(parameter: str) -> str:
 
 
 @dataclass(frozen=True)
-class Settings:
+class StackSettings:
     """The administrator's options. None: the stack's present value, or else the template's default."""
 
     domain: Annotated[
@@ -163,18 +163,18 @@ def _zones(
 
 def taking_settings(command: Callable[..., int]) -> Callable[..., int]:
     """Turn a function that takes `settings` into a command of typer's with an option for each setting."""
-    hints = get_type_hints(Settings, include_extras=True)
+    hints = get_type_hints(StackSettings, include_extras=True)
     options = [
         inspect.Parameter(
             field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
         )
-        for field in fields(Settings)
+        for field in fields(StackSettings)
     ]
 
     @functools.wraps(command)
     def with_options(*folder: Any, **given: Any) -> int:
         chosen = {option.name: given.pop(option.name) for option in options if option.name in given}
-        return command(*folder, settings=Settings(**chosen), **given)
+        return command(*folder, settings=StackSettings(**chosen), **given)
 
     signature = inspect.signature(command, eval_str=True)
     parameters = [

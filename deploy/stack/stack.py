@@ -16,7 +16,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import Account, describe_stack, is_no_stack
 from deploy.core.explain import NOT_ACTIVE
 from deploy.stack import states
-from deploy.stack.states import Action
+from deploy.stack.states import StackAction
 from hippodrome.aws import errors
 
 FIRST_PAUSE = 0.3  # seconds between two looks, growing
@@ -197,7 +197,7 @@ class Stack:
     def attach(self) -> None:
         """If something is going on in the stack, show it until it ends."""
         found = self.describe()
-        if found and states.action_for(str(found["StackStatus"])) is Action.WAIT:
+        if found and states.action_for(str(found["StackStatus"])) is StackAction.WAIT:
             screen.info(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
             self.follow("Waiting for CloudFormation", found["StackId"])
 
@@ -210,14 +210,14 @@ class Stack:
         found = self.describe()
         status = str(found["StackStatus"]) if found else ""
         act = states.action_for(status)
-        if act is Action.STOP:
+        if act is StackAction.STOP:
             raise states.problem(self.name, status)
-        if found and act in {Action.ROLL_BACK, Action.CONTINUE}:
+        if found and act in {StackAction.ROLL_BACK, StackAction.CONTINUE}:
             self._take_back(found, act)
 
-    def _take_back(self, found: Mapping[str, Any], act: Action) -> None:
+    def _take_back(self, found: Mapping[str, Any], act: StackAction) -> None:
         """An update that failed, or whose rollback failed: back to where the stack stood before."""
-        if act is Action.ROLL_BACK:
+        if act is StackAction.ROLL_BACK:
             screen.info(
                 f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
             )
@@ -228,7 +228,7 @@ class Stack:
         after = self.last_event(found["StackId"])
         begin(StackName=self.name)
         status = self.follow("Taking back the update", found["StackId"], after=after)
-        if states.action_for(status) is not Action.UPDATE:
+        if states.action_for(status) is not StackAction.UPDATE:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:

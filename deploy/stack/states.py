@@ -13,7 +13,7 @@ from enum import Enum
 from console.problem import Problem
 
 
-class Action(Enum):
+class StackAction(Enum):
     """The first thing that `apply` does."""
 
     CREATE = "make it"  # there is nothing, or an empty shell
@@ -25,30 +25,30 @@ class Action(Enum):
     STOP = "leave it to the administrator"
 
 
-ACTIONS: Mapping[str, Action] = {
-    "CREATE_IN_PROGRESS": Action.WAIT,
-    "CREATE_FAILED": Action.RECREATE,
-    "CREATE_COMPLETE": Action.UPDATE,
-    "ROLLBACK_IN_PROGRESS": Action.WAIT,
-    "ROLLBACK_FAILED": Action.RECREATE,
-    "ROLLBACK_COMPLETE": Action.RECREATE,
-    "DELETE_IN_PROGRESS": Action.WAIT,
-    "DELETE_FAILED": Action.STOP,
-    "DELETE_COMPLETE": Action.CREATE,
-    "UPDATE_IN_PROGRESS": Action.WAIT,
-    "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS": Action.WAIT,
-    "UPDATE_COMPLETE": Action.UPDATE,
-    "UPDATE_FAILED": Action.ROLL_BACK,
-    "UPDATE_ROLLBACK_IN_PROGRESS": Action.WAIT,
-    "UPDATE_ROLLBACK_FAILED": Action.CONTINUE,
-    "UPDATE_ROLLBACK_COMPLETE_CLEANUP_IN_PROGRESS": Action.WAIT,
-    "UPDATE_ROLLBACK_COMPLETE": Action.UPDATE,
-    "REVIEW_IN_PROGRESS": Action.CREATE,
-    "IMPORT_IN_PROGRESS": Action.WAIT,
-    "IMPORT_COMPLETE": Action.UPDATE,
-    "IMPORT_ROLLBACK_IN_PROGRESS": Action.WAIT,
-    "IMPORT_ROLLBACK_FAILED": Action.STOP,
-    "IMPORT_ROLLBACK_COMPLETE": Action.UPDATE,
+ACTIONS: Mapping[str, StackAction] = {
+    "CREATE_IN_PROGRESS": StackAction.WAIT,
+    "CREATE_FAILED": StackAction.RECREATE,
+    "CREATE_COMPLETE": StackAction.UPDATE,
+    "ROLLBACK_IN_PROGRESS": StackAction.WAIT,
+    "ROLLBACK_FAILED": StackAction.RECREATE,
+    "ROLLBACK_COMPLETE": StackAction.RECREATE,
+    "DELETE_IN_PROGRESS": StackAction.WAIT,
+    "DELETE_FAILED": StackAction.STOP,
+    "DELETE_COMPLETE": StackAction.CREATE,
+    "UPDATE_IN_PROGRESS": StackAction.WAIT,
+    "UPDATE_COMPLETE_CLEANUP_IN_PROGRESS": StackAction.WAIT,
+    "UPDATE_COMPLETE": StackAction.UPDATE,
+    "UPDATE_FAILED": StackAction.ROLL_BACK,
+    "UPDATE_ROLLBACK_IN_PROGRESS": StackAction.WAIT,
+    "UPDATE_ROLLBACK_FAILED": StackAction.CONTINUE,
+    "UPDATE_ROLLBACK_COMPLETE_CLEANUP_IN_PROGRESS": StackAction.WAIT,
+    "UPDATE_ROLLBACK_COMPLETE": StackAction.UPDATE,
+    "REVIEW_IN_PROGRESS": StackAction.CREATE,
+    "IMPORT_IN_PROGRESS": StackAction.WAIT,
+    "IMPORT_COMPLETE": StackAction.UPDATE,
+    "IMPORT_ROLLBACK_IN_PROGRESS": StackAction.WAIT,
+    "IMPORT_ROLLBACK_FAILED": StackAction.STOP,
+    "IMPORT_ROLLBACK_COMPLETE": StackAction.UPDATE,
 }
 
 _BECAUSE = {
@@ -57,14 +57,14 @@ _BECAUSE = {
 }
 
 
-def action_for(status: str) -> Action:
+def action_for(status: str) -> StackAction:
     """What to do about a stack in this state ("": there is none). Unknown states are left to the administrator."""
-    return ACTIONS.get(status, Action.STOP) if status else Action.CREATE
+    return ACTIONS.get(status, StackAction.STOP) if status else StackAction.CREATE
 
 
 def broken(status: str) -> bool:
     """Whether the stack was never complete, so that it can only be deleted."""
-    return action_for(status) is Action.RECREATE
+    return action_for(status) is StackAction.RECREATE
 
 
 def problem(stack: str, status: str) -> Problem:

@@ -59,7 +59,7 @@ class RegisterRequest:
 class RegisterPlan:
     """What registering would do. Nothing is changed yet."""
 
-    study: project_folder.Study
+    study: project_folder.ProjectFolder
     before: Project | None
     pages: pages.Changes
     image: image.ImagePlan | None
@@ -196,7 +196,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     }
 
 
-def _remarks(folder: Path, found: project_folder.Study) -> list[str]:
+def _remarks(folder: Path, found: project_folder.ProjectFolder) -> list[str]:
     """What to say of a project without mistakes."""
     lacking = [
         *agent_imports.requirement_remarks(folder),
@@ -212,7 +212,7 @@ def link(installation: Installation, project_id: str) -> str:
     return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
 
 
-def _definition(installation: Installation, found: project_folder.Study, uri: str) -> dict[str, Any]:
+def _definition(installation: Installation, found: project_folder.ProjectFolder, uri: str) -> dict[str, Any]:
     setup = found.registration["awsSetup"]
     return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
 

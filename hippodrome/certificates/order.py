@@ -29,7 +29,7 @@ from josepy.errors import Error as JoseError
 from josepy.jwa import ES256
 from josepy.jwk import JWKEC
 
-from hippodrome.certificates.rules import FailureReason, OrderFailed, Stage, StoredCertificate, names_of
+from hippodrome.certificates.rules import FailureReason, OrderFailed, OrderStage, StoredCertificate, names_of
 
 REQUEST_SECONDS = 20  # for one response of the CA
 NONCE_ROUNDS = 4  # rounds of two attempts if the CA refuses a nonce; each refusal brings a new one
@@ -78,7 +78,9 @@ def txt_name(domain: str) -> str:
     return f"{acme_challenges.DNS01.LABEL}.{domain.removeprefix('*.')}"
 
 
-def order(request: OrderRequest, publish: Callable[[list[str], float], None], tell: Callable[[Stage], None]) -> Issued:
+def order(
+    request: OrderRequest, publish: Callable[[list[str], float], None], tell: Callable[[OrderStage], None]
+) -> Issued:
     """Place the order, prove control of the domain, fetch the certificate and verify it.
 
     `publish` gets the values of the TXT record, and the seconds within which they must be visible. The caller removes
@@ -90,23 +92,23 @@ def order(request: OrderRequest, publish: Callable[[list[str], float], None], te
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     with _network(request) as (network, retry_after):
-        tell(Stage.ACCOUNT)
+        tell(OrderStage.ACCOUNT)
         with _errors_translated(retry_after):
             authority = _authority(request, network)
-        tell(Stage.ORDER)
+        tell(OrderStage.ORDER)
         with _errors_translated(retry_after):
             ordered = authority.new_order(crypto_util.make_csr(key_pem, list(names)))
             answers = _pending_challenges(ordered, request.domain)
             values = [challenge.validation(network.key) for challenge in answers]
         if answers:
-            tell(Stage.PUBLISH)
+            tell(OrderStage.PUBLISH)
             publish(values, deadline - time.monotonic())
-            tell(Stage.VALIDATE)
+            tell(OrderStage.VALIDATE)
             with _errors_translated(retry_after):
                 for challenge in answers:
                     authority.answer_challenge(challenge, challenge.response(network.key))
                 ordered = authority.poll_authorizations(ordered, _acme_deadline(deadline))
-        tell(Stage.ISSUE)
+        tell(OrderStage.ISSUE)
         with _errors_translated(retry_after):
             done = authority.finalize_order(ordered, _acme_deadline(deadline))
     issued = Issued(key_pem.decode(), done.fullchain_pem, read_chain(done.fullchain_pem.encode(), request.directory))

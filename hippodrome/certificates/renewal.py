@@ -18,12 +18,12 @@ from hippodrome.certificates import rules
 from hippodrome.certificates.rules import (
     ACCOUNT,
     FORMER,
+    CertificateRecord,
     Decision,
     FailureReason,
     Location,
     OrderFailed,
-    Stage,
-    State,
+    OrderStage,
     StoredCertificate,
     Verdict,
 )
@@ -62,7 +62,7 @@ class RenewalRequest:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RenewalOutcome:
     """The result of `obtain`: the decision, and the certificate that is stored now."""
 
     decision: Decision
@@ -83,7 +83,7 @@ class Renewal:
         now: Callable[[], datetime],
         location: Location,
         *,
-        tell: Callable[[Stage], None] = lambda _: None,
+        tell: Callable[[OrderStage], None] = lambda _: None,
         note: Callable[[str, BaseException], None] = lambda *_: None,
     ) -> None:
         self._documents = documents
@@ -94,7 +94,7 @@ class Renewal:
         self._note = note
         self._published: list[str] = []
 
-    def read(self) -> tuple[State, StoredCertificate | None]:
+    def read(self) -> tuple[CertificateRecord, StoredCertificate | None]:
         """The state and the stored certificate. Changes nothing."""
         return self._state()[0], self._stored()[0]
 
@@ -121,18 +121,18 @@ class Renewal:
         state, stored = self.read()
         return self._decide(state, stored, wanted)
 
-    def obtain(self, wanted: RenewalRequest) -> Outcome:
+    def obtain(self, wanted: RenewalRequest) -> RenewalOutcome:
         """Order if it is due. Raises OrderFailed and what the ports raise; the present certificate stays then."""
         token = secrets.token_hex(8)
         decision, before, stored = self._decide_and_claim(wanted, token)
         if decision.verdict is not Verdict.ORDER:
             if decision.verdict is Verdict.FRESH and stored:
                 self._repair(stored, wanted)
-            return Outcome(decision, stored)
+            return RenewalOutcome(decision, stored)
         try:
             self._remove_challenges(wanted.domain, self._state()[0].challenges)  # of a run that was killed
             issued = self._order(wanted, token)
-            self._tell(Stage.STORE)
+            self._tell(OrderStage.STORE)
             self._store(issued, before)
         except BaseException as error:
             self._remove_challenges(wanted.domain, self._published)
@@ -140,19 +140,19 @@ class Renewal:
             raise
         self._remove_challenges(wanted.domain, self._published)
         self._record_result(token, lambda state: rules.succeeded(state, issued.stored, wanted.trusted, self._now()))
-        return Outcome(decision, issued.stored)
+        return RenewalOutcome(decision, issued.stored)
 
     # ---- the state
 
-    def _state(self) -> tuple[State, Document | None]:
+    def _state(self) -> tuple[CertificateRecord, Document | None]:
         found = self._documents.get(self._location.state)
         if found is None:
-            return State(), None
+            return CertificateRecord(), None
         try:
-            return from_json(found.body, State), found
+            return from_json(found.body, CertificateRecord), found
         except ValueError as error:  # edited by hand; the certificate itself has what matters
             self._note(f"{self._location.state} cannot be read and is written anew", error)
-            return State(), found
+            return CertificateRecord(), found
 
     def _write(self, key: str, body: bytes, known: Document | None) -> None:
         if known is None:
@@ -160,7 +160,7 @@ class Renewal:
         else:
             self._documents.replace(key, body, known.etag)
 
-    def _change(self, change: Callable[[State], State | None]) -> bool:
+    def _change(self, change: Callable[[CertificateRecord], CertificateRecord | None]) -> bool:
         """Apply `change` to the state and write it, also beside other writers; False if `change` returned None."""
         for _ in range(MAX_TRIES):
             state, known = self._state()
@@ -193,11 +193,11 @@ class Renewal:
             return decision, before, stored
         raise Conflict(self._location.state)
 
-    def _decide(self, state: State, stored: StoredCertificate | None, wanted: RenewalRequest) -> Decision:
+    def _decide(self, state: CertificateRecord, stored: StoredCertificate | None, wanted: RenewalRequest) -> Decision:
         names = rules.names_of(wanted.domain)
         return rules.decide(state, stored, wanted.directory, names, now=self._now(), force=wanted.force)
 
-    def _record_result(self, token: str, change: Callable[[State], State]) -> None:
+    def _record_result(self, token: str, change: Callable[[CertificateRecord], CertificateRecord]) -> None:
         """Record how our order ended, unless another run has taken over. If that fails, the next run repairs it."""
         try:
             self._change(lambda state: change(state) if state.claim == token else None)
@@ -316,7 +316,7 @@ class Renewal:
             self._change(rules.unclaimed)
 
 
-def renew(renewal: Renewal, domain: str, seconds: float) -> Outcome | None:
+def renew(renewal: Renewal, domain: str, seconds: float) -> RenewalOutcome | None:
     """Renew the certificate from its present directory, as the timer does. None if none was ever ordered."""
     directory = renewal.last_directory()
     if not directory:

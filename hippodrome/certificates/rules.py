@@ -7,7 +7,7 @@ moves from one domain to another:
 * `privkey.pem`: a line that names the certificate's ACME directory, the private key, and its chain. Writing this one
   document replaces the old certificate, so no reader ever sees a key without its chain.
 * `fullchain.pem`: a copy of the chain, where HIPPO's `ssl` section and other readers expect it.
-* `certificate.json`: `State`, what was ordered and when.
+* `certificate.json`: `CertificateRecord`, what was ordered and when.
 
 `SSL/account.json` has the keys of our accounts, one for each ACME directory. Earlier versions kept a certificate for
 `*.<root domain>` in `SSL/` itself (`FORMER`); servers that they named still read it.
@@ -73,7 +73,7 @@ def location(domain: str, root_domain: str) -> Location:
     return Location(*(f"SSL/{domain}/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")))
 
 
-class Stage(StrEnum):
+class OrderStage(StrEnum):
     """How far an order is, as shown to the administrator."""
 
     ACCOUNT = "opening the account"
@@ -121,7 +121,7 @@ class FailedOrder(Record, frozen=True):
     until: UtcDatetime | None = None
 
 
-class State(Record, frozen=True):
+class CertificateRecord(Record, frozen=True):
     """`certificate.json`: the certificate ordered last ("" and None if none was), and what happened since."""
 
     schema: int = 1
@@ -185,7 +185,7 @@ def renew_at(not_before: datetime, not_after: datetime) -> datetime:
 
 
 def decide(
-    state: State,
+    state: CertificateRecord,
     stored: StoredCertificate | None,
     directory: str,
     names: Sequence[str],
@@ -229,7 +229,9 @@ def _decide_by_certificate(
     return Decision(Verdict.FRESH, "the certificate is fresh", at)
 
 
-def _wait_after_failures(state: State, directory: str, now: datetime, force: bool) -> tuple[datetime | None, str]:
+def _wait_after_failures(
+    state: CertificateRecord, directory: str, now: datetime, force: bool
+) -> tuple[datetime | None, str]:
     failures = [failure for failure in state.failures if failure.directory == directory]
     if not failures:
         return None, ""
@@ -246,33 +248,33 @@ def _wait_after_failures(state: State, directory: str, now: datetime, force: boo
     return None, ""
 
 
-def claimed(state: State, token: str, now: datetime) -> State:
+def claimed(state: CertificateRecord, token: str, now: datetime) -> CertificateRecord:
     """The run with this token is ordering."""
     return msgspec.structs.replace(state, claim=token, claimed=now)
 
 
-def with_challenges(state: State, values: Sequence[str]) -> State:
+def with_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
     """Write down values before they are published. If this run is interrupted, a later one removes them."""
     return msgspec.structs.replace(state, challenges=tuple(values))
 
 
-def without_challenges(state: State, values: Sequence[str]) -> State:
+def without_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
     """These values are removed from DNS."""
     return msgspec.structs.replace(state, challenges=()) if state.challenges == tuple(values) else state
 
 
-def unclaimed(state: State) -> State:
+def unclaimed(state: CertificateRecord) -> CertificateRecord:
     """The run was interrupted (Ctrl-C) and has no result: another run may order."""
     return msgspec.structs.replace(state, claim="", claimed=None)
 
 
-def failed(state: State, failure: FailedOrder) -> State:
+def failed(state: CertificateRecord, failure: FailedOrder) -> CertificateRecord:
     """The order failed."""
     kept = (*state.failures, msgspec.structs.replace(failure, text=failure.text[:MAX_TEXT]))[-MAX_FAILURES:]
     return msgspec.structs.replace(unclaimed(state), failures=kept)
 
 
-def succeeded(state: State, stored: StoredCertificate, trusted: str, now: datetime) -> State:
+def succeeded(state: CertificateRecord, stored: StoredCertificate, trusted: str, now: datetime) -> CertificateRecord:
     """The order succeeded: this certificate is stored."""
     return msgspec.structs.replace(
         unclaimed(state),

@@ -9,12 +9,12 @@ from typing import Any
 
 from hippodrome.config.diagnostics import Diagnostic
 from hippodrome.config.each_value import Checked
-from hippodrome.config.project_keys import AwsSetup, Events, Project, Ssl
+from hippodrome.config.project_keys import AwsSetupKeys, EventsKeys, ProjectKeys, SslKeys
 from hippodrome.config.step_files import CLOSING
 from hippodrome.config.step_order import resolve_events, step_name
 from hippodrome.model.project import number_of_groups
 from hippodrome.model.step_types import StepType, type_of
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +42,10 @@ class Config:
     say what was turned from HIPPO's form into ours.
     """
 
-    project: Project
-    trial: Trial
+    project: ProjectKeys
+    trial: TrialSection
     steps: tuple[StepFiles, ...]
-    events: Events
+    events: EventsKeys
     game_pages: tuple[StepFiles, ...] = ()
     """The pages that the game page shows; the key of each is the key of `trial` that names it."""
     remarks: tuple[Diagnostic, ...] = ()
@@ -114,7 +114,7 @@ class Config:
         return ", ".join(parts)
 
 
-def _given(section: AwsSetup | Ssl, *needed: str) -> dict[str, Any] | None:
+def _given(section: AwsSetupKeys | SslKeys, *needed: str) -> dict[str, Any] | None:
     """The section if all of these keys are given, otherwise None."""
     data = section.model_dump(by_alias=True)
     if any(data[key] is None for key in needed):

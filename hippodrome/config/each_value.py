@@ -18,7 +18,7 @@ from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, 
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
-from protocol.trial import RATE_CHANGE_MISSPELT, Trial
+from protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
 from protocol.trial_check import check as check_trial
 from protocol.trial_keys import names
 from protocol.trial_sections import Ui
@@ -35,7 +35,7 @@ class Checked:
     root: Root
     step_keys: list[str]
     has_project: bool
-    trial: Trial = field(default_factory=Trial)
+    trial: TrialSection = field(default_factory=TrialSection)
     mistakes: list[Mistake] = field(default_factory=list)
     invalid: list[Keys] = field(default_factory=list)
 
@@ -87,7 +87,7 @@ def _check_trial(given: Any, checked: Checked) -> None:
 def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
     for path, section in TRIAL_SECTIONS.items():
         given = _at({"trial": trial}, path)
-        known = names(section) | ({RATE_CHANGE_MISSPELT} if section is Trial else set())
+        known = names(section) | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
         # other keys of ui are controls of the project's own
         unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
         yield from (one for one in unknown if section is not Ui or meant_for(one) is not None)

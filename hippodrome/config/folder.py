@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ConfigSource:
     """A project's config.yml as it was read: its values in our form, and where each of them stands."""
 
     layout: Layout
@@ -58,11 +58,11 @@ class Source:
         return Diagnostic(file, line or self.parsed.line(origin), where_of(origin), message, remark)
 
 
-def read_source(folder: Path) -> Source:
+def read_source(folder: Path) -> ConfigSource:
     """The config.yml of the project in `folder`, not checked yet. Raises ConfigErrors if it cannot be read."""
     layout = find(folder)
     parsed = _parse(layout)
-    return Source(layout, parsed, adapt(parsed.values, Path(folder).resolve().name))
+    return ConfigSource(layout, parsed, adapt(parsed.values, Path(folder).resolve().name))
 
 
 def read_project(folder: Path) -> Config:
@@ -101,7 +101,7 @@ def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
             yield Mistake(("trial", *path), f"there is no file {file} beside agent.py{hint}")
 
 
-def _loaded_from(source: Source, steps: list[StepFiles]) -> tuple[str, ...]:
+def _loaded_from(source: ConfigSource, steps: list[StepFiles]) -> tuple[str, ...]:
     """From which sites a project of HIPPO Gym, which has no `allowedHosts`, loads something."""
     if not source.layout.of_hippo or source.names(("project", "allowedHosts")):
         return ()

@@ -16,7 +16,7 @@ from hippodrome.config.project_keys import MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from hippodrome.model.step_order import FINAL
-from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial
+from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
 from protocol.values import Plain, flag, number_in, show
 
 CLOSING_PAGE = "hippodrome-the-end"
@@ -330,7 +330,7 @@ def _frame_rates(adapted: Adapted) -> None:
     trial = adapted.section(("trial",))
     if any(_is_true(trial.get(key)) for key in (RATE_CHANGE, RATE_CHANGE_MISSPELT)):
         return
-    usual = Trial()
+    usual = TrialSection()
     low, start, high = (
         number_in(trial[key]) if not _blank(trial.get(key)) else default
         for key, default in (

@@ -23,9 +23,9 @@ from hippodrome.model.texts import ENGLISH
 from protocol import values
 from protocol.session import MOST_PLAYERS
 from protocol.similar import did_you_mean
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from protocol.trial_keys import names
-from protocol.trial_sections import Scene, Ui
+from protocol.trial_sections import SceneSection, Ui
 from protocol.values import Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
@@ -209,7 +209,7 @@ _ObjectKey = Annotated[str, Rule(object_key)]
 _StepName = Annotated[str, Rule(step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
 
 
-class AwsSetup(Model):
+class AwsSetupKeys(Model):
     """Where a project lies in AWS, and how large its servers are."""
 
     bucket: _Bucket | None = None
@@ -224,7 +224,7 @@ class AwsSetup(Model):
     """Memory of each participant's server in GB; must fit cpu. Needed for AWS."""
 
 
-class Events(Model):
+class EventsKeys(Model):
     """At which steps a participant's server starts and stops."""
 
     start_server_step: _StepName | None = None
@@ -233,7 +233,7 @@ class Events(Model):
     """The step whose reaching stops the server. Default: the step after the last game step."""
 
 
-class Ssl(Model):
+class SslKeys(Model):
     """Where the servers fetch their certificate: three keys or none."""
 
     ssl_bucket: _Bucket | None = None
@@ -244,7 +244,7 @@ class Ssl(Model):
     """Path of privkey.pem within sslBucket."""
 
 
-class Project(Model):
+class ProjectKeys(Model):
     """Who runs the study, its steps, and where its servers run."""
 
     id: Annotated[str, Rule(project_id, {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"})] = ""
@@ -263,11 +263,11 @@ class Project(Model):
     """Minutes after which a server is stopped, whatever happens."""
     use_aws: _Flag = False
     """Whether the study is for AWS. false keeps it on one machine; left out, deploying it puts it on AWS."""
-    aws_setup: AwsSetup = AwsSetup()
+    aws_setup: AwsSetupKeys = AwsSetupKeys()
     """How large the servers are, and where on AWS; needed for AWS."""
-    events: Events = Events()
+    events: EventsKeys = EventsKeys()
     """When the participant's server starts and stops."""
-    ssl: Ssl = Ssl()
+    ssl: SslKeys = SslKeys()
     """Has no effect: servers get the installation's certificate. HIPPO's configurations have it."""
     steps: dict[Annotated[str, Rule(step_key)], Annotated[str, Rule(page)]] = Field(
         default={},
@@ -337,19 +337,19 @@ class Project(Model):
 
 
 class Root(Model):
-    project: Project = Project()
+    project: ProjectKeys = ProjectKeys()
 
 
 SECTIONS: dict[Keys, type[Model]] = {
-    ("project",): Project,
-    ("project", "awsSetup"): AwsSetup,
-    ("project", "events"): Events,
-    ("project", "ssl"): Ssl,
+    ("project",): ProjectKeys,
+    ("project", "awsSetup"): AwsSetupKeys,
+    ("project", "events"): EventsKeys,
+    ("project", "ssl"): SslKeys,
 }
-TRIAL_SECTIONS: dict[Keys, type[Trial | Ui | Scene]] = {
-    ("trial",): Trial,
+TRIAL_SECTIONS: dict[Keys, type[TrialSection | Ui | SceneSection]] = {
+    ("trial",): TrialSection,
     ("trial", "ui"): Ui,
-    ("trial", "scene"): Scene,
+    ("trial", "scene"): SceneSection,
 }
 NAMES: dict[Keys, frozenset[str]] = {
     **{path: names(section) for path, section in TRIAL_SECTIONS.items()},

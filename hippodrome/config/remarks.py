@@ -9,7 +9,7 @@ from pathlib import Path
 from hippodrome.config import sessions, texts
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
-from hippodrome.config.folder import Source, read_source
+from hippodrome.config.folder import ConfigSource, read_source
 from protocol import keyboard
 from protocol.values import printable
 
@@ -142,13 +142,13 @@ def _names_a_certificate(config: Config) -> bool:
     return not stays and any(value is not None for value in project.ssl.model_dump().values())
 
 
-def without_observations(source: Source, config: Config) -> Iterator[Remark]:
+def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:
     """What to say about recordings without observations, in a project of HIPPO's layout that does not ask for that."""
     if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not source.names(OBSERVATIONS):
         yield Remark(("trial",), NO_OBSERVATIONS)
 
 
-def keys_of_sessions(source: Source, config: Config) -> Iterator[Remark]:
+def keys_of_sessions(source: ConfigSource, config: Config) -> Iterator[Remark]:
     """What to say about keys that are for several participants, if each participant plays alone."""
     if not config.project.has_sessions:
         said = sessions.no_effect(config.trial)

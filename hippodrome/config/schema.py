@@ -7,10 +7,10 @@ import inspect
 import itertools
 from typing import Any
 
-from hippodrome.config.project_keys import SECTIONS, Root
+from hippodrome.config.project_keys import SECTIONS, ProjectKeys, Root
 from protocol import trial, trial_keys, values
-from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, Trial
-from protocol.trial_sections import Scene, Ui
+from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
+from protocol.trial_sections import SceneSection, Ui
 
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
@@ -25,12 +25,12 @@ def config_schema() -> dict[str, Any]:
     """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
     schema = Root.model_json_schema()
     definitions = schema["$defs"]
-    definitions |= {section.__name__: _of_trial(section) for section in (Trial, Ui, Scene)}
-    schema["properties"]["trial"] = {"$ref": "#/$defs/Trial"}
-    properties = definitions["Trial"]["properties"]
+    definitions |= {section.__name__: _of_trial(section) for section in (TrialSection, Ui, SceneSection)}
+    schema["properties"]["trial"] = {"$ref": f"#/$defs/{TrialSection.__name__}"}
+    properties = definitions[TrialSection.__name__]["properties"]
     spelt = f"HIPPO's spelling of {RATE_CHANGE}."
     properties[RATE_CHANGE_MISSPELT] = {**properties[RATE_CHANGE], "description": spelt, "deprecated": True}
-    definitions["Project"]["required"] = ["id", "steps"]
+    definitions[ProjectKeys.__name__]["required"] = ["id", "steps"]
     schema |= {"title": "A Hippodrome project: config.yml", "required": ["project"]}
     meanings = _meanings()
     for name, section in ((Root.__name__, schema), *definitions.items()):
@@ -42,7 +42,7 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema
 
 
-def _of_trial(section: type[Trial | Ui | Scene]) -> dict[str, Any]:
+def _of_trial(section: type[TrialSection | Ui | SceneSection]) -> dict[str, Any]:
     """A section of `trial`, as pydantic describes those of `project`."""
     properties = {
         key.name: {

@@ -11,7 +11,7 @@ from hippodrome.config.each_value import Checked
 from hippodrome.model.step_types import type_of
 from protocol import players as who
 from protocol.players import HUMAN
-from protocol.trial import SESSION_KEYS, Trial
+from protocol.trial import SESSION_KEYS, TrialSection
 from protocol.values import printable
 
 PLAYERS: Keys = ("project", "players")
@@ -29,7 +29,7 @@ OF_SESSIONS: tuple[Keys, ...] = (
 """The keys that matter with `project.players` only."""
 
 
-def no_effect(trial: Trial) -> str:
+def no_effect(trial: TrialSection) -> str:
     """A sentence on each of these keys that has no effect because the project has no `players`."""
     most = max((len(humans) for _, humans in trial.humans()), default=0)
     alone = "project.players is 1, so each participant plays alone"
@@ -154,7 +154,7 @@ def remarks(config: Config) -> Iterator[Remark]:
         yield Remark(("trial", "gather"), f"{said}; write gather: 120, or afterAbsent: policy with a substitute")
 
 
-def _without_keys(trial: Trial) -> Iterator[Remark]:
+def _without_keys(trial: TrialSection) -> Iterator[Remark]:
     """Participants of whose keys `keys` says nothing, though it has a section for each player."""
     humans = dict.fromkeys(name for _, names in trial.humans() for name in names)
     lacking = [name for name in humans if trial.keys_differ and name not in trial.keys]
@@ -174,7 +174,7 @@ def _too_short(config: Config) -> Iterator[Remark]:
         yield Remark(("project", "maxRuntime"), f"{most} minute{'' if most == 1 else 's'}: {said}")
 
 
-def _one_for_all(trial: Trial) -> Iterator[Remark]:
+def _one_for_all(trial: TrialSection) -> Iterator[Remark]:
     for control, does in (("stop", "ends the game"), ("reset", "ends the episode")):
         if getattr(trial.ui, control):
             yield Remark(("trial", "ui", control), f"one participant who presses it {does} for all of them")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hippodrome.config import project_keys
-from hippodrome.config.project_keys import Events
+from hippodrome.config.project_keys import EventsKeys
 from hippodrome.model.step_order import FINAL, default_start, default_stop, position
 from hippodrome.model.step_types import type_of
 
@@ -30,14 +30,14 @@ def step_range(keys: list[str]) -> str:
     return words if numbered == keys else f"{words} and {FINAL}"
 
 
-def resolve_events(events: Events, keys: list[str], pages: Mapping[str, str]) -> Events:
+def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]) -> EventsKeys:
     """The events with defaults, as keys of steps. The events have been checked."""
     start, stop = (position(key, keys) for key in (events.start_server_step, events.stop_server_step))
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if games:
         start = default_start(games) if start is None else start
         stop = default_stop(games) if stop is None else stop
-    return Events.model_validate(
+    return EventsKeys.model_validate(
         {
             "startServerStep": None if start is None else keys[start],
             "stopServerStep": None if stop is None else keys[stop],

@@ -36,7 +36,7 @@ from hippodrome.lobby.entries import Entries, Waiting, WaitingDocument
 from hippodrome.lobby.lookups import Lookups
 from hippodrome.lobby.matcher import Matcher
 from hippodrome.lobby.repair import Repair
-from hippodrome.lobby.run import Servers
+from hippodrome.lobby.run import StartedAhead
 from hippodrome.lobby.store import LobbyStore
 from hippodrome.log import logger
 from hippodrome.model import ids
@@ -244,7 +244,7 @@ class Lobby:
         return LobbyState(here, seconds, is_proposed)
 
     def _begin_to_wait(
-        self, project: Project, known: Decisions, after: Decisions, entries: Entries, servers: Servers
+        self, project: Project, known: Decisions, after: Decisions, entries: Entries, servers: StartedAhead
     ) -> None:
         """Sessions are formed that wait for a server: remove the entries of their members.
 

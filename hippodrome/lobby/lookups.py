@@ -10,7 +10,7 @@ from hippodrome.lobby import entries as folder
 from hippodrome.lobby import rules
 from hippodrome.lobby.decisions import Decisions, Matched, Proposal
 from hippodrome.lobby.entries import Entries, Waiting
-from hippodrome.lobby.run import Run, Servers
+from hippodrome.lobby.run import LobbyRun, StartedAhead
 from hippodrome.log import failure
 from hippodrome.model import ids, sessions
 from hippodrome.model.project import Project
@@ -46,13 +46,13 @@ class Lookups:
         entries: Entries,
         proposals: Sequence[Proposal],
         *,
-        servers: Servers,
+        servers: StartedAhead,
         wished: Sequence[Sequence[str]] = (),
-    ) -> Run:
+    ) -> LobbyRun:
         """A run that may form the sessions of these confirmed proposals. Two reads for each member."""
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), self.open_for(project)
-        return Run(project, known, entries, members, broken, now, open_for, servers, wished)
+        return LobbyRun(project, known, entries, members, broken, now, open_for, servers, wished)
 
     def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
         """The confirmed proposals that this participant's request forms: their own, and some that have waited for long.
@@ -67,7 +67,7 @@ class Lookups:
 
     # Servers that were started ahead
 
-    def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> Servers:
+    def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> StartedAhead:
         """The servers at which this participant's request looks.
 
         None, unless their session (formed, or of `proposals`) needs one that was started ahead. Then that one; if no
@@ -76,7 +76,7 @@ class Lookups:
         formed = known.formed_of(label)
         own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
         if own is None:
-            return Servers({})
+            return StartedAhead({})
         waiting, now = known.without_server(), self._platform.now()
         is_first = not waiting or waiting[0] is formed
         open_for = self.open_for(project)
@@ -85,12 +85,12 @@ class Lookups:
         found = self._records(project, [own.id, *some])
         if own.id in found.over:
             others = self._records(project, usable[len(some) : LOOKED_AT_IN_NEED])
-            return Servers({**found.records, **others.records})
+            return StartedAhead({**found.records, **others.records})
         return found
 
-    def _records(self, project: Project, session_ids: Sequence[str]) -> Servers:
+    def _records(self, project: Project, session_ids: Sequence[str]) -> StartedAhead:
         acts = [partial(self._server, project, each) for each in session_ids]
-        return Servers(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
+        return StartedAhead(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
 
     def _server(self, project: Project, session_id: str) -> Server | None:
         """The record of a session's server; None also if it cannot be read, which the next request tries again."""

@@ -12,7 +12,7 @@ from datetime import timedelta
 from hippodrome.lobby import questions, rules
 from hippodrome.lobby.decisions import Decisions
 from hippodrome.lobby.entries import Entries
-from hippodrome.lobby.questions import Answer, Candidate, Question
+from hippodrome.lobby.questions import Candidate, MatchAnswer, Question
 from hippodrome.log import failure, logger
 from hippodrome.model.project import Project
 from hippodrome.ports import Platform
@@ -96,7 +96,7 @@ class Matcher:
             failure("the question to match cannot be read and is made anew", error, project=project.id)
             return Question()
 
-    def _answer(self, project: Project, question: Question) -> Answer | None:
+    def _answer(self, project: Project, question: Question) -> MatchAnswer | None:
         """The answer to the question; None if it has none yet, or if too few wait for one."""
         if len(question.waiting) < project.players:
             return None

@@ -61,7 +61,7 @@ class _Groups(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Answer:
+class MatchAnswer:
     """The sessions of an answer that can be played, and a sentence for the researcher on what is wrong with others."""
 
     sessions: Sequence[Sequence[str]] = ()
@@ -86,12 +86,12 @@ def is_full(question: Question) -> bool:
     return len(question.came) >= MOST_CAME
 
 
-def read(body: bytes, question: Question) -> Answer:
+def read(body: bytes, question: Question) -> MatchAnswer:
     """The answer in a document that a server has written, and that may hold anything."""
     try:
         found = from_json(body, _Groups).groups
     except (ValueError, RecursionError):
-        return Answer(problem="the answer of match cannot be read")
+        return MatchAnswer(problem="the answer of match cannot be read")
     asked, taken, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
     for labels in found[:MOST_WAITING]:
         if len(labels) != question.players or len(set(labels)) != len(labels):
@@ -103,7 +103,7 @@ def read(body: bytes, question: Question) -> Answer:
         else:
             taken.update(labels)
             sessions.append(labels)
-    return Answer(sessions, problem)
+    return MatchAnswer(sessions, problem)
 
 
 def next_question(

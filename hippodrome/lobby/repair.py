@@ -11,7 +11,7 @@ from hippodrome.lobby import rules, servers_ahead
 from hippodrome.lobby.decisions import Decisions
 from hippodrome.lobby.lookups import Lookups
 from hippodrome.lobby.matcher import Matcher
-from hippodrome.lobby.run import Servers
+from hippodrome.lobby.run import StartedAhead
 from hippodrome.lobby.store import LobbyStore
 from hippodrome.log import logger
 from hippodrome.model import ids
@@ -54,7 +54,7 @@ class Repair:
         ahead = [*known.open, *(each.waits_for for each in known.formed if each.waits_for)]
         servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
         entries = self._store.entries(project)  # with the marks of what has just been carried out
-        run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=Servers(servers))
+        run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=StartedAhead(servers))
         closed = [each for each in servers.values() if each and each.closed]
         over = [each.user_id for each in closed if each.closed and run.now - each.closed > CLOSED_FOR_GOOD]
         wanted = servers_ahead.sessions_wanted(known, entries, project)

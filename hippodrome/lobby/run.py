@@ -11,11 +11,11 @@ from hippodrome.lobby.decisions import Decisions, Matched
 from hippodrome.lobby.entries import Entries
 from hippodrome.model import ids
 from hippodrome.model.project import Project
-from hippodrome.model.server import Server, State, next_attempt
+from hippodrome.model.server import Server, ServerState, next_attempt
 
 
 @dataclass(frozen=True)
-class Servers:
+class StartedAhead:
     """The records of servers that were started ahead, by their sessions' ids; None for one without a record."""
 
     records: Mapping[str, Server | None]
@@ -23,7 +23,7 @@ class Servers:
     @property
     def ready(self) -> frozenset[str]:
         """The ids of sessions whose servers are ready."""
-        return frozenset(name for name, each in self.records.items() if each and each.state is State.READY)
+        return frozenset(name for name, each in self.records.items() if each and each.state is ServerState.READY)
 
     @property
     def over(self) -> frozenset[str]:
@@ -44,7 +44,7 @@ class Servers:
 
 
 @dataclass(frozen=True)
-class Run:
+class LobbyRun:
     """What a run has read, and what it makes of any later version of the document."""
 
     project: Project
@@ -54,7 +54,7 @@ class Run:
     broken: Collection[str]  # the proposals of sessions that cannot be formed
     now: datetime
     open_for: timedelta
-    servers: Servers
+    servers: StartedAhead
     wished: Sequence[Sequence[str]] = ()  # what the function `match` has chosen, by labels
 
     def decided(self, document: Decisions) -> Decisions:

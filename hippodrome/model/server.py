@@ -32,7 +32,7 @@ MAX_ATTEMPTS = 8  # and at the participant's request up to this one
 R = TypeVar("R")
 
 
-class State(StrEnum):
+class ServerState(StrEnum):
     QUEUED = "queued"  # never stored: there is no record yet
     STARTING = "starting"
     NAMING = "naming"
@@ -83,7 +83,7 @@ class Server(Record, frozen=True):
     project_id: str
     user_id: str
     attempt: int
-    state: State
+    state: ServerState
     token: str  # empty except in records of earlier versions (`secret.py`), which require the key
     requested: datetime
     deadline: datetime
@@ -137,7 +137,7 @@ class Server(Record, frozen=True):
 
     @property
     def is_closed(self) -> bool:
-        return self.state is State.CLOSED
+        return self.state is ServerState.CLOSED
 
     def is_open(self, attempt: int) -> bool:
         """Whether the record is at this attempt and not closed."""
@@ -217,7 +217,7 @@ def new_attempt(
         project_id=project.id,
         user_id=user_id,
         attempt=attempt,
-        state=State.STARTING,
+        state=ServerState.STARTING,
         token=token,
         requested=now,
         deadline=warm_pool.deadline(project, settings, label, now) if is_warm_server else played,
@@ -295,7 +295,7 @@ def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datet
         project_id=project_id,
         user_id=user_id,
         attempt=attempt,
-        state=State.CLOSED,
+        state=ServerState.CLOSED,
         token="",
         requested=now,
         deadline=now,
@@ -313,7 +313,9 @@ def on_demand(server: Server) -> Server:
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
     """The task runs and has an address. Written before the DNS record is created, so that each record has an owner."""
     port = address.port or server.port or LEGACY_PORT  # records of earlier versions have no port yet here
-    return msgspec.structs.replace(server, state=State.NAMING, task=task, host=address.host, port=port, running=now)
+    return msgspec.structs.replace(
+        server, state=ServerState.NAMING, task=task, host=address.host, port=port, running=now
+    )
 
 
 def with_default_name(server: Server) -> Server:
@@ -323,7 +325,7 @@ def with_default_name(server: Server) -> Server:
 
 def ready(server: Server, now: datetime) -> Server:
     """Its DNS record is INSYNC: the participant may connect."""
-    return msgspec.structs.replace(server, state=State.READY, ready=now)
+    return msgspec.structs.replace(server, state=ServerState.READY, ready=now)
 
 
 def reserving(server: Server, warm_server: Server) -> Server:
@@ -360,25 +362,25 @@ def without_warm_server(server: Server, own: Server) -> Server:
 def handed_over(warm_server: Server, label: str, now: datetime) -> Server:
     """Close a warm server's record: the participant's record under `label` owns its resources now."""
     return msgspec.structs.replace(
-        warm_server, state=State.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
+        warm_server, state=ServerState.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
     )
 
 
 def draining(warm_server: Server) -> Server:
     """Drain a warm server: it can no longer be assigned. Written before any of its resources is removed."""
-    return msgspec.structs.replace(warm_server, state=State.DRAINING)
+    return msgspec.structs.replace(warm_server, state=ServerState.DRAINING)
 
 
 def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
     """The warm server's resources are this server's: the participant may connect."""
     return msgspec.structs.replace(
-        server, state=State.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
+        server, state=ServerState.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
     )
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
     """Close the record. `servers/termination.py` says which resources are removed before, and which after."""
-    return msgspec.structs.replace(server, state=State.CLOSED, closed=now, reason=reason, cause=cause)
+    return msgspec.structs.replace(server, state=ServerState.CLOSED, closed=now, reason=reason, cause=cause)
 
 
 def reason_for(stopped: TaskStopped) -> Reason:

@@ -38,7 +38,7 @@ class BadPageForm(BadForm):
 
 
 @dataclass(frozen=True)
-class Form:
+class PostedForm:
     """The answers of one page, and the hidden fields of the frame."""
 
     answers: Mapping[str, Any]  # a field named twice (checkboxes) holds a list
@@ -47,7 +47,7 @@ class Form:
     action: str | None = None
 
 
-def read(request: Request) -> Form:
+def read(request: Request) -> PostedForm:
     """Return the form in a request. Raises `BadForm`."""
     if request.body is None:
         raise BadPageForm(400, "formUnread")
@@ -62,14 +62,14 @@ def read(request: Request) -> Form:
     return _form(fields)
 
 
-def of_query(query: Iterable[tuple[str, str]]) -> Form:
+def of_query(query: Iterable[tuple[str, str]]) -> PostedForm:
     """The form in a query's fields."""
     return _form(_gather(list(query)))
 
 
-def _form(fields: dict[str, Any]) -> Form:
+def _form(fields: dict[str, Any]) -> PostedForm:
     step, ticket, action = (_text(fields.pop(name, None)) for name in (STEP, TICKET, ACTION))
-    return Form(fields, step, ticket, action)
+    return PostedForm(fields, step, ticket, action)
 
 
 def _urlencoded(body: bytes) -> dict[str, Any]:

@@ -154,7 +154,7 @@ class Journey:
             self._steps[step.type.name].post(project, user_id, step, form)
         return self._get(request, project, user_id) if request.wants_json else http.see_other(request.url())
 
-    def _step_of(self, form: forms.Form, project: Project, user_id: str) -> Step | None:
+    def _step_of(self, form: forms.PostedForm, project: Project, user_id: str) -> Step | None:
         """The step that this form may answer; None if that step is not due.
 
         A ticket proves that the participant was shown the step, so their folder is not listed. A form without a ticket
@@ -172,7 +172,7 @@ class Journey:
         repeated = may_repeat and self._answers.repeats(project, user_id, progress, form.answers)
         return None if repeated else current
 
-    def _leave(self, project: Project, user_id: str, form: forms.Form) -> Response:
+    def _leave(self, project: Project, user_id: str, form: forms.PostedForm) -> Response:
         """The page of the lobby was closed, and says so with its ticket. A redirect would be followed, as a visit."""
         if project.step_of_ticket(user_id, form.step, form.ticket):
             self._shared_game.leave(project, user_id)

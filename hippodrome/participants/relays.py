@@ -21,7 +21,7 @@ from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server, requestable_attempt
 from hippodrome.participants import forms, previews
-from hippodrome.participants.forms import BadForm, Form
+from hippodrome.participants.forms import BadForm, PostedForm
 from hippodrome.ports import Platform, Topic
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
@@ -74,7 +74,7 @@ class Relays:
             return _answer(refusal.status, refusal.text)
         return _answer(200 if request.method == "GET" else 202, "Accepted.")
 
-    def _participant_of(self, request: Request, form: Form) -> tuple[Project, str]:
+    def _participant_of(self, request: Request, form: PostedForm) -> tuple[Project, str]:
         project_id = request.query_value("projectId") or form.answers.get("projectId")
         user_id = request.query_value("userId") or form.answers.get("userId")
         if project_id is None and not request.has_query("projectId") and ids.is_user_id(user_id):
@@ -86,7 +86,7 @@ class Relays:
             raise Refusal(400, "userId should be 1 to 64 letters, digits, dashes or underscores.")
         return project, str(user_id)
 
-    def _project_of_ticket(self, user_id: str, form: Form) -> Project:
+    def _project_of_ticket(self, user_id: str, form: PostedForm) -> Project:
         """The project in which the ticket proves that this participant was shown a step: HIPPO's stop names none."""
         for found in self._project_cache.projects():
             project = self._secrets.with_secret(found) if found.live and found.step(form.step) and form.ticket else None
@@ -94,7 +94,7 @@ class Relays:
                 return project
         raise Refusal(403, f"{NO_PROOF} A token needs the projectId as well.")
 
-    def _start(self, project: Project, user_id: str, form: Form) -> None:
+    def _start(self, project: Project, user_id: str, form: PostedForm) -> None:
         owner = self._repository.session_id(project, user_id) or user_id
         record = self._repository.server_of(project.id, owner)
         self._authorize(project, user_id, form, record)
@@ -111,7 +111,7 @@ class Relays:
             raise Refusal(409, "No further server can be started.")
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
 
-    def _stop(self, project: Project, user_id: str, form: Form) -> None:
+    def _stop(self, project: Project, user_id: str, form: PostedForm) -> None:
         delay = _delay(form.answers)
         owner = self._repository.session_id(project, user_id) or user_id
         record = self._repository.server_of(project.id, owner)
@@ -128,7 +128,7 @@ class Relays:
         else:
             self._platform.bus.publish(Topic.STOP, to_message(message))
 
-    def _authorize(self, project: Project, user_id: str, form: Form, record: Server | None) -> None:
+    def _authorize(self, project: Project, user_id: str, form: PostedForm, record: Server | None) -> None:
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
         if expected and record and record.is_sessions:
@@ -140,10 +140,10 @@ class Relays:
         raise Refusal(403, NO_PROOF)
 
 
-def _form(request: Request) -> Form:
+def _form(request: Request) -> PostedForm:
     """The fields in the body of a POST, or in the query of a GET. Raises `Refusal` or `BadForm`."""
     if request.method == "POST":
-        return forms.read(request) if request.body else Form({})
+        return forms.read(request) if request.body else PostedForm({})
     if request.method != "GET":
         raise Refusal(405, "Use POST, or GET with a query.")
     if previews.preview_kind(request) is not None:

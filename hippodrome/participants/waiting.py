@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Any
 
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Reason, Server, State, next_attempt, requestable_attempt
+from hippodrome.model.server import Reason, Server, ServerState, next_attempt, requestable_attempt
 from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import SecretCache
 
@@ -35,7 +35,7 @@ class ServerStates:
     ) -> dict[str, Any]:
         """The state as JSON data. `since`, when the participant reached the step, is used if there is no record."""
         state: dict[str, Any] = {
-            "state": State.QUEUED,
+            "state": ServerState.QUEUED,
             "attempt": 1,
             "again": False,
             "reason": None,
@@ -48,7 +48,7 @@ class ServerStates:
             state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
             if record.is_closed:
                 state.update(_closed(record))
-            elif record.state is State.READY and record.dns_record:
+            elif record.state is ServerState.READY and record.dns_record:
                 self._remember(record)
                 host = dns.browser_host(record.dns_record)
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
@@ -69,7 +69,7 @@ class ServerStates:
 def _closed(record: Server) -> dict[str, Any]:
     """The part of the state that a closed record decides."""
     if next_attempt(record) is not None:
-        return {"state": State.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
+        return {"state": ServerState.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"
     return {"state": over, "again": requestable_attempt(record) is not None, "replaces": False}
 

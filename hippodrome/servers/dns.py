@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, ServerAttempt, TaskChanged, TaskSeen, to_message
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.ports import Address, DnsRecord, Platform, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.batches import for_each
 from hippodrome.servers.services import ServerServices
@@ -29,8 +29,8 @@ LONG_PAUSE = 30  # seconds between later checks
 MAX_CHECKS = 51  # ten minutes
 RETRY_PAUSE = 3  # seconds until the next try if the zone was busy, or if an interface had no public address yet
 MAX_ADDRESS_CHECKS = 5  # for one network interface; then the queue delivers the event again
-BEFORE_READY = (State.STARTING, State.NAMING)
-DRAINING_OR_CLOSED = (State.DRAINING, State.CLOSED)
+BEFORE_READY = (ServerState.STARTING, ServerState.NAMING)
+DRAINING_OR_CLOSED = (ServerState.DRAINING, ServerState.CLOSED)
 MAX_SERVERS_PER_CHANGE = 400  # so many fit in one message
 MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
@@ -135,7 +135,7 @@ class DnsRecords:
     def _use_default_name(self, record: Server) -> Server | None:
         after = self._repository.update(
             self._repository.server(record.label),
-            lambda r: server.with_default_name(r) if r.owns(record.name) and r.state is State.NAMING else None,
+            lambda r: server.with_default_name(r) if r.owns(record.name) and r.state is ServerState.NAMING else None,
         )
         return after.server if after else None
 
@@ -209,7 +209,7 @@ class DnsRecords:
     def _waiting_record(self, named: ServerAttempt) -> Server | None:
         """The record of a server that is still in state `naming`, else None."""
         stored = self._repository.server(named.label)
-        waits = stored and stored.server.is_open(named.attempt) and stored.server.state is State.NAMING
+        waits = stored and stored.server.is_open(named.attempt) and stored.server.state is ServerState.NAMING
         return stored.server if stored and waits else None
 
     def _check(self, message: DnsChanged) -> bool | None:
@@ -263,7 +263,7 @@ class DnsRecords:
         if found is None or found.server.name != name:
             return None
         record = found.server
-        if record.is_warm_server and record.state is State.READY:  # also if the last try was interrupted here
+        if record.is_warm_server and record.state is ServerState.READY:  # also if the last try was interrupted here
             self._pools.mark_ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
@@ -273,7 +273,7 @@ class DnsRecords:
         stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)
         return self._repository.update(
             stored,
-            lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is State.NAMING else None,
+            lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is ServerState.NAMING else None,
         )
 
 

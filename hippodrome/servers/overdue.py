@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta
 from enum import StrEnum
 
-from hippodrome.model.server import Server, State, next_attempt
+from hippodrome.model.server import Server, ServerState, next_attempt
 from hippodrome.ports import RunningTask
 
 RETRY_AFTER = timedelta(minutes=3)  # a server should be in its next state by then: the message is sent again
@@ -81,11 +81,11 @@ def _queued(record: Server, task: RunningTask | None, now: datetime) -> Remedy |
     return None
 
 
-RULES: Mapping[State, Rule] = {
-    State.QUEUED: _queued,
-    State.STARTING: _starting,
-    State.NAMING: _naming,
-    State.READY: _ready,
-    State.DRAINING: _draining,
-    State.CLOSED: _closed,
+RULES: Mapping[ServerState, Rule] = {
+    ServerState.QUEUED: _queued,
+    ServerState.STARTING: _starting,
+    ServerState.NAMING: _naming,
+    ServerState.READY: _ready,
+    ServerState.DRAINING: _draining,
+    ServerState.CLOSED: _closed,
 }

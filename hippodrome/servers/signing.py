@@ -33,7 +33,7 @@ from hippodrome.http import Request, Response
 from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.ports import Documents, Settings
 from hippodrome.servers.sessions import members_of
 from hippodrome.storage.repository import Repository
@@ -300,7 +300,7 @@ class Signing:
         if record.assigned_to is not None:
             owner = self._repository.server(record.assigned_to)
             return access_of(owner.server, name, certificate) if owner else None
-        if record.is_closed or record.state is State.DRAINING:
+        if record.is_closed or record.state is ServerState.DRAINING:
             return None
         return ServerAccess(name, record.project_id, certificate=certificate)
 

@@ -17,7 +17,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.matching import MATCH
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.model.project import LEGACY_PORT, Project
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.model.sessions import lifetime_asked_for
 from hippodrome.ports import Conflict, NoCapacity, Refused, Settings, TaskRequest, Topic
 from hippodrome.servers import causes
@@ -94,7 +94,7 @@ class Start:
         """The project is closed, or has no sessions any more: start nothing, and stop what was already started."""
         logger.warning("start for a project that is not live or has no sessions: dropped")
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
-        if stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING:
+        if stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(stop))
 
@@ -148,7 +148,7 @@ class Start:
             return self._repository.update(
                 stored, lambda r: server.repeating(r, new) if server.found_no_slot(r, message.attempt) else None
             )
-        unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is State.STARTING
+        unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING
         return stored if unfinished else None
 
     def _close_as_full(self, stored: Versioned) -> None:

@@ -19,7 +19,7 @@ from hippodrome.log import failure, logger
 from hippodrome.model import ids, messages
 from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskSeen, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import RECORDS, Reason, Server, State
+from hippodrome.model.server import RECORDS, Reason, Server, ServerState
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Platform, RunningTask, Topic
 from hippodrome.servers import leftovers, resources
@@ -222,7 +222,7 @@ class Sweep:
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
             if (
-                record.user_id not in known and record.state is not State.DRAINING
+                record.user_id not in known and record.state is not ServerState.DRAINING
             ):  # which was sent a stop message already
                 self._try("warm_servers", partial(self._send_stop, record, Reason.STOPPED))
 

@@ -19,7 +19,7 @@ from hippodrome.limits.slots import Release
 from hippodrome.log import logger
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StopServer, TaskChanged
-from hippodrome.model.server import Reason, Server, State, TaskStopped, next_attempt
+from hippodrome.model.server import Reason, Server, ServerState, TaskStopped, next_attempt
 from hippodrome.ports import Conflict
 from hippodrome.servers import causes
 from hippodrome.servers.batches import for_each
@@ -125,7 +125,7 @@ class Termination:
 
     def _drain(self, stored: Versioned) -> Versioned | None:
         """Write `draining`, so that the warm server cannot be assigned any more; None if it is assigned or closed."""
-        if stored.server.state is State.DRAINING:
+        if stored.server.state is ServerState.DRAINING:
             return stored
         return self._repository.update(stored, lambda r: None if r.is_closed else server.draining(r))
 
@@ -198,7 +198,9 @@ class Termination:
             return None  # of an earlier attempt, or the unwanted one of two tasks for one server
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
         reason = server.reason_for(ended)
-        cause = causes.cause_of_task(ended, was_ready=record.state is State.READY) if reason is Reason.LOST else None
+        cause = (
+            causes.cause_of_task(ended, was_ready=record.state is ServerState.READY) if reason is Reason.LOST else None
+        )
         return ServerToClose(stored, reason, cause, deprovisioning)
 
     def _delete_dns_records(self, closing: Iterable[Versioned]) -> None:

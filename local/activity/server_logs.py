@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from local.backend.task_record import Task
+from local.backend.task_record import TaskRecord
 from local.check.remedies import remedy
 from protocol import session
 from protocol.keys import participant_folder
@@ -22,7 +22,7 @@ class WatchedServer:
     And how far its log has been read.
     """
 
-    def __init__(self, task: Task, data: Path, log: Path, anew: bool) -> None:
+    def __init__(self, task: TaskRecord, data: Path, log: Path, anew: bool) -> None:
         self._data = data
         self._log = log
         self._read = 0 if anew else _size(log)

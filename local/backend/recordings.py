@@ -8,12 +8,12 @@ from itertools import count
 from pathlib import Path
 
 from local.backend import files
-from local.backend.task_record import Task
+from local.backend.task_record import TaskRecord
 from protocol import disk
 from protocol.keys import with_number
 
 
-def unfinished(spool: Path, task: Task) -> Sequence[Path]:
+def unfinished(spool: Path, task: TaskRecord) -> Sequence[Path]:
     """The task's recordings in the spool that belong into the data folder. Raises OSError."""
     if not (task.kept and task.folder):
         return []
@@ -21,7 +21,7 @@ def unfinished(spool: Path, task: Task) -> Sequence[Path]:
     return [folder / name for name in files.names(folder, ".part")] if files.exists(folder) else []
 
 
-def move_to_data(spool: Path, data: Path, task: Task) -> None:
+def move_to_data(spool: Path, data: Path, task: TaskRecord) -> None:
     """Put the task's unfinished recordings where they belong. Raises OSError; may be called again."""
     for recording in unfinished(spool, task):
         place = data / recording.relative_to(spool)

@@ -27,7 +27,7 @@ from local.backend import recordings
 from local.backend.health import is_healthy, port_in
 from local.backend.processes import child_of, kill_group, mark_of, process_of, spawn
 from local.backend.retry import Retry, start_thread
-from local.backend.task_record import HOST, KILLED, Task, TaskFolder, event, folder_of, now
+from local.backend.task_record import HOST, KILLED, TaskFolder, TaskRecord, event, folder_of, now
 from protocol import disk, environment, handover
 
 START_TIMEOUT = 120.0  # seconds in which a server must listen
@@ -90,7 +90,7 @@ class Shared:
 class TaskProcess:
     """A task, its process, and the thread that follows it."""
 
-    def __init__(self, task: Task, shared: Shared) -> None:
+    def __init__(self, task: TaskRecord, shared: Shared) -> None:
         self.task = task
         self.begun = threading.Event()  # there is a process, or there will be none
         self.gone = threading.Event()  # the process is gone and the event is sent

@@ -23,7 +23,7 @@ KILLED = 137
 
 
 @dataclass(frozen=True)
-class Task:
+class TaskRecord:
     """A task as it is kept on the disk."""
 
     name: str
@@ -52,7 +52,7 @@ class Task:
         return f"eni-{self.id[:17]}"
 
     @classmethod
-    def of(cls, request: TaskRequest, id_: str) -> Task:
+    def of(cls, request: TaskRequest, id_: str) -> TaskRecord:
         """The task that is requested, before it has a process."""
         return cls(
             name=request.name,
@@ -72,12 +72,12 @@ class TaskFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def save(self, task: Task) -> None:
+    def save(self, task: TaskRecord) -> None:
         """Keep the record. Raises OSError."""
         # After a power cut every process is gone: to know that there was one is enough to tell its end.
         files.write_json(self.file(task.name), _to_json(task), surely=task.version == 0)
 
-    def load(self) -> Iterator[Task]:
+    def load(self) -> Iterator[TaskRecord]:
         """The records that can be read. Raises OSError."""
         for name in files.names(self.path, ".json"):
             try:
@@ -102,19 +102,19 @@ class TaskFolder:
         return self.path / f"{name}.{kind}"
 
 
-def _to_json(task: Task) -> dict[str, Any]:
+def _to_json(task: TaskRecord) -> dict[str, Any]:
     """The record as it is stored."""
     return {"warm_server" if name == "handover_key" else name: value for name, value in asdict(task).items()}
 
 
-def _from_json(stored: Any) -> Task:
+def _from_json(stored: Any) -> TaskRecord:
     """The stored record. Raises TypeError if this is no record."""
     fields = dict(**stored)
     handover = fields.pop("warm_server", "")
-    return Task(**fields, handover_key=handover)
+    return TaskRecord(**fields, handover_key=handover)
 
 
-def event(task: Task, exit_code: int | None = None) -> dict[str, Any]:
+def event(task: TaskRecord, exit_code: int | None = None) -> dict[str, Any]:
     """The "ECS Task State Change" event of EventBridge for this state of a task."""
     details = {"subnetId": "subnet-local", "networkInterfaceId": task.interface, "privateIPv4Address": HOST}
     detail: dict[str, Any] = {

@@ -19,7 +19,7 @@ from local.backend import files
 from local.backend.processes import is_shell, kill, marked
 from local.backend.retry import Retry, reports_errors
 from local.backend.task_process import Emit, Say, Shared, TaskProcess
-from local.backend.task_record import HOST, Task, TaskFolder, claim_of
+from local.backend.task_record import HOST, TaskFolder, TaskRecord, claim_of
 from protocol import disk
 
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, the default of ECS and of `STOP_SECONDS` (on AWS: 120)
@@ -89,7 +89,7 @@ class ProcessTasks:
             if known:
                 return known.task.arn
             id_ = hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32]
-            task = Task.of(request, id_)
+            task = TaskRecord.of(request, id_)
             live = TaskProcess(task, self._shared)
             live.begin(request)
             self._live[request.name] = live
@@ -204,7 +204,7 @@ class ProcessTasks:
             self.log(live.task.name).unlink(missing_ok=True)
         return len(playing)
 
-    def playing(self) -> Sequence[Task]:
+    def playing(self) -> Sequence[TaskRecord]:
         """The servers that have not stopped. A warm server has a `folder` once it is assigned."""
         there = [live for live in self._all() if live.task.status != "STOPPED"]
         for live in there:

@@ -20,13 +20,13 @@ from random import Random
 from typing import IO, Any, ClassVar
 
 from local.check import idle
-from local.check.agent_progress import Progress
+from local.check.agent_progress import AgentProgress
 from local.check.outside import Outside
-from local.check.several import Game
+from local.check.several import GameOfSeveral
 from protocol import environment as variables
 from protocol import handover
 from protocol.session import MOST_PLAYERS, Session, is_session_id
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.agent import match
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.callbacks import About, Callbacks
@@ -94,7 +94,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
     """Let the agent play, and write down how far it came."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = Progress(report, folder, Outside(config.scene), _Early.asked)
+    progress = AgentProgress(report, folder, Outside(config.scene), _Early.asked)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     document = os.environ.pop("GIVEN", "")
     group = _group(document)
@@ -122,7 +122,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
     players = progress.result
     progress.callbacks = _callbacks(player, players, progress, config.callback_seconds)
     if isinstance(player, JointAdapter):
-        game = Game(player, players, config, folder, progress)
+        game = GameOfSeveral(player, players, config, folder, progress)
         if not player.steps_itself and progress.known["names"] > (progress.known["count"] or math.inf):
             progress.foreign = [progress.known["count"]]
         played = game.load() and game.play(reset, progress.time_over)
@@ -139,7 +139,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
         progress.over()
 
 
-def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: Progress, deadline: _Deadline) -> bool:
+def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress, deadline: _Deadline) -> bool:
     """Whether `match` returns, in the time that it has on a server."""
     progress.known["within"] = match.SECONDS
     with deadline.within(match.SECONDS):
@@ -148,7 +148,7 @@ def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: Progress
     return went_well
 
 
-def _match(adapter: AgentAdapter, question: dict[str, Any], progress: Progress) -> None:
+def _match(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress) -> None:
     """Ask the function `match` about made-up participants. Raises AgentError, and what `match` raises."""
     function = match.function_of(adapter.agent_module)
     if function is None:
@@ -162,7 +162,7 @@ def _match(adapter: AgentAdapter, question: dict[str, Any], progress: Progress) 
     progress.matched = len(found)
 
 
-def _reader(config: Trial, folder: Path, progress: Progress) -> PictureReader:
+def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> PictureReader:
     """Reads pictures, and notes what in the project's images and objects cannot be drawn."""
     found = Assets() if config.scene is None else assets.load(folder, config.scene.assets)
     progress.undrawn.extend(found.problems)
@@ -185,7 +185,7 @@ def _group(document: str) -> int | None:
     return int(text) if text else None
 
 
-def _actions(player: AgentAdapter | JointAdapter, config: Trial) -> dict[str, Any]:
+def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[str, Any]:
     """How many names of actions there are, and how many actions (None: not known); the names, if they are not given."""
     if isinstance(player, AgentAdapter):
         count = getattr(getattr(player.env, "action_space", None), "n", None)
@@ -197,7 +197,7 @@ def _actions(player: AgentAdapter | JointAdapter, config: Trial) -> dict[str, An
 
 
 def _seen_idle(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: Trial, progress: Progress
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: TrialSection, progress: AgentProgress
 ) -> bool:
     """Note whether the action of no key visibly does something, where config.yml says nothing of it. Always true.
 
@@ -224,7 +224,7 @@ def _seen_idle(
 
 
 def _callbacks(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: Progress, seconds: float
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: AgentProgress, seconds: float
 ) -> Callbacks:
     """The agent's callbacks, which are told what happens as on a server."""
     humans = tuple(each.name for each in players if each.human)
@@ -254,7 +254,7 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
     return found
 
 
-def _play(player: Any, progress: Progress, first_reset: Callable[[], Any], config: Trial) -> bool:
+def _play(player: Any, progress: AgentProgress, first_reset: Callable[[], Any], config: TrialSection) -> bool:
     """Play up to the end of the last episode, or of the time; False if something failed.
 
     Each action comes once in turn, then they are at random.

@@ -22,7 +22,7 @@ PLAY_STEPS = 5_000  # in each group
 REPORT_BYTES = 2**20  # after which the report begins anew
 
 
-class Progress:
+class AgentProgress:
     """Writes down each method before it calls it: if the process ends or hangs, the last line names the method.
 
     A line holds all that is known. There are two for each step, and to make a new file for each would take longer than

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.pictures.scene import Scene
 from trial.pictures.scene_object import CheckedObject
 

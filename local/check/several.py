@@ -15,7 +15,7 @@ from random import Random
 from typing import Any, Protocol
 
 from local.check.pace import Pace
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.agent.joint import Joint, JointAdapter
 from trial.core.players import Player, legal_actions
 from trial.core.seeds import policy_seed
@@ -26,7 +26,7 @@ STAYS = 20  # steps for which a substitute plays, before another does
 
 
 class Reporting(Protocol):
-    """Where plays are reported: `Progress` of `agent_progress.py`."""
+    """Where plays are reported: `AgentProgress`."""
 
     action: Any
     steps: int
@@ -41,11 +41,11 @@ class Reporting(Protocol):
     def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None: ...
 
 
-class Game:
+class GameOfSeveral:
     """A game of several players; `play` lets them."""
 
     def __init__(
-        self, adapter: JointAdapter, players: Sequence[Player], config: Trial, folder: Path, progress: Reporting
+        self, adapter: JointAdapter, players: Sequence[Player], config: TrialSection, folder: Path, progress: Reporting
     ) -> None:
         self._adapter, self._players, self._config, self._progress = adapter, players, config, progress
         self._folder = folder

@@ -26,7 +26,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from bots.account import Account
+from bots.account import BotReport
 from bots.addresses import THIS_MACHINE, AddressRefused
 from bots.bot import Bot
 from bots.crowd import SIGNALS, interruptible, walk
@@ -61,7 +61,7 @@ class Crowd:
     ramp: float
 
 
-async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[Account]], None]) -> list[Account]:
+async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
     """Send the crowd through the study; what happened to each bot. Cancelling ends all of them."""
     run, width = secrets.token_hex(3), len(str(crowd.bots))
     bots = [
@@ -72,7 +72,7 @@ async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[Account]],
 
 
 @contextlib.contextmanager
-def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], None]]:
+def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]], None]]:
     """A progress bar that shows how far the bots are."""
     columns = (
         TextColumn("{task.description}"),
@@ -84,7 +84,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[Account]], 
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("Bots", total=bots, doing="")
 
-        def watch(accounts: Sequence[Account]) -> None:
+        def watch(accounts: Sequence[BotReport]) -> None:
             stages = [re.sub(r"step \S+", "pages", account.stage) for account in accounts]
             over = sum(stage in ("finished", "failed") for stage in stages)
             doing = [

@@ -16,7 +16,7 @@ _LONGEST = 40  # lines of a traceback
 
 
 @dataclass
-class Crash:
+class AgentCrash:
     """An error of agent.py's: where and what (`agent.py:30: ValueError: …`), its traceback, how often it happened."""
 
     what: str
@@ -36,9 +36,9 @@ class ServerLogs:
         self._folder = logs_of(data)
         self._begin = {log: log.stat().st_size for log in self._logs()}
 
-    def crashes(self, names: Mapping[str, str] | None = None) -> list[Crash]:
+    def crashes(self, names: Mapping[str, str] | None = None) -> list[AgentCrash]:
         """Each error of agent.py once, the most frequent first; in the texts, `names` are replaced by their values."""
-        found: dict[str, Crash] = {}
+        found: dict[str, AgentCrash] = {}
         for log in self._logs():
             try:
                 text = log.read_bytes()[self._begin.get(log, 0) :].decode("utf-8", "replace")
@@ -54,9 +54,9 @@ class ServerLogs:
         return sorted(log for log in self._folder.glob("*.log") if log.name != "functions.log")
 
 
-def read(lines: Iterable[str]) -> Iterator[Crash]:
+def read(lines: Iterable[str]) -> Iterator[AgentCrash]:
     """The errors in a server's log, one for each time that agent.py failed."""
-    last: Crash | None = None
+    last: AgentCrash | None = None
     told: list[str] | None = None  # the lines of the traceback that is being read
     for line in [*lines, "0000-00-00 00:00:00 INFO the end"]:
         if not _LINE.match(line):
@@ -64,7 +64,7 @@ def read(lines: Iterable[str]) -> Iterator[Crash]:
                 told.append(line)
             continue
         if told:
-            last = Crash(told[-1], "\n".join(told[-_LONGEST:]))
+            last = AgentCrash(told[-1], "\n".join(told[-_LONGEST:]))
             yield last
         told = [] if _FAILED.search(line) else None
         if _AGAIN in line and last is not None:

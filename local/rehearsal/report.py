@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bots.account import Account, Play
+from bots.account import BotReport, PlayedStep
 from bots.verification import Verification
-from local.rehearsal.crashes import Crash
+from local.rehearsal.crashes import AgentCrash
 from local.rehearsal.study_process import Leftovers
 
 EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended before their time
@@ -24,7 +24,7 @@ SHOWN_CRASHES = 3  # tracebacks of agent.py
 
 def report(
     console: Console,
-    accounts: Sequence[Account],
+    accounts: Sequence[BotReport],
     found: Verification | None,
     left: Leftovers | None,
     seconds: float,
@@ -32,7 +32,7 @@ def report(
     recorded: bool = True,
     live: bool = True,
     said: Sequence[str] = (),
-    crashes: Sequence[Crash] = (),
+    crashes: Sequence[AgentCrash] = (),
 ) -> bool:
     """Print the table and what went wrong; whether everything is as it should be.
 
@@ -67,11 +67,11 @@ def report(
 Rows = list[tuple[str, str]]
 
 
-def _title(accounts: Sequence[Account], seconds: float) -> str:
+def _title(accounts: Sequence[BotReport], seconds: float) -> str:
     return f"Rehearsal with {len(accounts)} bot{'s' if len(accounts) != 1 else ''}, {seconds:.0f} s"
 
 
-def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
+def _played(accounts: Sequence[BotReport], found: Verification | None) -> Rows:
     """What the bots have seen."""
     plays = [play for account in accounts for play in account.plays]
     rows = [("bots finished", _of(sum(account.finished for account in accounts), len(accounts)))]
@@ -89,13 +89,13 @@ def _played(accounts: Sequence[Account], found: Verification | None) -> Rows:
     return rows
 
 
-def _together(accounts: Sequence[Account]) -> Rows:
+def _together(accounts: Sequence[BotReport]) -> Rows:
     """Who played with others, for a study of several participants."""
     plays = [play for account in accounts for play in account.plays]
     waited = [play.lobby for play in plays if play.lobby is not None]
     if not waited and not any(play.unmatched or play.members > 1 for play in plays):
         return []
-    sessions: dict[str, list[Play]] = {}
+    sessions: dict[str, list[PlayedStep]] = {}
     for play in plays:
         if not play.unmatched and play.addresses:
             sessions.setdefault(f"{play.step} {play.addresses[0]}", []).append(play)
@@ -116,7 +116,7 @@ def _together(accounts: Sequence[Account]) -> Rows:
     ]
 
 
-def _found(accounts: Sequence[Account], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
+def _found(accounts: Sequence[BotReport], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
     """What of it is in the data."""
     if not found:
         return [("data", "not looked at: --data says where they are")]

@@ -10,7 +10,7 @@ from typing import Any
 
 from hippodrome.participants import frame
 from local.web import access
-from local.web.gateway import ROUTES, Answer, Scope, answer_of, event_of, json_answer
+from local.web.gateway import ROUTES, GatewayResponse, Scope, answer_of, event_of, json_answer
 
 LARGEST_BODY = 10 * 1024 * 1024
 THREADS = 32
@@ -44,7 +44,7 @@ class App:
     def close(self) -> None:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def _answer(self, scope: Scope, receive: Receive) -> Answer | None:
+    async def _answer(self, scope: Scope, receive: Receive) -> GatewayResponse | None:
         """The answer; None if the client has gone."""
         path = scope["path"]
         if path == "/next/":
@@ -79,7 +79,7 @@ class App:
         kept = access.headers_for(_headers(scope).get("origin"), others, self._origins)
         return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.items()] + cookies
 
-    def _call(self, handler: Handler, event: dict[str, Any]) -> Answer:
+    def _call(self, handler: Handler, event: dict[str, Any]) -> GatewayResponse:
         try:
             return answer_of(handler(event, None))
         except Exception:  # noqa: BLE001 - as API Gateway: the participant learns nothing of it
@@ -109,15 +109,15 @@ async def _body(receive: Receive) -> bytes | None:
             return bytes(body)
 
 
-def _plain(status: int, text: str) -> Answer:
-    return Answer(status, [(b"content-type", b"text/plain; charset=utf-8")], text.encode())
+def _plain(status: int, text: str) -> GatewayResponse:
+    return GatewayResponse(status, [(b"content-type", b"text/plain; charset=utf-8")], text.encode())
 
 
-def _message(status: int, text: str) -> Answer:
+def _message(status: int, text: str) -> GatewayResponse:
     return json_answer(status, {"message": text})
 
 
-def _nothing_here(scope: Scope) -> Answer:
+def _nothing_here(scope: Scope) -> GatewayResponse:
     """What API Gateway answers; for browsers a page, since their user may have mistyped an address."""
     accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
     if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
@@ -125,4 +125,6 @@ def _nothing_here(scope: Scope) -> Answer:
     text = "Please open your study link again. It looks like /next?projectId=…"
     page = frame.message_page("There is nothing here", text)
     headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
-    return Answer(404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode())
+    return GatewayResponse(
+        404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode()
+    )

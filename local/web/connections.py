@@ -20,7 +20,7 @@ def most() -> int:
     return MAX_CONNECTIONS if soft == resource.RLIM_INFINITY else max(1, min(MAX_CONNECTIONS, soft // SHARE))
 
 
-class Connection(H11Protocol):
+class HttpConnection(H11Protocol):
     """A connection as uvicorn has it, cut off when it is too slow.
 
     Beyond `most`, the oldest that waits for a request goes; if all are being answered, the newest.
@@ -33,7 +33,7 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._arm(HEADER_SECONDS)
         if len(self.connections) > most():
-            waiting = [each for each in self.connections if isinstance(each, Connection) and not each.answering]
+            waiting = [each for each in self.connections if isinstance(each, HttpConnection) and not each.answering]
             oldest = min(waiting, key=lambda each: each._since, default=self)
             self.connections.discard(oldest)  # the transport says so later
             oldest.transport.abort()

@@ -49,7 +49,7 @@ ROUTES = (
 )
 
 
-class Answer(NamedTuple):
+class GatewayResponse(NamedTuple):
     """What goes back over the wire."""
 
     status: int
@@ -113,7 +113,7 @@ def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, s
     return event
 
 
-def answer_of(result: Any) -> Answer:
+def answer_of(result: Any) -> GatewayResponse:
     """The response that API Gateway makes of what a function returns. Raises for what it would call an error."""
     if not isinstance(result, dict) or "statusCode" not in result:
         return json_answer(200, result)
@@ -128,7 +128,7 @@ def answer_of(result: Any) -> Answer:
         for name, value in headers
         if name not in ("content-length", "transfer-encoding", "connection")
     ]
-    return Answer(int(result["statusCode"]), sent, data)
+    return GatewayResponse(int(result["statusCode"]), sent, data)
 
 
 def _text(body: bytes, content_type: str) -> str | None:
@@ -141,6 +141,6 @@ def _text(body: bytes, content_type: str) -> str | None:
         return None
 
 
-def json_answer(status: int, data: Any) -> Answer:
+def json_answer(status: int, data: Any) -> GatewayResponse:
     """A response with JSON."""
-    return Answer(status, [(b"content-type", b"application/json")], json.dumps(data).encode())
+    return GatewayResponse(status, [(b"content-type", b"application/json")], json.dumps(data).encode())

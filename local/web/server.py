@@ -14,7 +14,7 @@ from typing import Any
 import uvicorn
 
 from local.web.app import App
-from local.web.connections import Connection
+from local.web.connections import HttpConnection
 
 HOST = "127.0.0.1"
 PORTS_TRIED = 20
@@ -87,7 +87,7 @@ class WebServer:
         self.url = f"https://localhost:{port}" if tls else f"http://{HOST}:{port}"
         config = uvicorn.Config(
             app,
-            http=Connection,
+            http=HttpConnection,
             lifespan="off",
             access_log=False,
             log_level="error",

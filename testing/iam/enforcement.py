@@ -26,7 +26,7 @@ from testing.iam.actions import asks
 from testing.iam.judge import Judge, evaluator
 
 
-class World(Protocol):
+class EnforcedWorld(Protocol):
     """What the enforcement needs of a `MotoWorld`."""
 
     platform: AwsPlatform
@@ -39,7 +39,7 @@ class World(Protocol):
 
 
 @dataclass(frozen=True)
-class Call:
+class ApiCall:
     """One call of an AWS API, made through any botocore client but the world's own."""
 
     service: str  # as botocore names it: s3, ecs, ec2, route53, scheduler, sns, sqs
@@ -147,7 +147,7 @@ _running: contextvars.ContextVar[str | None] = contextvars.ContextVar("function"
 Handler = Callable[[dict[str, Any], object], Any]
 
 
-def account_of(world: World, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.Account:
+def account_of(world: EnforcedWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.ReferenceValues:
     """The template's references in the world's account."""
     env = world.env
     known = {
@@ -170,13 +170,13 @@ def account_of(world: World, of: Mapping[str, Any] | None = None, **parameters: 
         "MaxRuntime": env["MAX_RUNTIME"],
         **parameters,
     }
-    return cfn.Account("hippodrome", ACCOUNT, world.region, given, known, of or cfn.template())
+    return cfn.ReferenceValues("hippodrome", ACCOUNT, world.region, given, known, of or cfn.template())
 
 
 class IamEnforcement:
     """The enforcement of one world."""
 
-    def __init__(self, world: World, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
+    def __init__(self, world: EnforcedWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
         self._world = world
         self.region, self.account = world.region, ACCOUNT
         self._account = account_of(world, of, **parameters)
@@ -187,7 +187,7 @@ class IamEnforcement:
         self.too_much: list[str] = []
 
     @classmethod
-    def of(cls, world: World) -> IamEnforcement | None:
+    def of(cls, world: EnforcedWorld) -> IamEnforcement | None:
         """None if there is no evaluator: `test_enforcement.py` says so aloud."""
         return cls(world) if evaluator() else None
 
@@ -205,7 +205,7 @@ class IamEnforcement:
         """What was wrong, in sentences."""
         return [*dict.fromkeys([*self.refused, *self.too_much])]
 
-    def judge(self, call: Call) -> dict[str, Any] | None:
+    def judge(self, call: ApiCall) -> dict[str, Any] | None:
         """AWS's error if the calling function may not make this call; None if it may, or if no function calls."""
         who = _running.get()
         if who is None:
@@ -222,7 +222,7 @@ class IamEnforcement:
             self.too_much += [f"{other} may {ask.kind} as well, which is not needed" for other in sorted(others)]
         return None
 
-    def signed(self, call: Call) -> None:
+    def signed(self, call: ApiCall) -> None:
         """Judge a presigned request: it has the rights of the role that signed it."""
         token = _running.set(SIGN)
         try:
@@ -230,7 +230,7 @@ class IamEnforcement:
         finally:
             _running.reset(token)
 
-    def _refuse(self, call: Call, why: str) -> dict[str, Any]:
+    def _refuse(self, call: ApiCall, why: str) -> dict[str, Any]:
         self.refused.append(why)
         return {"Error": {"Code": _REFUSALS.get(call.service, "AccessDenied"), "Message": why}}
 

@@ -53,7 +53,7 @@ def evaluator() -> ModuleType | None:
 class Judge:
     """Judges by the policies of the template's roles, resolved for one account."""
 
-    def __init__(self, account: cfn.Account) -> None:
+    def __init__(self, account: cfn.ReferenceValues) -> None:
         found = evaluator()
         assert found is not None, MISSING
         self._iam = found

@@ -89,7 +89,7 @@ def _certificate(folder: Path) -> tuple[Path, Path]:
 
 
 @dataclass(frozen=True)
-class Ran:
+class CommandRun:
     """A command that has ended."""
 
     code: int
@@ -98,7 +98,7 @@ class Ran:
     seconds: float
 
 
-class World:
+class MinistackWorld:
     """One account. `client` gives root's clients; `decisions` what ministack's evaluator has said about all others."""
 
     def __init__(self, venv: Path, home: Path) -> None:
@@ -111,7 +111,7 @@ class World:
 
     # -- coming and going
 
-    def __enter__(self) -> World:
+    def __enter__(self) -> MinistackWorld:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -244,7 +244,7 @@ class World:
         """Variables with which every command but the first finds its modules compiled, outside of the copy of the project."""
         return {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(self.home / "bytecode")}
 
-    def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> Ran:
+    def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> CommandRun:
         """`python -m deploy …` in the copy of the project, as the caller with these keys (root without)."""
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
         env |= {
@@ -275,7 +275,7 @@ class World:
         )
         seconds = time.monotonic() - began
         self.timings[" ".join(arguments[:1])] = seconds
-        return Ran(ended.returncode, ended.stdout, ended.stderr, seconds)
+        return CommandRun(ended.returncode, ended.stdout, ended.stderr, seconds)
 
     # -- what stands
 
@@ -335,10 +335,10 @@ LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
 }
 
 
-class Installation:
+class MinistackInstallation:
     """A stack of ours in a world."""
 
-    def __init__(self, world: World, stack: str = "hippodrome") -> None:
+    def __init__(self, world: MinistackWorld, stack: str = "hippodrome") -> None:
         self.world, self.stack = world, stack
         described = world.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
         self.status = described["StackStatus"]

@@ -29,7 +29,7 @@ class NoRoom(Throttled):
 
 
 @dataclass
-class Bucket:
+class TokenBucket:
     """A token bucket: `burst` calls at once, then `rate` a second."""
 
     rate: float
@@ -102,7 +102,7 @@ class Cloud:
         self.timeline: list[tuple[float, str]] = []
         self.invocations = 0  # that run now, of all functions
         self.most_invocations = 0  # that ran at once
-        self._buckets = {name: Bucket(*quota) for name, quota in QUOTAS.items()}
+        self._buckets = {name: TokenBucket(*quota) for name, quota in QUOTAS.items()}
 
     def log(self, text: str) -> None:
         """One line of the timeline."""

@@ -16,21 +16,21 @@ from protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import session_checks
 from testing.simulation.conditions import Conditions
-from testing.simulation.members import Habits, Member
-from testing.simulation.people import SimulatedParticipant, Visit
-from testing.simulation.world import PROJECT, World
+from testing.simulation.members import Habits, SimulatedMember
+from testing.simulation.people import SimulatedParticipant, SimulatedVisit
+from testing.simulation.world import PROJECT, SimulatedWorld
 
 FAULTS = (PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER, PortFault.REPLY)
 HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: three times the deadline, and the sweeps after it
 
 
 @dataclass(frozen=True)
-class Journey:
+class SimulatedJourney:
     """One way through the study."""
 
     name: str
     conditions: Callable[[], Conditions] = Conditions
-    person: Callable[[World], SimulatedParticipant] = lambda world: SimulatedParticipant(world, 0)
+    person: Callable[[SimulatedWorld], SimulatedParticipant] = lambda world: SimulatedParticipant(world, 0)
     finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
     minutes: int = 30  # maxRuntime
     limits: Mapping[str, int] = field(default_factory=dict)
@@ -42,47 +42,52 @@ class Journey:
     play: float = 60.0  # seconds that a session plays
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
 
-    def people(self, world: World) -> list[SimulatedParticipant]:
+    def people(self, world: SimulatedWorld) -> list[SimulatedParticipant]:
         """All who take part. Those of a session come at the same time, but for their reading."""
         if self.group:
-            return [Member(world, number, habits=habits, play=self.play) for number, habits in enumerate(self.group)]
+            return [
+                SimulatedMember(world, number, habits=habits, play=self.play)
+                for number, habits in enumerate(self.group)
+            ]
         return [self.person(world), *(SimulatedParticipant(world, number) for number in range(1, 1 + self.others))]
 
 
 JOURNEYS = (
-    Journey("a participant plays and finishes"),
-    Journey("Spot is sold out", conditions=lambda: Conditions(no_spot=lambda seconds: True)),
-    Journey(
+    SimulatedJourney("a participant plays and finishes"),
+    SimulatedJourney("Spot is sold out", conditions=lambda: Conditions(no_spot=lambda seconds: True)),
+    SimulatedJourney(
         "Spot takes the server back", conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0))
     ),
-    Journey("AWS is slow", conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0)),
-    Journey("the image cannot be pulled", conditions=lambda: Conditions(stillborn=1.0), finishes=False),
-    Journey(
+    SimulatedJourney("AWS is slow", conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0)),
+    SimulatedJourney("the image cannot be pulled", conditions=lambda: Conditions(stillborn=1.0), finishes=False),
+    SimulatedJourney(
         "nobody comes to play", person=lambda world: SimulatedParticipant(world, 0, leaves_at="wait"), finishes=False
     ),
-    Journey("within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}),
-    Journey(
+    SimulatedJourney(
+        "within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}
+    ),
+    SimulatedJourney(
         "within limits Spot takes the server back",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0)),
         limits={"max_servers": 1, "max_server_hours": 1},
     ),
-    Journey("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
-    Journey("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
-    Journey(
+    SimulatedJourney("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
+    SimulatedJourney("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
+    SimulatedJourney(
         "Spot takes back warm servers, assigned or not",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(155.0, 185.0)),
         limits={"warm_servers": 1},
         comes=150.0,
         closes=600.0,
     ),
-    Journey(
+    SimulatedJourney(
         "two come within limits and one server waits",
         limits={"warm_servers": 1, "max_servers": 2, "max_server_hours": 4},
         others=1,
         comes=150.0,
         closes=600.0,
     ),
-    Journey(
+    SimulatedJourney(
         "play beyond maxRuntime",
         person=lambda world: SimulatedParticipant(world, 0, play=7200),
         finishes=False,
@@ -92,54 +97,56 @@ JOURNEYS = (
 USUAL = Habits()
 PAIR: Mapping[str, object] = {"players": 2, "patience": 120.0}
 JOURNEYS_OF_GROUPS = (
-    Journey("a pair plays and finishes", to_the_end=2, group=(USUAL, USUAL), project=PAIR),
-    Journey(
+    SimulatedJourney("a pair plays and finishes", to_the_end=2, group=(USUAL, USUAL), project=PAIR),
+    SimulatedJourney(
         "Spot takes a pair's server back",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(70.0, 110.0)),
         to_the_end=2,
         group=(USUAL, USUAL),
         project=PAIR,
     ),
-    Journey("of three who come for pairs, one is unmatched", to_the_end=3, group=(USUAL,) * 3, project=PAIR),
-    Journey("one who comes alone is unmatched", to_the_end=1, group=(USUAL,), project=PAIR),
-    Journey(
+    SimulatedJourney("of three who come for pairs, one is unmatched", to_the_end=3, group=(USUAL,) * 3, project=PAIR),
+    SimulatedJourney("one who comes alone is unmatched", to_the_end=1, group=(USUAL,), project=PAIR),
+    SimulatedJourney(
         "one who comes alone plays with a policy",
         to_the_end=1,
         group=(USUAL,),
         project={**PAIR, "after_patience": "policies"},
     ),
-    Journey(
+    SimulatedJourney(
         "they reload, have two tabs, and lose the network in the lobby",
         to_the_end=4,
         group=(Habits(leaves=3.0, beacon=0.4, back=0.0), Habits(tabs=2), Habits(offline=(1.0, 25.0)), USUAL),
         project=PAIR,
     ),
-    Journey(
+    SimulatedJourney(
         "some close the lobby's page, with a beacon and without one, and one comes back",
         to_the_end=2,
         group=(Habits(leaves=1.0), Habits(leaves=2.5, beacon=None), Habits(leaves=4.0, back=20.0), USUAL),
         project=PAIR,
     ),
-    Journey("all close the lobby's page", group=(Habits(leaves=1.0), Habits(leaves=1.0, beacon=None)), project=PAIR),
-    Journey(
+    SimulatedJourney(
+        "all close the lobby's page", group=(Habits(leaves=1.0), Habits(leaves=1.0, beacon=None)), project=PAIR
+    ),
+    SimulatedJourney(
         "one drops out of the game and is back in time",
         to_the_end=2,
         group=(USUAL, Habits(drops=(20.0, 12.0))),
         project=PAIR,
     ),
-    Journey(
+    SimulatedJourney(
         "one drops out of the game for too long", to_the_end=2, group=(USUAL, Habits(drops=(20.0, 80.0))), project=PAIR
     ),
-    Journey("one leaves the game for good", to_the_end=1, group=(USUAL, Habits(quits=20.0)), project=PAIR),
-    Journey("both leave the game for good", group=(Habits(quits=20.0), Habits(quits=25.0)), project=PAIR),
-    Journey(
+    SimulatedJourney("one leaves the game for good", to_the_end=1, group=(USUAL, Habits(quits=20.0)), project=PAIR),
+    SimulatedJourney("both leave the game for good", group=(Habits(quits=20.0), Habits(quits=25.0)), project=PAIR),
+    SimulatedJourney(
         "a group of four, and AWS is slow",
         conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0, s3=(0.1, 0.2)),
         to_the_end=4,
         group=(USUAL,) * 4,
         project={**PAIR, "players": 4},
     ),
-    Journey(
+    SimulatedJourney(
         "two pairs, and one warm server",
         to_the_end=4,
         group=(USUAL,) * 4,
@@ -148,10 +155,10 @@ JOURNEYS_OF_GROUPS = (
         comes=150.0,
         closes=600.0,
     ),
-    Journey(
+    SimulatedJourney(
         "two pairs, and room for one server", to_the_end=2, group=(USUAL,) * 4, project=PAIR, limits={"max_servers": 1}
     ),
-    Journey(
+    SimulatedJourney(
         "a pair plays beyond maxRuntime",
         group=(Habits(drops=(30.0, 15.0)), USUAL),
         project=PAIR,
@@ -162,17 +169,17 @@ JOURNEYS_OF_GROUPS = (
 
 
 @dataclass
-class Outcome:
+class FaultOutcome:
     """What came of one run with one fault."""
 
     journey: str
     fault: FaultAt | None
-    visit: Visit
+    visit: SimulatedVisit
     left: dict[str, int]
     lost: list[str]
     story: str = field(repr=False)
     seed: int = 0
-    others: tuple[Visit, ...] = ()
+    others: tuple[SimulatedVisit, ...] = ()
     wrong: tuple[str, ...] = ()  # sessions that are split or merged, and ghosts
 
     @property
@@ -188,21 +195,23 @@ class Outcome:
         return f"{about}\n{self.story}"
 
 
-def how_it_ended(visit: Visit) -> str:
+def how_it_ended(visit: SimulatedVisit) -> str:
     """How it ended for one participant."""
     return "finished" if visit.finished is not None else visit.told or "stranded"
 
 
-def served_or_told(visit: Visit) -> bool:
+def served_or_told(visit: SimulatedVisit) -> bool:
     """Whether the participant finished, left by themselves, or ended with a page that says how things are."""
     told = bool(visit.told) and not visit.told.startswith(("waited too long", "no answer"))
     return visit.finished is not None or told
 
 
-def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: bool = False) -> tuple[World, Outcome]:
-    """One run of a journey. With `watched` (`World.watch`) it takes four times as long; nothing else changes."""
+def run(
+    journey: SimulatedJourney, seed: int, fault: FaultAt | None = None, *, watched: bool = False
+) -> tuple[SimulatedWorld, FaultOutcome]:
+    """One run of a journey. With `watched` (`SimulatedWorld.watch`) it takes four times as long; nothing else changes."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits, **journey.project)
-    world = World(seed, journey.conditions(), project)
+    world = SimulatedWorld(seed, journey.conditions(), project)
     world.cloud.fault = fault
     if watched:
         world.watch()
@@ -216,24 +225,26 @@ def run(journey: Journey, seed: int, fault: FaultAt | None = None, *, watched: b
     kept = world.platform.documents.kept
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
     first, *others = [person.visit for person in people]
-    members = [person for person in people if isinstance(person, Member)]
+    members = [person for person in people if isinstance(person, SimulatedMember)]
     wrong = tuple(session_checks.wrong(kept, world.project, members))
-    outcome = Outcome(journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong)
+    outcome = FaultOutcome(
+        journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong
+    )
     return world, outcome
 
 
-def calls(journey: Journey, seed: int) -> int:
+def calls(journey: SimulatedJourney, seed: int) -> int:
     """How many calls the functions make in a journey until its server is gone; later sweeps are left out."""
     world, _ = run(journey, seed, watched=True)
     return world.calls_until_quiet
 
 
-def points(journey: Journey, seed: int) -> list[FaultAt]:
+def points(journey: SimulatedJourney, seed: int) -> list[FaultAt]:
     """Every fault of a journey: each kind at each call."""
     return [FaultAt(call, fault) for call in range(1, calls(journey, seed) + 1) for fault in FAULTS]
 
 
-def explore(journey: Journey, seed: int) -> Iterator[Outcome]:
+def explore(journey: SimulatedJourney, seed: int) -> Iterator[FaultOutcome]:
     """Every fault of a journey, one run each."""
     for fault in points(journey, seed):
         yield run(journey, seed, fault)[1]

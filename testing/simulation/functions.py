@@ -66,7 +66,7 @@ class Container:
     lineage: Lineage = field(default_factory=dict)  # of its present invocation
 
 
-class Function:
+class SimulatedFunction:
     """One Lambda function. `billed` is seconds of all its invocations."""
 
     def __init__(
@@ -170,7 +170,7 @@ def ends(owner: object) -> float:
 
 
 @dataclass
-class Held:
+class HeldMessage:
     """A message in a queue."""
 
     number: int
@@ -191,13 +191,15 @@ class Wire(NamedTuple):
     visibility: float
 
 
-class Queue:
+class SimulatedQueue:
     """An SQS standard queue with the event source mapping that empties it into a function."""
 
-    def __init__(self, function: Function, clock: GreenletClock, cloud: Cloud, wire: Wire, receives: int) -> None:
+    def __init__(
+        self, function: SimulatedFunction, clock: GreenletClock, cloud: Cloud, wire: Wire, receives: int
+    ) -> None:
         self._function, self._clock, self._cloud = function, clock, cloud
         self._wire, self._receives = wire, receives
-        self._visible: deque[Held] = deque()
+        self._visible: deque[HeldMessage] = deque()
         self._running = 0
         self._gathering = False
         self._backlog_since = 0.0  # since when the queue has not been empty
@@ -205,16 +207,16 @@ class Queue:
         self._receipts = itertools.count(1)
         self.sent = 0
         self.waiting = 0  # messages not yet gone
-        self.dead: list[Held] = []
+        self.dead: list[HeldMessage] = []
 
     def send(self, message: Mapping[str, Any], delay: float = 0.0, lineage: Lineage = NO_LINEAGE) -> None:
         """A message, visible after `delay` seconds."""
         self.sent += 1
         self.waiting += 1
-        held = Held(next(self._numbers), json.dumps(message), lineage)
+        held = HeldMessage(next(self._numbers), json.dumps(message), lineage)
         self._clock.after(delay, partial(self._show, held))
 
-    def _show(self, held: Held) -> None:
+    def _show(self, held: HeldMessage) -> None:
         if held.receives >= self._receives:
             self.waiting -= 1
             self.dead.append(held)
@@ -253,12 +255,12 @@ class Queue:
             self._clock.spawn(partial(self._serve, batch))
         self._gather()
 
-    def _back(self, held: Held, receipt: int) -> None:
+    def _back(self, held: HeldMessage, receipt: int) -> None:
         """The visibility timeout is over and the message is not deleted."""
         if not held.gone and held.receipt == receipt:
             self._show(held)
 
-    def _serve(self, batch: list[Held]) -> None:
+    def _serve(self, batch: list[HeldMessage]) -> None:
         event = aws_events.queue_event([held.body for held in batch], [str(held.number) for held in batch])
         try:
             answer = self._function.invoke(event, together(held.lineage for held in batch)) or {}

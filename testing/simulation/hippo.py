@@ -23,7 +23,7 @@ from typing import Any
 from hippodrome.ports import DnsRecord, NoCapacity, TaskRequest
 from testing.simulation.cloud import Throttled
 from testing.simulation.tasks import TimedTask
-from testing.simulation.world import World
+from testing.simulation.world import SimulatedWorld
 from testing.tasks import Life
 
 TRIES, PAUSE = 3, 20.0  # of RunTask and of the look for an address; seconds
@@ -39,7 +39,7 @@ ASSUMED = (
 
 
 @dataclass
-class Start:
+class HippoStart:
     """How one start went. Times are virtual seconds."""
 
     asked: float
@@ -52,15 +52,15 @@ class Start:
 class Hippo:
     """The starts of one world."""
 
-    def __init__(self, world: World, *, early: bool) -> None:
+    def __init__(self, world: SimulatedWorld, *, early: bool) -> None:
         self._early = early
         self.world, self.clock, self.cloud = world, world.clock, world.cloud
-        self.starts: list[Start] = []
+        self.starts: list[HippoStart] = []
         self._rules: set[int] = set()
 
     def start(self, number: int) -> None:
         """One participant's `start_server`, with Lambda's further invocations of it. To be spawned."""
-        made = Start(self.clock.seconds)
+        made = HippoStart(self.clock.seconds)
         self.starts.append(made)
         for pause in (*AGAIN, None):
             begun = self.clock.seconds
@@ -74,7 +74,7 @@ class Hippo:
                 return  # it returned: Lambda does not invoke it again
             self.clock.sleep(pause)
 
-    def _start(self, number: int, made: Start) -> None:
+    def _start(self, number: int, made: HippoStart) -> None:
         self._call("s3:GetObject")
         self.cloud.call("events:PutRule", lambda: self._rule(number), ATTEMPTS)
         self._call("events:PutTargets")
@@ -175,7 +175,7 @@ STOP_CALLS = (
 )  # fmt: skip
 
 
-class Record:
+class HippoRecord:
     """A participant's record as HIPPO keeps it: the event of every request is appended, and the whole is written."""
 
     def __init__(self) -> None:

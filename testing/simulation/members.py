@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from hippodrome.model import ids
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.trials import SimTrial, is_lost
-from testing.simulation.world import SECRET, World
+from testing.simulation.world import SECRET, SimulatedWorld
 
 POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two questions of the lobby's page: web/game/
 GIVES_UP = 3900.0  # seconds in the lobby: `patience` is an hour at most
@@ -34,10 +34,10 @@ class Quit(Exception):
     """They have closed the page of the game."""
 
 
-class Member(SimulatedParticipant):
+class SimulatedMember(SimulatedParticipant):
     """One participant's way through a study whose sessions have several players."""
 
-    def __init__(self, world: World, number: int, *, habits: Habits | None = None, **person: Any) -> None:
+    def __init__(self, world: SimulatedWorld, number: int, *, habits: Habits | None = None, **person: Any) -> None:
         super().__init__(world, number, **person)
         self.habits = habits or Habits()
         self.asked_at: list[datetime] = []  # when their requests arrived at the game step

@@ -12,7 +12,7 @@ from hippodrome.ports import Conflict
 from protocol.keys import answer_key
 from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
-from testing.simulation.world import World
+from testing.simulation.world import SimulatedWorld
 
 READ, PLAY = 20.0, 60.0  # seconds: for a page, half as long to half as long again; in the game
 MAX_TRIES = 4  # of a page that does not come
@@ -39,7 +39,7 @@ def retry_delay(tries: int) -> float:
 
 
 @dataclass
-class Visit:
+class SimulatedVisit:
     """How it went for one participant. Times are virtual seconds since the world's beginning."""
 
     user: str
@@ -58,10 +58,10 @@ class SimulatedParticipant:
     """One participant's way through the study, as a browser walks it."""
 
     def __init__(
-        self, world: World, number: int, *, read: float = READ, play: float = PLAY, leaves_at: str = ""
+        self, world: SimulatedWorld, number: int, *, read: float = READ, play: float = PLAY, leaves_at: str = ""
     ) -> None:
         self.world, self.clock = world, world.clock
-        self.visit = Visit(f"p{number:05d}", world.clock.seconds)
+        self.visit = SimulatedVisit(f"p{number:05d}", world.clock.seconds)
         self.answered: list[str] = []  # the steps whose answer we were told is kept
         self._read, self._play, self._leaves_at = read, play, leaves_at
         self._first_ask = self._step_before_server()

@@ -11,13 +11,13 @@ from hippodrome.model import memberships
 from hippodrome.model.project import Project
 from protocol.keys import answer_key, membership_key
 from testing.simulation.lobby import Kept, formed
-from testing.simulation.members import Member
+from testing.simulation.members import SimulatedMember
 
 PRESENT = timedelta(seconds=10)  # after which who has not asked is no longer there
 ANSWERS = timedelta(seconds=30)  # that a page may take: what it decides, it decides for who was there when it began
 
 
-def wrong(kept: Kept, project: Project, people: Sequence[Member]) -> list[str]:
+def wrong(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
     """Sessions whose members are split, or that are merged, participants who were matched as ghosts, and answers of another session."""
     return [
         *_split(kept, project, people),
@@ -27,7 +27,7 @@ def wrong(kept: Kept, project: Project, people: Sequence[Member]) -> list[str]:
     ]
 
 
-def _split(kept: Kept, project: Project, people: Sequence[Member]) -> Iterator[str]:
+def _split(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
     """Where a session and its members do not say the same."""
     members = {(member.user_id, one.id) for one in formed(kept, project) for member in one.members}
     told = set()
@@ -52,7 +52,7 @@ def _merged(kept: Kept, project: Project) -> Iterator[str]:
     yield from (f"merged: {user} is in {times} sessions" for user, times in sorted(count.items()) if times > 1)
 
 
-def _ghosts(kept: Kept, project: Project, people: Sequence[Member]) -> Iterator[str]:
+def _ghosts(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
     """Members who had closed the page long before their session was formed."""
     asked: dict[str, list[datetime]] = defaultdict(list)
     for person in people:

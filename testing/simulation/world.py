@@ -28,7 +28,7 @@ from testing.simulation import functions, lobby
 from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import CONCURRENCY, Cloud, NoRoom
 from testing.simulation.conditions import Conditions
-from testing.simulation.functions import NO_LINEAGE, Function, Lineage, Queue, Wire
+from testing.simulation.functions import NO_LINEAGE, Lineage, SimulatedFunction, SimulatedQueue, Wire
 from testing.simulation.matching import SimMatching
 from testing.simulation.ports import SimBus, SimPlatform, SimTimers
 from testing.simulation.tasks import TimedTask
@@ -71,7 +71,7 @@ PROJECT = Project(
 )
 
 
-class World:
+class SimulatedWorld:
     """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
 
     RECEIVES = 8  # deliveries of a message before it is a dead letter
@@ -93,8 +93,8 @@ class World:
         self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.conditions)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
-        def function(name: str, handler: functions.Handler) -> Function:
-            return Function(name, handler, self.cloud, platform, TIMEOUTS[name], loops=name in LOOPS)
+        def function(name: str, handler: functions.Handler) -> SimulatedFunction:
+            return SimulatedFunction(name, handler, self.cloud, platform, TIMEOUTS[name], loops=name in LOOPS)
 
         self.next_step = function("next_step", next_step.handler)
         self.start_server = function("start_server", start_server.handler)
@@ -102,7 +102,7 @@ class World:
         self.stop_server = function("stop_server", stop_server.handler)
         self.sweep = function("sweep", sweep.handler)
         self.start_queue, self.stop_queue, self.task_queue = (
-            Queue(function, self.clock, self.cloud, wires[function.name], self.RECEIVES)
+            SimulatedQueue(function, self.clock, self.cloud, wires[function.name], self.RECEIVES)
             for function in (self.start_server, self.stop_server, self.task_changed)
         )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
@@ -116,12 +116,12 @@ class World:
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     @property
-    def functions(self) -> list[Function]:
+    def functions(self) -> list[SimulatedFunction]:
         """The functions that work behind the pages."""
         return [self.start_server, self.task_changed, self.stop_server, self.sweep]
 
     @property
-    def queues(self) -> list[Queue]:
+    def queues(self) -> list[SimulatedQueue]:
         """The three queues."""
         return [self.start_queue, self.stop_queue, self.task_queue]
 

@@ -246,12 +246,12 @@ def test_memory_is_that_of_the_command_and_not_of_who_starts_it(tmp_path: Path) 
 
 
 @pytest.fixture(scope="module")
-def crowd() -> scale.Crowd:
+def crowd() -> scale.ServedCrowd:
     with quiet():
         return scale.crowd(7, 100, 10.0)
 
 
-def test_waiting_counts_from_asking_to_the_page(crowd: scale.Crowd) -> None:
+def test_waiting_counts_from_asking_to_the_page(crowd: scale.ServedCrowd) -> None:
     with quiet():  # slow spans come and go, and would decide the p95 of so few
         row = scale.waiting([scale.crowd(seed, 250, 25.0, Conditions(slow_zone=0.0)) for seed in scale.SEEDS[1:3]])
     assert row["met"], row
@@ -283,7 +283,7 @@ def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the
     assert {round(wait, 3) % 5 for wait in aws_bound.aws_alone(at_once, 1, busy)} == {0.0}
 
 
-def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.Crowd) -> None:
+def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.ServedCrowd) -> None:
     theirs = {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}
     assert scale.served("a crowd", [crowd], theirs, 1.0)["met"]
     visits = [*crowd.visits[1:], dataclasses.replace(crowd.visits[0], finished=None, told="waited too long")]
@@ -311,7 +311,7 @@ def test_pages_that_find_no_room_miss_their_goal(
     assert first_try["met"] is met
 
 
-def test_functions_that_run_for_long_miss_their_goal(crowd: scale.Crowd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_functions_that_run_for_long_miss_their_goal(crowd: scale.ServedCrowd, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = {"billed": 20.0, "throttled": {}}
     assert next(scale.costs(crowd, theirs))["met"]
     monkeypatch.setattr(crowd.world.start_server, "billed", 300.0)
@@ -363,7 +363,7 @@ def test_hippo_swallows_what_the_look_for_an_address_raises(monkeypatch: pytest.
     assert found["throttled"]["ec2:DescribeNetworkInterfaces"] == 2 * hippo.TRIES * hippo.ATTEMPTS
 
 
-def test_crowds_say_what_they_assume(crowd: scale.Crowd) -> None:
+def test_crowds_say_what_they_assume(crowd: scale.ServedCrowd) -> None:
     with quiet():
         pairs = sessions.crowd(sessions.PAIRS, Conditions(s3=(0.1, 0.2)), people=4, within=2.0)
     served = scale.served("a crowd", [crowd], {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}, 1.0)["detail"]
@@ -451,8 +451,8 @@ def test_all_servers_of_environments_have_the_same_core_and_the_client_another(m
 
 
 def test_a_server_of_environments_that_is_dear_misses_its_goals() -> None:
-    def run(cpu: float) -> gym.Run:
-        return gym.Run(cpu, 1000, [cpu] * 5)
+    def run(cpu: float) -> gym.GymRun:
+        return gym.GymRun(cpu, 1000, [cpu] * 5)
 
     for count in gym.THEIRS:
         for cpu, met in ((51.9, True), (52.1, False)):
@@ -511,7 +511,7 @@ def test_objects_that_are_late_or_large_miss_their_goals() -> None:
 
 def test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals() -> None:
     def all_rows(share: float, cpu: float, size: float) -> list[table.Row]:
-        found = load.Played(share, cpu, size, size + 15)
+        found = load.ServerLoad(share, cpu, size, size + 15)
         return [load.judged_cpu(found, 0.5), *load.judged_core([found] * 3), load.judged_policy(share, 1.0, 0.9)]
 
     rows = all_rows(1.0, 1.1, 40.0)
@@ -570,7 +570,7 @@ def test_a_sweep_that_its_timeout_cuts_off_misses_its_goal(monkeypatch: pytest.M
     """Its time is no more than the timeout then."""
     monkeypatch.setitem(world.TIMEOUTS, "sweep", 0.001)
     with quiet():
-        found = world.World(7)
+        found = world.SimulatedWorld(7)
         found.run(700.0)
         longest, cut_off = scale.sweeps(found)
     assert longest["met"] is None
@@ -594,8 +594,8 @@ def test_without_a_browser_the_row_says_how_to_install_one(monkeypatch: pytest.M
 def test_memory_that_grows_with_the_study_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = {"participants": data.PARTICIPANTS, "problems": 0, "frames": 1, "recordings": 1}
 
-    def measured(people: int) -> tuple[data.Ran, data.Ran]:
-        ran = data.Ran(1.0, held[people], {"counts": counts, "run": {"new": 1}})
+    def measured(people: int) -> tuple[data.DataRun, data.DataRun]:
+        ran = data.DataRun(1.0, held[people], {"counts": counts, "run": {"new": 1}})
         return ran, ran
 
     monkeypatch.setattr(data, "_measured", measured)
@@ -606,15 +606,15 @@ def test_memory_that_grows_with_the_study_misses_its_goal(monkeypatch: pytest.Mo
 
 
 def test_a_participant_whose_server_costs_more_calls_misses_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = study_on_moto.Study.invoke
+    usual = study_on_moto.MeasuredStudy.invoke
 
-    def chatty(study: study_on_moto.Study, function: types.ModuleType, event: Any) -> dict[str, Any]:
+    def chatty(study: study_on_moto.MeasuredStudy, function: types.ModuleType, event: Any) -> dict[str, Any]:
         answer = usual(study, function, event)
         of = study.calls[function.__name__.rpartition(".")[2]]
         of.extend(of[-1:])
         return answer
 
-    monkeypatch.setattr(study_on_moto.Study, "invoke", chatty)
+    monkeypatch.setattr(study_on_moto.MeasuredStudy, "invoke", chatty)
     assert next(control.calls_of_a_participant())["met"] is False
 
 
@@ -645,7 +645,7 @@ def test_warm_servers_that_do_not_help_or_stay_miss_their_goals(monkeypatch: pyt
 
 def test_games_of_several_that_deliver_too_little_miss_their_goals() -> None:
     def all_rows(share: float) -> list[table.Row]:
-        found = together.Played([1.0, share], 40.0, 0.7, 30.0)
+        found = together.TogetherLoad([1.0, share], 40.0, 0.7, 30.0)
         return [*together.judged_game(2, found), *together.judged_core([found] * 3)]
 
     assert_well_formed(all_rows(1.0))
@@ -654,8 +654,8 @@ def test_games_of_several_that_deliver_too_little_miss_their_goals() -> None:
 
 
 def test_processor_times_say_of_which_python_they_are() -> None:
-    alone = load.Played(1.0, 1.0, 40.0, 50.0)
-    several = together.Played([1.0, 1.0], 40.0, 0.7, 30.0)
+    alone = load.ServerLoad(1.0, 1.0, 40.0, 50.0)
+    several = together.TogetherLoad([1.0, 1.0], 40.0, 0.7, 30.0)
     on_a_core = next(load.judged_core([alone])), next(together.judged_core([several]))
     for found in (load.judged_cpu(alone, 0.5), *on_a_core):
         assert found["detail"]["Python"] == platform.python_version()
@@ -663,10 +663,10 @@ def test_processor_times_say_of_which_python_they_are() -> None:
 
 
 def test_views_that_are_late_or_apart_miss_their_goals() -> None:
-    good = together.Seen([1.0, 1.0], [[30.0] * 9, [31.0] * 9], [0, 1, 1, 0])
+    good = together.PairSeen([1.0, 1.0], [[30.0] * 9, [31.0] * 9], [0, 1, 1, 0])
     assert_well_formed(list(together.judged_views(good)))
     assert [row["met"] for row in together.judged_views(good)] == [True] * 4
-    bad = together.Seen([1.0, 0.9], [[39.0] * 9, [40.0] * 9], [0, 2])
+    bad = together.PairSeen([1.0, 0.9], [[39.0] * 9, [40.0] * 9], [0, 2])
     assert [row["met"] for row in together.judged_views(bad)] == [False] * 4
 
 

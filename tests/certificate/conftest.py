@@ -13,8 +13,8 @@ import acme.client
 import pytest
 
 from hippodrome.certificates import rules as certificate
-from hippodrome.certificates.renewal import Outcome, Renewal, RenewalRequest
-from hippodrome.certificates.rules import ACCOUNT, Stage, State
+from hippodrome.certificates.renewal import Renewal, RenewalOutcome, RenewalRequest
+from hippodrome.certificates.rules import ACCOUNT, CertificateRecord, OrderStage
 from hippodrome.ports import Documents
 from local.backend.documents import FolderDocuments
 from testing.moto_world import moto_world  # noqa: F401 - a fixture
@@ -73,7 +73,7 @@ class Place:
         self.documents = FolderDocuments(self.folder, folder / "state")
         self.challenges = TestChallenges(pebble)
         self.ahead = timedelta(0)
-        self.stages: list[Stage] = []
+        self.stages: list[OrderStage] = []
         self.notes: list[str] = []
 
     def now(self) -> datetime:
@@ -82,7 +82,7 @@ class Place:
     def renewal(
         self,
         documents: Documents | None = None,
-        tell: Callable[[Stage], None] | None = None,
+        tell: Callable[[OrderStage], None] | None = None,
         at: certificate.Location = PLACE,
     ) -> Renewal:
         return Renewal(
@@ -105,11 +105,11 @@ class Place:
         although it is told never to (PEBBLE_AUTHZREUSE=0)."""
         (self.folder / ACCOUNT).unlink()
 
-    def obtain(self, **more: object) -> Outcome:
+    def obtain(self, **more: object) -> RenewalOutcome:
         return self.renewal().obtain(self.wish(**more))  # type: ignore[arg-type]
 
     @property
-    def state(self) -> State:
+    def state(self) -> CertificateRecord:
         return self.renewal().read()[0]
 
     def read(self, key: str) -> str:

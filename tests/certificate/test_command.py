@@ -13,7 +13,7 @@ from deploy.stack import certificate
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates import rules
 from hippodrome.certificates.renewal import Renewal
-from hippodrome.certificates.rules import PRODUCTION, STAGING, FailedOrder, FailureReason, State
+from hippodrome.certificates.rules import PRODUCTION, STAGING, CertificateRecord, FailedOrder, FailureReason
 from hippodrome.model.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
@@ -93,7 +93,7 @@ def txt(world):
 
 
 def state(world):
-    return from_json(world.get(STATE), State)
+    return from_json(world.get(STATE), CertificateRecord)
 
 
 def by_hand(world, folder, origin=""):
@@ -286,7 +286,7 @@ def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
 def test_rate_limited_until(world, delegated, capsys):
     until = datetime.now(UTC) + timedelta(hours=5)
     failure = FailedOrder(datetime.now(UTC), PRODUCTION, FailureReason.RATE_LIMITED, "too many", until)
-    world.put(STATE, to_json(State(failures=(failure,))))
+    world.put(STATE, to_json(CertificateRecord(failures=(failure,))))
     ran = world.run(capsys, "certificate", "--production", "--force")
     assert ran.code == 1
     assert f"Nothing is ordered until {until.astimezone():%Y-%m-%d %H:%M}" in ran.err
@@ -306,7 +306,7 @@ def test_a_limit_that_an_order_meets_is_told_with_its_end(world, delegated, caps
 
 
 def test_somebody_else_is_ordering(world, delegated, capsys):
-    world.put(STATE, to_json(rules.claimed(State(), "other", datetime.now(UTC))))
+    world.put(STATE, to_json(rules.claimed(CertificateRecord(), "other", datetime.now(UTC))))
     ran = world.run(capsys, "certificate", "--production")
     assert ran.code == 1
     assert "Another run is ordering" in ran.err
@@ -366,5 +366,5 @@ def test_obtain_for_other_commands(world, own, pebble):
         )
     assert report.ordered
     assert report.days_left == 89
-    assert told == list(rules.Stage)
+    assert told == list(rules.OrderStage)
     json.dumps(report.as_json())

@@ -22,14 +22,14 @@ from cryptography.hazmat.primitives import serialization
 
 from hippodrome.certificates.order import chain_of
 from hippodrome.certificates.renewal import Renewal, RenewalRequest, renew
-from hippodrome.certificates.rules import ACCOUNT, CLAIM, FailureReason, OrderFailed, Stage, Verdict, renew_at
+from hippodrome.certificates.rules import ACCOUNT, CLAIM, FailureReason, OrderFailed, OrderStage, Verdict, renew_at
 from hippodrome.ports import Conflict
 from local.backend.documents import FolderDocuments
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
 from trial.recordings.store import FolderStore
 from trial.server.certificate import Certificate
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -64,7 +64,7 @@ def served(place: Place) -> Certificate:
         "STORE": "e",
         "TRIAL": "{}",
     }
-    settings = Settings.from_env({**env, "SSL_FULLCHAIN": FULLCHAIN, "SSL_PRIVKEY": PRIVKEY, "TLS": "on"})
+    settings = TrialSettings.from_env({**env, "SSL_FULLCHAIN": FULLCHAIN, "SSL_PRIVKEY": PRIVKEY, "TLS": "on"})
     certificate = Certificate(settings, FolderStore(place.folder))
     certificate.load()
     return certificate
@@ -74,7 +74,7 @@ def test_the_first_order(place):
     outcome = place.obtain(email="admin@example.org")
     assert outcome.ordered
     assert outcome.stored.names == (f"*.{DOMAIN}",)
-    assert place.stages == list(Stage)
+    assert place.stages == list(OrderStage)
     assert place.challenges.puts[0][0] == f"_acme-challenge.{DOMAIN}"
     assert not place.challenges.present
     assert chain_of(place.key.encode()).decode() == place.chain
@@ -205,7 +205,7 @@ def test_dns_says_something_else(place):
     assert place.state.failures == ()
 
 
-@pytest.mark.parametrize("stage", Stage)
+@pytest.mark.parametrize("stage", OrderStage)
 @pytest.mark.parametrize("what", [KeyboardInterrupt, RuntimeError, OSError])
 def test_interrupted_anywhere_the_next_run_goes_on(place, stage, what):
     def tell(reached):
@@ -309,7 +309,7 @@ def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_p
 import os, signal, sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hippodrome.certificates.rules import Stage, location
+from hippodrome.certificates.rules import location
 from hippodrome.certificates.renewal import Renewal, RenewalRequest
 from local.backend.documents import FolderDocuments
 class Nowhere:
@@ -432,7 +432,7 @@ def test_whoever_is_overtaken_stores_nothing(place):
     other = []
 
     def tell(stage):
-        if stage is Stage.ISSUE and not other:
+        if stage is OrderStage.ISSUE and not other:
             other.append(place.obtain(force=True))
 
     with pytest.raises(OrderFailed) as failed:

@@ -11,10 +11,10 @@ from hippodrome.certificates import rules
 from hippodrome.certificates.rules import (
     CLAIM,
     STAGING,
+    CertificateRecord,
     Decision,
     FailedOrder,
     FailureReason,
-    State,
     StoredCertificate,
     Verdict,
 )
@@ -42,7 +42,7 @@ def failure(ago, trouble=FailureReason.VALIDATION, directory=STAGING, until=None
     return FailedOrder(NOW - ago, directory, trouble, until=until)
 
 
-NEVER = State()
+NEVER = CertificateRecord()
 
 
 def decide(state=NEVER, present=None, force=False, directory=STAGING) -> Decision:
@@ -89,64 +89,66 @@ def test_what_there_is_to_do(present, due):
 def test_after_failures_it_waits_longer_and_longer():
     for count, minutes in [(1, 1), (2, 10), (3, 100), (4, 1200), (9, 1200)]:
         failures = [failure(timedelta(seconds=30), FailureReason.TIMEOUT)] * count
-        decision = decide(State(failures=tuple(failures)))
+        decision = decide(CertificateRecord(failures=tuple(failures)))
         assert (decision.verdict, decision.until) == (
             Verdict.WAIT,
             NOW - timedelta(seconds=30) + timedelta(minutes=minutes),
         )
-        assert decide(State(failures=tuple(failures)), force=True).verdict is Verdict.ORDER
+        assert decide(CertificateRecord(failures=tuple(failures)), force=True).verdict is Verdict.ORDER
 
 
 def test_a_daily_timer_tries_every_day():
     failures = tuple(failure(n * DAY) for n in (3, 2, 1))
-    assert decide(State(failures=failures)).verdict is Verdict.ORDER
-    assert decide(State(failures=(*failures, failure(DAY - timedelta(minutes=10))))).verdict is Verdict.ORDER
+    assert decide(CertificateRecord(failures=failures)).verdict is Verdict.ORDER
+    assert (
+        decide(CertificateRecord(failures=(*failures, failure(DAY - timedelta(minutes=10))))).verdict is Verdict.ORDER
+    )
 
 
 def test_even_who_insists_fails_at_most_four_validations_an_hour():
     recent = tuple(failure(timedelta(minutes=m)) for m in (50, 40, 30, 20))
-    decision = decide(State(failures=recent), force=True)
+    decision = decide(CertificateRecord(failures=recent), force=True)
     assert (decision.verdict, decision.until) == (Verdict.WAIT, NOW + timedelta(minutes=10))
-    assert decide(State(failures=recent[1:]), force=True).verdict is Verdict.ORDER
-    assert decide(State(failures=recent), force=True, directory=rules.PRODUCTION).verdict is Verdict.ORDER
+    assert decide(CertificateRecord(failures=recent[1:]), force=True).verdict is Verdict.ORDER
+    assert decide(CertificateRecord(failures=recent), force=True, directory=rules.PRODUCTION).verdict is Verdict.ORDER
     others = tuple(failure(timedelta(minutes=m), FailureReason.TIMEOUT) for m in (5, 4, 3, 2, 1))
-    assert decide(State(failures=others), force=True).verdict is Verdict.ORDER
+    assert decide(CertificateRecord(failures=others), force=True).verdict is Verdict.ORDER
 
 
 def test_what_the_authority_asked_for_holds_for_everybody():
-    asked = State(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW + DAY),))
+    asked = CertificateRecord(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW + DAY),))
     for force in (False, True):
         assert decide(asked, force=force) == Decision(Verdict.WAIT, decide(asked).why, NOW + DAY)
-    over = State(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW),))
+    over = CertificateRecord(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW),))
     assert decide(over).verdict is Verdict.ORDER
 
 
 def test_a_clock_that_went_wrong_stops_nothing():
-    assert decide(State(failures=(failure(-400 * DAY),))).verdict is Verdict.ORDER
+    assert decide(CertificateRecord(failures=(failure(-400 * DAY),))).verdict is Verdict.ORDER
 
 
 def test_a_claim_holds_for_a_while():
-    held = rules.claimed(State(), "me", NOW - CLAIM + timedelta(seconds=1))
+    held = rules.claimed(CertificateRecord(), "me", NOW - CLAIM + timedelta(seconds=1))
     assert decide(held) == Decision(Verdict.BUSY, decide(held).why, NOW + timedelta(seconds=1))
     assert decide(held, force=True).verdict is Verdict.ORDER
-    assert decide(rules.claimed(State(), "me", NOW - CLAIM)).verdict is Verdict.ORDER
+    assert decide(rules.claimed(CertificateRecord(), "me", NOW - CLAIM)).verdict is Verdict.ORDER
     assert decide(held, stored()).verdict is Verdict.FRESH
 
 
 @given(st.integers(0, 30), st.text(max_size=3000))
 def test_the_state_does_not_grow(count, text):
-    state = State()
+    state = CertificateRecord()
     for _ in range(count):
         state = rules.failed(state, FailedOrder(NOW, STAGING, FailureReason.REFUSED, text))
     assert len(state.failures) <= rules.MAX_FAILURES
     assert all(len(one.text) <= rules.MAX_TEXT for one in state.failures)
-    assert from_json(to_json(state), State) == state
+    assert from_json(to_json(state), CertificateRecord) == state
     assert rules.succeeded(state, stored(), "", NOW).failures == ()
 
 
 def test_a_state_with_times_of_no_zone_is_none():
     with pytest.raises(msgspec.ValidationError):
-        from_json(b'{"claimed": "2026-01-01T00:00:00"}', State)
+        from_json(b'{"claimed": "2026-01-01T00:00:00"}', CertificateRecord)
 
 
 def test_days_left():

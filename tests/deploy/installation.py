@@ -31,7 +31,7 @@ from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.participant import Participant, participant_key
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import to_json
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.storage.repository import Repository
 from protocol.answer import Answer
@@ -206,14 +206,16 @@ class Installed(MotoWorld):
             body = gzip.compress(b'{"kind": "header", "v": 1}\n')
             self.put(f"{project.id}/users/{user}/trials/{name}/3-episode-{number:04}.jsonl.gz", body)
 
-    def record(self, user: str, state: State = State.READY, project: Project | None = None, **changes: Any) -> Server:
+    def record(
+        self, user: str, state: ServerState = ServerState.READY, project: Project | None = None, **changes: Any
+    ) -> Server:
         """A server's record in the bucket, requested ten minutes ago."""
         project = project or study()
         then = datetime.now(UTC) - timedelta(minutes=10)
         attempt = changes.pop("attempt", 1)
         settings = self.platform.settings
         made = server.new_attempt(project, user, attempt, token="secret-token", settings=settings, now=then)
-        if state is not State.STARTING:
+        if state is not ServerState.STARTING:
             changes.setdefault("running", then + timedelta(seconds=40))
             changes.setdefault("host", "203.0.113.7")
             changes.setdefault("port", 5000)

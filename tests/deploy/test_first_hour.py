@@ -21,7 +21,7 @@ import pytest
 from console.problem import Exit
 from deploy.core.participants import registered_projects
 from hippodrome.model import ids
-from hippodrome.model.server import Reason, State
+from hippodrome.model.server import Reason, ServerState
 from tests import first_hour
 from tests.deploy.installation import ROOT
 from tests.deploy.running_installation import RunningInstallation, held
@@ -88,7 +88,7 @@ def played(running: RunningInstallation) -> None:
     running.participant("me", answered=5, project=project)
     now = datetime.now(UTC)
     then = max(now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0))  # it was today
-    running.record("me", State.CLOSED, project, closed=then, reason=Reason.STOPPED)
+    running.record("me", ServerState.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)
     body = gzip.compress("".join(f"{json.dumps(line)}\n" for line in lines).encode())

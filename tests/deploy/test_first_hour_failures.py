@@ -13,7 +13,7 @@ from console.problem import Problem
 from deploy.aws import quotas
 from deploy.core import project_folder
 from deploy.lifecycle.apply import ApplyRequest, apply
-from deploy.stack.settings import Settings
+from deploy.stack.settings import StackSettings
 from tests import first_hour
 from tests.deploy.fake_cloudformation import Step
 from tests.deploy.registering import write_study
@@ -85,14 +85,14 @@ GOES_ON: dict[str, Callable[[World], None]] = {
 
 
 @pytest.fixture
-def game(tmp_path: Path) -> project_folder.Study:
+def game(tmp_path: Path) -> project_folder.ProjectFolder:
     return project_folder.read(write_study(tmp_path / "study"))
 
 
-def deploying(world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
+def deploying(world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
     """Whether it came to its end, and what was said."""
     try:
-        apply(world.account, "hippodrome", Settings(domain=DOMAIN), ApplyRequest(game))
+        apply(world.account, "hippodrome", StackSettings(domain=DOMAIN), ApplyRequest(game))
     except Problem as problem:
         screen.show_problem(problem)
         return False, capsys.readouterr().err
@@ -106,7 +106,7 @@ def pattern(message: str) -> str:
 
 @pytest.mark.parametrize("message", STOPS)
 def test_what_stops_is_said_with_a_remedy(
-    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str], message: str
+    world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     STOPS[message](world)
     done, said = deploying(world, game, capsys)
@@ -116,7 +116,7 @@ def test_what_stops_is_said_with_a_remedy(
 
 @pytest.mark.parametrize("message", GOES_ON)
 def test_what_mends_itself_is_said_and_it_goes_on(
-    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str], message: str
+    world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     GOES_ON[message](world)
     done, said = deploying(world, game, capsys)
@@ -125,7 +125,7 @@ def test_what_mends_itself_is_said_and_it_goes_on(
 
 
 def test_where_nothing_is_wrong_none_of_it_is_said(
-    world: World, game: project_folder.Study, capsys: pytest.CaptureFixture[str]
+    world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     done, said = deploying(world, game, capsys)
     assert done

@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 import pytest
 
-from bots.account import Account
+from bots.account import BotReport
 from bots.bot import Bot
 from bots.http import ask
 from bots.links import with_user
@@ -30,7 +30,7 @@ async def until(true: Callable[[], Any], seconds: float = 60) -> None:
             await asyncio.sleep(0.05)
 
 
-async def with_bots(bots: list[Bot], meanwhile: Awaitable[Any] | None = None) -> list[Account]:
+async def with_bots(bots: list[Bot], meanwhile: Awaitable[Any] | None = None) -> list[BotReport]:
     """Let them walk through the study while something else happens."""
     async with asyncio.timeout(150), asyncio.TaskGroup() as group:
         for each in bots:
@@ -44,7 +44,7 @@ def plays(*bots: Bot, frames: int = 10) -> Callable[[], bool]:
     return lambda: all(b.account.plays and b.account.plays[-1].frames >= frames for b in bots)
 
 
-def looked_at(study: StudyProcess, accounts: list[Account]) -> Verification:
+def looked_at(study: StudyProcess, accounts: list[BotReport]) -> Verification:
     """Everybody has finished, and nothing they did is missing."""
     assert [(account.errors, account.finished) for account in accounts] == [([], True)] * len(accounts), accounts
     found = verify(study.data, "tiny", accounts)

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.account import Account
+from bots.account import BotReport
 from bots.bot import Bot
-from bots.page import Page
+from bots.page import VisitedPage
 from bots.verification import document
 from local.new import LEFT_OUT
 from local.rehearsal.logs import verify
@@ -60,11 +60,11 @@ def bots_of(study: HeldStudy, *names: str) -> list[Bot]:
     return [Bot(study.link, name, Random(name), play=0, patience=PATIENCE) for name in names]
 
 
-async def walk(bots: list[Bot]) -> list[Account]:
+async def walk(bots: list[Bot]) -> list[BotReport]:
     return list(await asyncio.gather(*(bot.run() for bot in bots)))
 
 
-def all_is_well(study: HeldStudy, accounts: list[Account]) -> None:
+def all_is_well(study: HeldStudy, accounts: list[BotReport]) -> None:
     assert [(account.errors, account.troubles, account.finished) for account in accounts] == [([], [], True)] * len(
         accounts
     )
@@ -104,7 +104,7 @@ def test_two_find_each_other_and_a_third_goes_on_unmatched(hold: Hold) -> None:
 def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
     study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 6, "countdown": 1})
 
-    async def lose_it() -> list[Account]:
+    async def lose_it() -> list[BotReport]:
         bots = bots_of(study, "ada", "bo")
         walking = asyncio.ensure_future(walk(bots))
         while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
@@ -143,7 +143,7 @@ def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(ho
     trial = {"maxEpisodes": 1, "episodeSeconds": 20, "countdown": 1, "absent": 3, "afterAbsent": "end"}
     study = hold({}, trial)
 
-    async def leave() -> Account:
+    async def leave() -> BotReport:
         bots = bots_of(study, "ada", "bo")
         ada, bo = (asyncio.ensure_future(bot.run()) for bot in bots)
         while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
@@ -161,7 +161,7 @@ def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(ho
 def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -> None:
     study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1}, port=ports.free())
 
-    async def kill_twice() -> list[Account]:
+    async def kill_twice() -> list[BotReport]:
         ada, bo = bots_of(study, "ada", "bo")
         first = asyncio.ensure_future(ada.run())
         while ada.account.stage != "waits for others":
@@ -201,7 +201,7 @@ class Decided(Bot):
 
     plays = ""
 
-    async def post(self, address: str, pairs: list[tuple[str, str]]) -> Page:
+    async def post(self, address: str, pairs: list[tuple[str, str]]) -> VisitedPage:
         for answers in self.account.answers.values():
             if "plays" in answers:
                 answers["plays"] = self.plays

@@ -15,7 +15,7 @@ import pytest
 
 from console.problem import Exit
 from export import fetch
-from export.source import Bucket, Gone
+from export.source import Bucket, FileGone
 from testing.aws_events import ACCOUNT
 from testing.studies import study
 from tests.deploy.installation import Installed, environment, process
@@ -93,7 +93,7 @@ def test_a_body_that_breaks_off_is_asked_for_again(world: Installed, tmp_path: P
     bucket.fetch(listed, tmp_path / "x")
     assert (tmp_path / "x").read_bytes() == body
     world.put("maze/users/a/participant.json", b"another")
-    with pytest.raises(Gone):
+    with pytest.raises(FileGone):
         bucket.fetch(listed, tmp_path / "x")
 
 

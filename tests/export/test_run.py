@@ -18,7 +18,7 @@ from console.problem import Exit
 from deploy.__main__ import main
 from export import fetch, manifest
 from export.fetch import Fetcher
-from export.source import Folder, Gone
+from export.source import FileGone, Folder
 from hippodrome.model import warm_pool
 from hippodrome.model.records import to_json
 from protocol.handover import Handover
@@ -429,7 +429,7 @@ def test_a_file_that_goes_while_it_is_fetched(place: Place, monkeypatch: Any) ->
 
         def vanish(self: Folder, at: str, most: int) -> bytes:
             if users[0] in at:
-                raise Gone(at)
+                raise FileGone(at)
             return read(self, at, most)
 
         patch.setattr(Folder, "read", vanish)
@@ -440,9 +440,9 @@ def test_a_file_that_goes_while_it_is_fetched(place: Place, monkeypatch: Any) ->
 
 
 def test_names_that_some_machines_confuse(place: Place) -> None:
-    from export.state import State
+    from export.state import ExportState
 
-    state = State(None)
+    state = ExportState(None)
     folders = [state.find_or_add(user, False).folder for user in ("Ann", "ann", "ANN", "con", "NUL", "com1", "x")]
     assert len({name.lower() for name in folders}) == len(folders)
     assert not {"con", "nul", "com1"} & {name.lower() for name in folders}

@@ -17,10 +17,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from export import table_files, tables
-from export.answers import MAX_LINK, Answers
-from export.keys import Kind, Listed, read
+from export.answers import MAX_LINK, StudyAnswers
+from export.keys import KeyKind, Listed, read
 from export.scrub import Scrub, clean, identities
-from export.state import File, Participant, State
+from export.state import ExportedParticipant, ExportState, File
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
 from trial.recordings.recording import line
@@ -52,9 +52,9 @@ ANYTHING = st.recursive(
 QUICK = settings(max_examples=examples(60))
 
 
-def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **changes: Any) -> State:
+def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **changes: Any) -> ExportState:
     """A state as a run leaves it."""
-    state = State(None)
+    state = ExportState(None)
     state.begin_run()
     for user, steps in people.items():
         state.find_or_add(user, apart)
@@ -65,9 +65,11 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
     return state
 
 
-def written(state: State, folder: Path, apart: bool = False, **style: Any) -> tuple[list[dict[str, str]], list[Any]]:
+def written(
+    state: ExportState, folder: Path, apart: bool = False, **style: Any
+) -> tuple[list[dict[str, str]], list[Any]]:
     """The answers as CSV and as Parquet give them back."""
-    answers = Answers(state, PROJECT, apart)
+    answers = StudyAnswers(state, PROJECT, apart)
     sheet, parquet = table_files.write(folder / "answers", answers.columns, answers.rows(), table_files.Style(**style))
     with sheet.open(encoding="utf-8-sig", newline="") as file:
         found = list(csv.DictReader(file))
@@ -129,7 +131,7 @@ def test_answers_of_any_type_make_a_table(steps: dict[str, Any], link: Any) -> N
             sheet, parquet = written(filled(people, apart, link=link), Path(folder), apart)
             assert len(sheet) == len(parquet) == 2
         state = filled(people)
-        answers = Answers(state, PROJECT, False)
+        answers = StudyAnswers(state, PROJECT, False)
         long = list(answers.long_rows())
         table_files.write(Path(folder) / "long", answers.LONG, long, table_files.Style())
         columns, rows = tables.identities(state, answers.links)
@@ -240,20 +242,20 @@ def test_hostile_keys_never_become_paths(rest: str) -> None:
     for part in (item.user, item.step, item.server, item.name):
         assert "/" not in part
         assert part not in (".", "..")
-    if item.kind is not Kind.FOREIGN:
+    if item.kind is not KeyKind.FOREIGN:
         assert item.user
 
 
 def test_the_keys_that_hippodrome_writes_are_known() -> None:
     kinds = {
-        "ann/participant.json": Kind.PARTICIPANT,
-        "ann/answers/finalStep.json": Kind.ANSWER,
-        "ann/trials/sabc-1/3-episode-0001.jsonl.gz": Kind.RECORDING,
-        "ann/trials/sabc-1/3-episode-0001-2.jsonl.gz": Kind.RECORDING,
-        "ann/trials/a-b.c/3-trial.jsonl.gz": Kind.RECORDING,
-        "ann/trials/sabc-1/my-step-trial-2.jsonl.gz": Kind.RECORDING,
-        "ann/answers/1.json.part": Kind.FOREIGN,
-        "ann/participant.json/x": Kind.FOREIGN,
+        "ann/participant.json": KeyKind.PARTICIPANT,
+        "ann/answers/finalStep.json": KeyKind.ANSWER,
+        "ann/trials/sabc-1/3-episode-0001.jsonl.gz": KeyKind.RECORDING,
+        "ann/trials/sabc-1/3-episode-0001-2.jsonl.gz": KeyKind.RECORDING,
+        "ann/trials/a-b.c/3-trial.jsonl.gz": KeyKind.RECORDING,
+        "ann/trials/sabc-1/my-step-trial-2.jsonl.gz": KeyKind.RECORDING,
+        "ann/answers/1.json.part": KeyKind.FOREIGN,
+        "ann/participant.json/x": KeyKind.FOREIGN,
     }
     found = {rest: read("maze", Listed(f"maze/users/{rest}", "1", 1)) for rest in kinds}
     assert {rest: item.kind for rest, item in found.items()} == kinds
@@ -278,7 +280,7 @@ def test_an_identity_leaves_every_text_and_every_json(identity: str, before: str
 
 def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
     document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
-    known = identities(Participant("user-0001", "p1", "p1", document))
+    known = identities(ExportedParticipant("user-0001", "p1", "p1", document))
     hide = Scrub(known)
     code = participant("user-0001")["completionCode"]
     assert (

@@ -166,7 +166,9 @@ def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[st
     assert {a["MetricName"] for a in faults} == {"ServersFailed"}
     assert {a["Dimensions"][0]["Name"] for a in (oldest, *faults)} == {metrics.DIMENSION}
     assert sorted(a["Dimensions"][1]["Value"] for a in faults) == sorted(FailureCategory)
-    body = json.loads(cfn.Account().resolve(cfn.resources("AWS::CloudWatch::Dashboard")["Dashboard"]["DashboardBody"]))
+    body = json.loads(
+        cfn.ReferenceValues().resolve(cfn.resources("AWS::CloudWatch::Dashboard")["Dashboard"]["DashboardBody"])
+    )
     shown: set[str] = set()
     for widget in body["widgets"]:
         space = ""

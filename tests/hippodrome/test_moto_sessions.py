@@ -17,7 +17,7 @@ from testing.moto_study import (
     GAME,
     PAIRS,
     PROJECT,
-    Member,
+    MotoMember,
     StudyOnMoto,
     come,
     meet,
@@ -34,8 +34,8 @@ def study() -> Iterator[StudyOnMoto]:
 
 
 @pytest.fixture
-def pair(study: StudyOnMoto) -> tuple[Member, Member]:
-    return Member(study, "R_alice"), Member(study, "R_bob")
+def pair(study: StudyOnMoto) -> tuple[MotoMember, MotoMember]:
+    return MotoMember(study, "R_alice"), MotoMember(study, "R_bob")
 
 
 def environment(study: StudyOnMoto, task: str) -> dict[str, str]:
@@ -43,11 +43,11 @@ def environment(study: StudyOnMoto, task: str) -> dict[str, str]:
     return {one["name"]: one["value"] for one in told}
 
 
-def session_of(study: StudyOnMoto, member: Member) -> str:
+def session_of(study: StudyOnMoto, member: MotoMember) -> str:
     return str(member.membership["session"])
 
 
-def test_a_pair_from_two_links_until_nothing_is_left(study: StudyOnMoto, pair: tuple[Member, Member]) -> None:
+def test_a_pair_from_two_links_until_nothing_is_left(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
     alice, bob = pair
     come(study, *pair)
     (task,) = study.living()  # one server for both, started ahead
@@ -81,7 +81,7 @@ def test_a_pair_from_two_links_until_nothing_is_left(study: StudyOnMoto, pair: t
 
 
 def test_a_pair_that_is_faster_than_the_start_messages_gets_one_server(
-    study: StudyOnMoto, pair: tuple[Member, Member]
+    study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
 ) -> None:
     for member in pair:
         member.to_the_game()
@@ -94,7 +94,9 @@ def test_a_pair_that_is_faster_than_the_start_messages_gets_one_server(
     study.assert_nothing_left()
 
 
-def test_the_first_to_finish_leaves_the_server_to_the_other(study: StudyOnMoto, pair: tuple[Member, Member]) -> None:
+def test_the_first_to_finish_leaves_the_server_to_the_other(
+    study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
+) -> None:
     come(study, *pair)
     meet(*pair)
     alice, bob = pair
@@ -109,7 +111,7 @@ def test_the_first_to_finish_leaves_the_server_to_the_other(study: StudyOnMoto, 
     study.assert_nothing_left()
 
 
-def test_a_lost_server_is_replaced_for_both(study: StudyOnMoto, pair: tuple[Member, Member]) -> None:
+def test_a_lost_server_is_replaced_for_both(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
     come(study, *pair)
     before = meet(*pair)
     study.lose(study.living()[0])
@@ -126,7 +128,7 @@ def test_a_lost_server_is_replaced_for_both(study: StudyOnMoto, pair: tuple[Memb
 
 
 def test_four_people_are_two_pairs_on_two_servers(study: StudyOnMoto) -> None:
-    people = [Member(study, f"R_{number}") for number in range(4)]
+    people = [MotoMember(study, f"R_{number}") for number in range(4)]
     come(study, *people)
     assert len(study.living()) == 2
     meet(*people)
@@ -141,7 +143,7 @@ def test_a_pair_is_handed_a_warm_server() -> None:
     with MotoWorld() as world:
         study = StudyOnMoto(world, **PAIRS, warmServers=1)
         study.deliver()
-        pair = Member(study, "R_alice"), Member(study, "R_bob")
+        pair = MotoMember(study, "R_alice"), MotoMember(study, "R_bob")
         come(study, *pair)
         states = meet(*pair)
         assert [state["state"] for state in states] == ["ready", "ready"]
@@ -155,7 +157,7 @@ def test_a_pair_is_handed_a_warm_server() -> None:
 
 
 def test_a_server_ahead_of_one_who_gives_up_is_stopped(study: StudyOnMoto) -> None:
-    alice = Member(study, "R_alice")
+    alice = MotoMember(study, "R_alice")
     come(study, alice)
     assert len(study.living()) == 1
     assert alice.poll()["state"] == "lobby"
@@ -167,7 +169,9 @@ def test_a_server_ahead_of_one_who_gives_up_is_stopped(study: StudyOnMoto) -> No
     study.assert_nothing_left()
 
 
-def test_the_sessions_server_gets_requests_for_both_answers(study: StudyOnMoto, pair: tuple[Member, Member]) -> None:
+def test_the_sessions_server_gets_requests_for_both_answers(
+    study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
+) -> None:
     come(study, *pair)
     meet(*pair)
     (task,) = study.living()

@@ -13,7 +13,7 @@ from hippodrome.model import step_types
 from hippodrome.model.project import Project, Step
 from hippodrome.model.step_types import PAGE, RESERVED, StepType
 from hippodrome.participants import steps
-from hippodrome.participants.forms import Form
+from hippodrome.participants.forms import PostedForm
 from hippodrome.participants.steps.page import PageStep
 from hippodrome.participants.steps.visit import Visit
 from lambdas import installed as place
@@ -38,8 +38,8 @@ class BreakStep(PageStep):
     def show(self, visit: Visit) -> Response:
         return http.html(200, f"<p>Take a break, {visit.user_id}.</p>", {})
 
-    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
-        super().post(project, user_id, step, Form({"rested": "yes"}))
+    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
+        super().post(project, user_id, step, PostedForm({"rested": "yes"}))
 
 
 @pytest.fixture

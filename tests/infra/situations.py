@@ -40,7 +40,7 @@ def _domains() -> tuple[tuple[str, str], ...]:
     )
 
 
-class Account(cfn.Account):
+class Account(cfn.ReferenceValues):
     """An account in which numbers are numbers, and what CloudFormation names has names as long as they get."""
 
     def ref(self, name: str) -> Any:

@@ -39,9 +39,9 @@ ROLES = {
 }
 
 
-def account() -> cfn.Account:
+def account() -> cfn.ReferenceValues:
     logs = {f"{name}.Arn": "its log" for name in cfn.resources("AWS::Logs::LogGroup")}
-    return cfn.Account(
+    return cfn.ReferenceValues(
         "<stack>",
         "account",
         "region",

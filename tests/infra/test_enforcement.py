@@ -34,9 +34,9 @@ from protocol.keys import groups_key, waiting_key
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
-from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, Call, IamEnforcement
+from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, ApiCall, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
-from testing.moto_study import GAME, PAIRS, PROJECT, Member, Person, StudyOnMoto, come, meet
+from testing.moto_study import GAME, PAIRS, PROJECT, MotoMember, Person, StudyOnMoto, come, meet
 from testing.moto_world import MotoWorld
 from tests.hippodrome.test_moto_journey import run
 
@@ -61,7 +61,7 @@ def judged() -> None:
 
 @pytest.fixture
 def judge(judged: None) -> Judge:
-    return Judge(cfn.Account(parameters=TEXTS, known={"Bucket": "the-bucket"}))
+    return Judge(cfn.ReferenceValues(parameters=TEXTS, known={"Bucket": "the-bucket"}))
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
         assert urlsplit(request["url"]).path == f"/{key}"
         condition = {"IfNoneMatch": request["headers"]["If-None-Match"]} if method == "PUT" else {}
         world.iam.signed(
-            Call("s3", f"{method.title()}Object", {"Bucket": world.env["BUCKET"], "Key": key, **condition})
+            ApiCall("s3", f"{method.title()}Object", {"Bucket": world.env["BUCKET"], "Key": key, **condition})
         )
 
 
@@ -273,7 +273,7 @@ def waiting(world: MotoWorld) -> None:
 def together(world: MotoWorld) -> None:
     """A study of pairs: matched, lost, replaced, recorded, left one by one; one who waits alone, and who leaves."""
     study = StudyOnMoto(world, **PAIRS)
-    alice, bob = Member(study, "R_alice"), Member(study, "R_bob")
+    alice, bob = MotoMember(study, "R_alice"), MotoMember(study, "R_bob")
     come(study, alice, bob)
     meet(alice, bob)
     session = alice.membership["session"]
@@ -296,7 +296,7 @@ def together(world: MotoWorld) -> None:
     study.deliver()
     study.assert_nothing_left()
 
-    carol, dave = Member(study, "R_carol"), Member(study, "R_dave")
+    carol, dave = MotoMember(study, "R_carol"), MotoMember(study, "R_dave")
     come(study, carol)
     assert carol.poll()["state"] == "lobby"
     carol.leave()
@@ -314,7 +314,7 @@ def together(world: MotoWorld) -> None:
 def matched_by_a_function(world: MotoWorld) -> None:
     """A study whose function `match` says who plays with whom, on a server that was started ahead."""
     study = StudyOnMoto(world, **PAIRS, matching="match")
-    alice, bob = Member(study, "R_alice"), Member(study, "R_bob")
+    alice, bob = MotoMember(study, "R_alice"), MotoMember(study, "R_bob")
     come(study, alice, bob)
     assert [alice.poll()["state"], bob.poll()["state"]] == ["lobby", "lobby"]
     question = study.stored(waiting_key(PROJECT))
@@ -468,7 +468,7 @@ def test_names_of_servers_and_no_others_are_changed(judge: Judge) -> None:
 
 
 def test_names_after_ids_are_changed_on_the_servers_own_level_alone(judged: None) -> None:
-    judge = Judge(cfn.Account(parameters={**TEXTS, "ServerNames": "userId"}, known={"Bucket": "the-bucket"}))
+    judge = Judge(cfn.ReferenceValues(parameters={**TEXTS, "ServerNames": "userId"}, known={"Bucket": "the-bucket"}))
     alice = "alice.servers.example.org"
     assert judge.who_may(names("UPSERT", "A", alice)) == {"task_changed"}
     assert judge.who_may(names("UPSERT", "A", alice, HASHED)) == {"task_changed"}
@@ -702,7 +702,7 @@ def test_each_function_reads_its_own_queue_and_writes_its_own_log(judge: Judge) 
         next(n for n, logical in judge.functions.items() if logical == m["FunctionName"]["Ref"]): m["EventSourceArn"]["Fn::GetAtt"][0]
         for m in cfn.resources("AWS::Lambda::EventSourceMapping").values()
     }  # fmt: skip
-    account = cfn.Account()
+    account = cfn.ReferenceValues()
     for queue in cfn.resources("AWS::SQS::Queue"):
         reader = {name for name, its in mappings.items() if its == queue}
         for action in ("sqs:ReceiveMessage", "sqs:DeleteMessage", "sqs:GetQueueAttributes"):
@@ -744,7 +744,7 @@ def test_names_are_normalized_as_route_53_does() -> None:
 def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     study = StudyOnMoto(world)
     assert world.iam
-    assert world.iam.judge(Call("s3", "DeleteBucket", {})) is None, "not by a function"
+    assert world.iam.judge(ApiCall("s3", "DeleteBucket", {})) is None, "not by a function"
     monkeypatch.setattr(ProjectCache, "project", lambda *_: study.world.platform._client("s3").list_buckets())
     assert Person(study, "R_alice").send("http_get")["statusCode"] == 500
     assert world.iam.findings() == ["next_step calls s3:ListBuckets, which actions.py does not describe"]

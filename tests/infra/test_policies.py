@@ -51,7 +51,7 @@ PARTIAL = re.compile(
 
 
 def allowances(of: dict[str, Any] | None = None) -> list[tuple[str, dict[str, Any]]]:
-    account = cfn.Account(known={"Bucket.Arn": "the-bucket"}, of=of or cfn.template())
+    account = cfn.ReferenceValues(known={"Bucket.Arn": "the-bucket"}, of=of or cfn.template())
     found = [(name, account.resolve(statement)) for name, statement in cfn.statements(of)]
     return [(name, statement) for name, statement in found if statement["Effect"] == "Allow"]
 

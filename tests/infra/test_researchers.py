@@ -230,7 +230,7 @@ def ways() -> Iterator[Ask]:
             yield Ask("lambda:InvokeFunction", arn)
     yield Ask("lambda:CreateEventSourceMapping", "*")
     yield Ask("lambda:CreateFunction", f"arn:aws:lambda:{HERE}:function:mine")
-    account = cfn.Account()
+    account = cfn.ReferenceValues()
     for queue in cfn.resources("AWS::SQS::Queue"):
         for action in ("sqs:ReceiveMessage", "sqs:SetQueueAttributes", "sqs:StartMessageMoveTask", "sqs:AddPermission"):
             yield Ask(action, account.attribute(queue, "Arn"))
@@ -268,7 +268,7 @@ WAYS = [*ways()]
 @pytest.fixture
 def judge(judged: None) -> Judge:
     texts = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
-    return Judge(cfn.Account(parameters=texts, known={"Bucket": "the-bucket"}))
+    return Judge(cfn.ReferenceValues(parameters=texts, known={"Bucket": "the-bucket"}))
 
 
 def test_no_other_way_leads_to_one(judge: Judge) -> None:
@@ -337,5 +337,5 @@ def test_a_policy_that_opens_a_way_is_noticed(
         if at in statement["Action"]:
             change(statement)
     texts = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
-    wider = Judge(cfn.Account(parameters=texts, known={"Bucket": "the-bucket"}, of=more))
+    wider = Judge(cfn.ReferenceValues(parameters=texts, known={"Bucket": "the-bucket"}, of=more))
     assert opens <= {ask.action for ask in WAYS if wider.may(POLICY, ask)}

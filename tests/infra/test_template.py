@@ -150,7 +150,7 @@ def test_queues_wait_for_their_functions_and_failures_end_in_dead_letters() -> N
         window = mapping.get("MaximumBatchingWindowInSeconds", 0)
         assert queue["VisibilityTimeout"] > functions[mapping["FunctionName"]["Ref"]]["Timeout"] + window
         assert mapping["FunctionResponseTypes"] == ["ReportBatchItemFailures"]
-        assert int(cfn.Account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"])) >= 2
+        assert int(cfn.ReferenceValues().resolve(mapping["ScalingConfig"]["MaximumConcurrency"])) >= 2
         assert mapping["BatchSize"] <= 10 or window >= 1
         assert queue["RedrivePolicy"]["deadLetterTargetArn"]["Fn::GetAtt"][0] in queues
     dead = {
@@ -215,7 +215,7 @@ def test_the_api_has_the_routes_of_the_local_server_and_one_for_servers() -> Non
 
 
 def test_servers_ask_for_requests_at_a_route_of_the_site() -> None:
-    account = cfn.Account()
+    account = cfn.ReferenceValues()
     told = account.resolve(cfn.template()["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"])[
         "SIGN_URL"
     ]
@@ -281,7 +281,7 @@ def test_servers_reach_out_to_port_443_alone() -> None:
 
 
 def test_with_the_administrators_network_none_is_made() -> None:
-    theirs = cfn.Account(parameters={"VpcId": "vpc-01234567", "SubnetIds": "subnet-01234567,subnet-89abcdef"})
+    theirs = cfn.ReferenceValues(parameters={"VpcId": "vpc-01234567", "SubnetIds": "subnet-01234567,subnet-89abcdef"})
     assert not theirs.holds("OwnVpc")
     assert theirs.resolve(cfn.template()["Outputs"]["Subnets"]["Value"]) == "subnet-01234567,subnet-89abcdef"
     (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
@@ -296,7 +296,7 @@ def test_with_the_administrators_network_none_is_made() -> None:
 @pytest.mark.parametrize("payload", ["running", "spot_warning", "deprovisioning_spot", "stopped_spot"])
 def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -> None:
     (rule,) = [r for r in cfn.resources("AWS::Events::Rule").values() if "EventPattern" in r]
-    pattern = cfn.Account().resolve(rule["EventPattern"])
+    pattern = cfn.ReferenceValues().resolve(rule["EventPattern"])
     event = json.loads((ROOT / f"tests/events/sqs_task_{payload}.json").read_text())["Records"][0]
     body = json.loads(event["body"])
     assert body["source"] in pattern["source"]

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from hippodrome.model import ids, messages, server
 from hippodrome.model.project import Events, step_key
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, Topic
 from hippodrome.servers.causes import Cause
 from hippodrome.storage.errors import RetryLater
@@ -88,7 +88,7 @@ def claimed(platform: FakePlatform, event: dict[str, Any], **changes: Any) -> No
             project_id=PROJECT,
             user_id=user,
             attempt=attempt,
-            state=State.STARTING,
+            state=ServerState.STARTING,
             token="t",
             requested=platform.now(),
             deadline=platform.now(),
@@ -108,7 +108,7 @@ def records(platform: FakePlatform, event: dict[str, Any]) -> list[Server]:
     return [msgspec.json.decode(stored, type=Server) for stored in kept]
 
 
-def states(platform: FakePlatform, event: dict[str, Any]) -> list[tuple[State, Reason | None]]:
+def states(platform: FakePlatform, event: dict[str, Any]) -> list[tuple[ServerState, Reason | None]]:
     return [(record.state, record.reason) for record in records(platform, event)]
 
 
@@ -252,7 +252,7 @@ def test_a_running_task_gets_its_name_in_one_go(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_running")
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.READY, None)]
+    assert states(platform, event) == [(ServerState.READY, None)]
     assert list(platform.dns.records) == [f"{ids.server_name(*attempt_of(event['Records'][0]))}.example.org"]
 
 
@@ -260,15 +260,15 @@ def test_a_task_that_is_only_being_provided_changes_nothing(platform: FakePlatfo
     event = aws_events.load("sqs_task_provisioning")
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.STARTING, None)]
+    assert states(platform, event) == [(ServerState.STARTING, None)]
 
 
 @pytest.mark.parametrize("payload", ["sqs_task_spot_warning", "sqs_task_spot_warning_no_code"])
 def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePlatform, payload: str) -> None:
     event = aws_events.load(payload)
-    claimed(platform, event, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
+    claimed(platform, event, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.READY, None)]
+    assert states(platform, event) == [(ServerState.READY, None)]
     assert platform.dns.records == {"a.example.org": "203.0.113.9"}
 
 
@@ -290,11 +290,11 @@ def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePla
 )
 def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str, reason: Reason, again: bool) -> None:
     event = aws_events.load(payload)
-    claimed(platform, event, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
+    claimed(platform, event, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     _, attempt = attempt_of(event["Records"][0])
     for _ in range(2):
         assert task_changed.handler(deepcopy(event), None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.CLOSED, reason)]
+    assert states(platform, event) == [(ServerState.CLOSED, reason)]
     assert platform.dns.records == {}
     assert platform.timers.due == {}
     (user,) = users(event)
@@ -331,7 +331,7 @@ def test_the_record_of_a_server_that_failed_says_why(platform: FakePlatform, pay
 
 def test_the_end_of_a_server_is_told_twice_and_told_once_is_enough(platform: FakePlatform) -> None:
     ended, gone = aws_events.load("sqs_task_deprovisioning_spot"), aws_events.load("sqs_task_stopped_spot")
-    claimed(platform, ended, state=State.READY, dns="a.example.org", host="203.0.113.9", port=5000)
+    claimed(platform, ended, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     task_changed.handler(ended, None)
     (user,) = users(ended)
     _, attempt = attempt_of(ended["Records"][0])
@@ -348,22 +348,22 @@ def test_a_task_that_we_stopped_is_left_to_the_one_who_stopped_it(platform: Fake
     claimed(platform, event)
     assert json.loads(event["Records"][0]["body"])["detail"]["stoppedReason"].startswith("hippodrome:")
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.STARTING, None)]
+    assert states(platform, event) == [(ServerState.STARTING, None)]
 
 
 def test_a_whole_batch_of_changes(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_tasks")
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    by_status: dict[str, list[tuple[State, Reason | None]]] = {}
+    by_status: dict[str, list[tuple[ServerState, Reason | None]]] = {}
     for record, state in zip(event["Records"], states(platform, event), strict=True):
         detail = json.loads(record["body"])["detail"]
         by_status.setdefault(detail.get("stopCode", detail["lastStatus"]), []).append(state)
-    assert by_status["PROVISIONING"] == [(State.STARTING, None)]
-    assert by_status["RUNNING"] == [(State.READY, None)]
-    assert by_status["EssentialContainerExited"] == [(State.CLOSED, Reason.ENDED)]
-    assert by_status["TaskFailedToStart"] == [(State.CLOSED, Reason.LOST)]
-    assert (State.CLOSED, Reason.LOST) in by_status["SpotInterruption"]
+    assert by_status["PROVISIONING"] == [(ServerState.STARTING, None)]
+    assert by_status["RUNNING"] == [(ServerState.READY, None)]
+    assert by_status["EssentialContainerExited"] == [(ServerState.CLOSED, Reason.ENDED)]
+    assert by_status["TaskFailedToStart"] == [(ServerState.CLOSED, Reason.LOST)]
+    assert (ServerState.CLOSED, Reason.LOST) in by_status["SpotInterruption"]
 
 
 def test_the_timer_of_the_sweep(platform: FakePlatform) -> None:
@@ -419,7 +419,7 @@ def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatf
     event["Records"].append(other)
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert [state for state, _ in states(platform, event)] == [State.READY, State.STARTING]
+    assert [state for state, _ in states(platform, event)] == [ServerState.READY, ServerState.STARTING]
     ((_, message),) = platform.bus.delayed
     again = messages.parse_task_changed(dict(message))
     assert again
@@ -434,7 +434,7 @@ def test_when_the_names_cannot_be_changed_every_event_of_the_batch_comes_again(p
     assert len(task_changed.handler(event, None)["batchItemFailures"]) == 1
     platform.dns.change = change  # type: ignore[method-assign]
     assert task_changed.handler(event, None) == NOTHING_FAILED
-    assert states(platform, event) == [(State.READY, None)]
+    assert states(platform, event) == [(ServerState.READY, None)]
 
 
 # What is not ours, and what nobody should know

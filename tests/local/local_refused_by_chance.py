@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 
 from local.__main__ import main
-from testing.os_faults import ERRORS, Call, OsFaultInjector
+from testing.os_faults import ERRORS, OsCall, OsFaultInjector
 
 
 class ByChance(OsFaultInjector):
@@ -19,7 +19,7 @@ class ByChance(OsFaultInjector):
     dice = random.Random(int(os.environ["SEED"]))
     chance = float(os.environ["CHANCE"])
 
-    def _error(self, call: Call) -> int | None:  # type: ignore[override]
+    def _error(self, call: OsCall) -> int | None:  # type: ignore[override]
         if self.dice.random() > self.chance:
             return None
         return self.dice.choice(ERRORS[call.operation])

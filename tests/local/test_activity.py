@@ -11,7 +11,7 @@ from rich.console import Console
 
 from local.activity.log import ActivityLog
 from local.activity.server_logs import WatchedServer
-from local.backend.task_record import Task, folder_of
+from local.backend.task_record import TaskRecord, folder_of
 from local.backend.tasks import ProcessTasks
 from protocol.keys import answer_key, session_key
 from protocol.session import Member, Session
@@ -26,7 +26,9 @@ def answer(data: Path, user_id: str, step: str) -> None:
 
 
 def watched(data: Path, owner: str) -> WatchedServer:
-    task = Task("name-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder=folder_of("study", owner))
+    task = TaskRecord(
+        "name-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder=folder_of("study", owner)
+    )
     return WatchedServer(task, data, data / "log", anew=True)
 
 
@@ -75,10 +77,10 @@ def test_the_terminal_names_who_has_played(tmp_path: Path, owner: str) -> None:
 class Running:
     """Stands for the processes' tasks."""
 
-    def __init__(self, *tasks: Task) -> None:
+    def __init__(self, *tasks: TaskRecord) -> None:
         self.tasks = tasks
 
-    def playing(self) -> tuple[Task, ...]:
+    def playing(self) -> tuple[TaskRecord, ...]:
         return self.tasks
 
     def log(self, name: str) -> Path:
@@ -88,7 +90,7 @@ class Running:
 def test_a_game_on_a_warm_server_that_is_over_by_the_next_look_is_told(tmp_path: Path) -> None:
     text = io.StringIO()
     log = ActivityLog(Console(file=text, width=200))
-    warm = Task("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
+    warm = TaskRecord("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
     given = replace(warm, folder=folder_of("study", "P1"))
     answer(tmp_path, "P1", "1")
     record = {"projectId": "study", "userId": "P1", "attempt": 1, "state": "starting", "nonce": "n", "spare": "warm-1"}

@@ -20,11 +20,11 @@ from pathlib import Path
 import pytest
 
 from testing import exploration
-from testing.os_faults import ERRORS, KILLS, Call, OsFault, Reach
+from testing.os_faults import ERRORS, KILLS, OsCall, OsFault, OsReach
 from tests.local.faulty_study import JOURNEYS, FaultyStudy, Stranded, run
 
 SEED, SAMPLE = 9, 5
-ELSEWHERE = OsFault(Call("link", ""), 0, Reach.EVER, errno.EXDEV)
+ELSEWHERE = OsFault(OsCall("link", ""), 0, OsReach.EVER, errno.EXDEV)
 
 
 def points(study: FaultyStudy) -> Iterator[OsFault]:
@@ -34,9 +34,9 @@ def points(study: FaultyStudy) -> Iterator[OsFault]:
         looks = call.operation in ("stat", "process", "list", "read", "open")
         for number in {1} if looks else {1, count}:
             for error in ERRORS[call.operation]:
-                yield OsFault(call, number, Reach.SPELL, error)
+                yield OsFault(call, number, OsReach.SPELL, error)
                 if not looks:
-                    yield OsFault(call, number, Reach.ONCE, error)
+                    yield OsFault(call, number, OsReach.ONCE, error)
             if not looks:
                 for reach in KILLS:
                     yield OsFault(call, number, reach)
@@ -86,7 +86,7 @@ def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
 
 def one_each(faults: list[OsFault], turn: int) -> list[OsFault]:
     """Of each kind of call one fault: another one in each journey, and for each place."""
-    kinds: dict[Call, list[OsFault]] = {}
+    kinds: dict[OsCall, list[OsFault]] = {}
     for fault in faults:
         kinds.setdefault(fault.call, []).append(fault)
     return [of_it[(turn + number) % len(of_it)] for number, of_it in enumerate(kinds.values())]

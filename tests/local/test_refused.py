@@ -28,7 +28,7 @@ from local.backend.retry import Retry
 from local.backend.timers import FolderTimers
 from local.publish import publish
 from local.watch import Watch
-from testing.os_faults import Call, OsFault, OsFaultInjector, Reach
+from testing.os_faults import OsCall, OsFault, OsFaultInjector, OsReach
 from testing.waiting import until
 from tests.local.backend.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture
 from tests.local.conftest import write_study
@@ -52,11 +52,11 @@ def refusing(tmp_path: Path) -> Iterator[Callable[..., OsFaultInjector]]:
     with injector.installed():
 
         def begin(
-            operation: str, place: str, number: int = 1, reach: Reach = Reach.ONCE, error: int = errno.EMFILE
+            operation: str, place: str, number: int = 1, reach: OsReach = OsReach.ONCE, error: int = errno.EMFILE
         ) -> OsFaultInjector:
             injector.calls.clear()
             injector.struck = 0
-            injector.fault = OsFault(Call(operation, place), number, reach, error)
+            injector.fault = OsFault(OsCall(operation, place), number, reach, error)
             return injector
 
         yield begin
@@ -131,10 +131,10 @@ def test_names_that_cannot_be_read_are_not_overwritten(
 
 
 @pytest.mark.parametrize(
-    "call", [Call("list", "data"), Call("stat", "data/_servers"), Call("open", "data/project_master_list.json")]
+    "call", [OsCall("list", "data"), OsCall("stat", "data/_servers"), OsCall("open", "data/project_master_list.json")]
 )
 def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
-    tmp_path: Path, refusing: Callable[..., OsFaultInjector], call: Call
+    tmp_path: Path, refusing: Callable[..., OsFaultInjector], call: OsCall
 ) -> None:
     told: list[str] = []
     others = set(threading.enumerate())
@@ -144,7 +144,7 @@ def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
     platform.start()
     try:
         time.sleep(0.2)
-        injector = refusing(*call, reach=Reach.SPELL, error=errno.EIO)
+        injector = refusing(*call, reach=OsReach.SPELL, error=errno.EIO)
         until(lambda: injector.struck)
         until(lambda: [line for line in told if "Input/output error" in line])
         time.sleep(0.6)  # longer than the spell, and some looks
@@ -171,7 +171,7 @@ def test_files_of_a_project_that_cannot_be_seen_are_not_gone(
     )
     watch.start()
     try:
-        injector = refusing("list", "study/steps", reach=Reach.SPELL)
+        injector = refusing("list", "study/steps", reach=OsReach.SPELL)
         until(lambda: injector.struck)
         time.sleep(0.6)
         assert not [line for line in told if "gone" in line or "changed" in line]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from testing.ministack.world import World, find_venv, fits
+from testing.ministack.world import MinistackWorld, find_venv, fits
 
-_worlds: list[World] = []
+_worlds: list[MinistackWorld] = []
 
 
 def emulated() -> Path:
@@ -30,9 +30,9 @@ def emulated() -> Path:
 
 
 @pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MinistackWorld]:
     """The account, with a hosted zone and nothing else."""
-    with World(emulated(), tmp_path_factory.mktemp("ministack")) as made:
+    with MinistackWorld(emulated(), tmp_path_factory.mktemp("ministack")) as made:
         _worlds.append(made)
         yield made
         _worlds.clear()

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from testing.ministack.world import REGION, ROOT, World
+from testing.ministack.world import REGION, ROOT, MinistackWorld
 from tests.certificate import pebble
 from tests.certificate.nameserver import answering
 
@@ -26,7 +26,7 @@ QUESTION = "type the stack's name:"
 class Newcomer:
     """`types` runs a line in the shell, in the clone. `internet` is what DNS says, by name and type of record."""
 
-    world: World
+    world: MinistackWorld
     folder: Path
     env: dict[str, str]
     internet: dict[tuple[str, str], Sequence[str]]
@@ -55,7 +55,7 @@ class Newcomer:
 
 
 @contextlib.contextmanager
-def arrived(world: World, home: Path) -> Iterator[Newcomer]:
+def arrived(world: MinistackWorld, home: Path) -> Iterator[Newcomer]:
     """With a hosted zone for `DOMAIN`, an administrator's keys, and nothing else."""
     made = world.client("route53").create_hosted_zone(Name=f"{DOMAIN}.", CallerReference="newcomer")
     servers = [f"{name.rstrip('.')}." for name in made["DelegationSet"]["NameServers"]]
@@ -99,7 +99,7 @@ def arrived(world: World, home: Path) -> Iterator[Newcomer]:
 
 
 def _clone(folder: Path) -> None:
-    """What `World` has not copied, and a virtual environment whose Python has the bridge."""
+    """What `MinistackWorld` has not copied, and a virtual environment whose Python has the bridge."""
     for name in ("Makefile", ".dockerignore"):
         shutil.copy(ROOT / name, folder)
     bin = folder / ".venv" / "bin"

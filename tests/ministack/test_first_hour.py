@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from testing.ministack.world import World
+from testing.ministack.world import MinistackWorld
 from tests import first_hour
 from tests.certificate import pebble
 from tests.ministack.conftest import emulated
@@ -34,7 +34,7 @@ def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Newcomer]:
         pytest.skip(pebble.MISSING)
     home = tmp_path_factory.mktemp("newcomer")
     (home / "world").mkdir()
-    with World(emulated(), home / "world") as world, arrived(world, home / "arrived") as somebody:
+    with MinistackWorld(emulated(), home / "world") as world, arrived(world, home / "arrived") as somebody:
         yield somebody
 
 

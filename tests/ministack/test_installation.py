@@ -25,7 +25,16 @@ from hippodrome.storage.project_cache import FRESH
 from hippodrome.storage.secret import KEY
 from protocol.session import member_token
 from testing import derived
-from testing.ministack.world import ACCOUNT, DOMAIN, FUNCTIONS, REGION, Installation, Ran, World, until
+from testing.ministack.world import (
+    ACCOUNT,
+    DOMAIN,
+    FUNCTIONS,
+    REGION,
+    CommandRun,
+    MinistackInstallation,
+    MinistackWorld,
+    until,
+)
 from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Member, Person, Trial, trial_done, write_project
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
@@ -72,11 +81,11 @@ def server_of(user: str, attempt: int = 1) -> str:
 @dataclass
 class Applied:
     before: dict[str, list[str]]
-    ran: Ran
+    ran: CommandRun
 
 
 @pytest.fixture(scope="session")
-def applied(world: World) -> Applied:
+def applied(world: MinistackWorld) -> Applied:
     before = world.inventory()
     # Gap: the emulator has no name servers, so wherever the tests can ask DNS the domain is not delegated.
     return Applied(
@@ -85,12 +94,12 @@ def applied(world: World) -> Applied:
 
 
 @pytest.fixture(scope="session")
-def installed(world: World, applied: Applied) -> Installation:
+def installed(world: MinistackWorld, applied: Applied) -> MinistackInstallation:
     assert applied.ran.code == 0, applied.ran.err
-    return Installation(world)
+    return MinistackInstallation(world)
 
 
-def test_apply_makes_everything(world: World, applied: Applied, installed: Installation) -> None:
+def test_apply_makes_everything(world: MinistackWorld, applied: Applied, installed: MinistackInstallation) -> None:
     assert installed.status == "CREATE_COMPLETE"
     assert {name: value for name in OUTPUTS if not (value := installed.outputs.get(name))} == {}
     assert installed.outputs["Site"] == f"https://study.{DOMAIN}"
@@ -102,7 +111,7 @@ def test_apply_makes_everything(world: World, applied: Applied, installed: Insta
     assert len({f["Role"] for f in functions}) == len(FUNCTIONS), "each has a role of its own"
 
 
-def test_a_second_apply_changes_nothing(world: World, installed: Installation) -> None:
+def test_a_second_apply_changes_nothing(world: MinistackWorld, installed: MinistackInstallation) -> None:
     before = events(world)
     objects = world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"]
     again = world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes")
@@ -111,13 +120,13 @@ def test_a_second_apply_changes_nothing(world: World, installed: Installation) -
     assert world.client("s3").list_objects_v2(Bucket=code_bucket(world))["Contents"] == objects
 
 
-def events(world: World, stack: str = "hippodrome") -> dict[str, str]:
+def events(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
     """What CloudFormation has done to a stack: the types of resources, by the events' ids."""
     pages = world.client("cloudformation").get_paginator("describe_stack_events").paginate(StackName=stack)
     return {event["EventId"]: event["ResourceType"] for page in pages for event in page["StackEvents"]}
 
 
-def code_bucket(world: World, stack: str = "hippodrome") -> str:
+def code_bucket(world: MinistackWorld, stack: str = "hippodrome") -> str:
     (found,) = [b for b in world.inventory()["buckets"] if b.startswith(f"{stack}-code-")]
     return found
 
@@ -126,25 +135,29 @@ def code_bucket(world: World, stack: str = "hippodrome") -> str:
 
 
 @pytest.fixture(scope="session")
-def researcher(world: World, installed: Installation) -> dict[str, str]:
+def researcher(world: MinistackWorld, installed: MinistackInstallation) -> dict[str, str]:
     """The keys of somebody who has nothing but the stack's ResearcherPolicy."""
     return world.user("researcher", installed.outputs["ResearcherPolicy"])
 
 
 @pytest.fixture(scope="session")
-def registered(world: World, researcher: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Ran:
+def registered(
+    world: MinistackWorld, researcher: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> CommandRun:
     """The tiny study, registered by the researcher."""
     folder = write_project(tmp_path_factory.mktemp("study") / "tiny")
     return world.deploy("register", str(folder), "--build-on-aws", "--json", keys=researcher)
 
 
 @pytest.fixture(scope="session")
-def study(registered: Ran) -> dict[str, Any]:
+def study(registered: CommandRun) -> dict[str, Any]:
     assert registered.code == 0, registered.err
     return dict(json.loads(registered.out))
 
 
-def test_a_researcher_registers_a_study(world: World, installed: Installation, study: dict[str, Any]) -> None:
+def test_a_researcher_registers_a_study(
+    world: MinistackWorld, installed: MinistackInstallation, study: dict[str, Any]
+) -> None:
     assert study["link"] == f"https://study.{DOMAIN}/next?projectId={PROJECT}"
     bundles = world.client("s3").list_objects_v2(Bucket=installed.bucket, Prefix="_builds/")["Contents"]
     assert [one["Key"] for one in bundles if one["Key"].endswith(".zip")]
@@ -168,7 +181,7 @@ class People:
 
 
 @pytest.fixture(scope="session")
-def people(installed: Installation, study: dict[str, Any]) -> Iterator[People]:
+def people(installed: MinistackInstallation, study: dict[str, Any]) -> Iterator[People]:
     with installed.browser() as browser:
         alice, bob, carol = (Person(browser, f"R_{name}") for name in ("alice", "bob", "carol"))
         alice.to_the_game(SECRET_WORD)
@@ -181,7 +194,7 @@ def people(installed: Installation, study: dict[str, Any]) -> Iterator[People]:
         yield People(alice, bob, carol, addresses)
 
 
-def fires_in(installed: Installation, name: str, seconds: int) -> None:
+def fires_in(installed: MinistackInstallation, name: str, seconds: int) -> None:
     """Let a timer fire so long from now, and change nothing else about it."""
     scheduler = installed.world.client("scheduler")
     found = scheduler.get_schedule(GroupName=installed.outputs["ScheduleGroup"], Name=name)
@@ -200,7 +213,9 @@ def fires_in(installed: Installation, name: str, seconds: int) -> None:
     )
 
 
-def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(installed: Installation, people: People) -> None:
+def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(
+    installed: MinistackInstallation, people: People
+) -> None:
     alice = people.alice
     assert "Play" in alice.look() or alice.at == GAME
     stored = {key: installed.stored(f"{PROJECT}/users/{alice.user}/answers/{key}.json")["answers"] for key in "12"}
@@ -218,19 +233,19 @@ def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(installed: I
         (f"/steps/{PROJECT}/../users/R_alice/answers/1.json", 404),
     ],
 )
-def test_what_is_not_there_is_refused(installed: Installation, people: People, path: str, status: int) -> None:
+def test_what_is_not_there_is_refused(installed: MinistackInstallation, people: People, path: str, status: int) -> None:
     found = people.alice.browser.get(path)
     assert found.status_code == status, found.text
     assert SECRET_WORD not in found.text
 
 
-def test_a_ticket_of_ones_own_is_needed_to_answer(installed: Installation, people: People) -> None:
+def test_a_ticket_of_ones_own_is_needed_to_answer(installed: MinistackInstallation, people: People) -> None:
     forged = {"hippodrome-step": AFTER, "hippodrome-ticket": "0" * 32, "fun": "1"}
     people.alice.browser.post(people.alice.link, data=forged)
     assert installed.stored(f"{PROJECT}/users/{people.alice.user}/answers/{AFTER}.json") is None
 
 
-def test_start_runs_one_task_with_its_shutdown_timer(installed: Installation, people: People) -> None:
+def test_start_runs_one_task_with_its_shutdown_timer(installed: MinistackInstallation, people: People) -> None:
     tasks = installed.tasks()
     assert set(tasks) == {server_of("R_alice"), server_of("R_bob")}
     task = tasks[server_of("R_alice")]
@@ -247,7 +262,7 @@ def test_start_runs_one_task_with_its_shutdown_timer(installed: Installation, pe
     assert abs(at - datetime.now(UTC) - timedelta(minutes=10)) < timedelta(minutes=3)  # maxRuntime of the study
 
 
-def test_the_same_start_message_again_starts_nothing(installed: Installation, people: People) -> None:
+def test_the_same_start_message_again_starts_nothing(installed: MinistackInstallation, people: People) -> None:
     message = {"projectId": PROJECT, "userId": "R_alice", "attempt": 1}
     world = installed.world
     world.client("sns").publish(TopicArn=installed.outputs["StartServerTopic"], Message=json.dumps(message))
@@ -258,7 +273,7 @@ def test_the_same_start_message_again_starts_nothing(installed: Installation, pe
 # -- queues, alarms ---------------------------------------------------------------------------------------------------
 
 
-def test_a_message_that_always_fails_ends_among_the_dead(installed: Installation, people: People) -> None:
+def test_a_message_that_always_fails_ends_among_the_dead(installed: MinistackInstallation, people: People) -> None:
     world, carol = installed.world, people.carol
     queue, dead = installed.queue("start_server"), installed.queue("start_server", dead=True)
     # Only the time between two deliveries is shortened; how often it is delivered stays as the template says.
@@ -277,7 +292,7 @@ def test_a_message_that_always_fails_ends_among_the_dead(installed: Installation
     world.client("s3").delete_object(Bucket=installed.bucket, Key=server.key(label(carol.user)))
 
 
-def alarms(installed: Installation, namespace: str, metric: str, dimension: str) -> dict[str, dict[str, Any]]:
+def alarms(installed: MinistackInstallation, namespace: str, metric: str, dimension: str) -> dict[str, dict[str, Any]]:
     """The alarms on a metric, by the value of a dimension."""
     found = installed.world.client("cloudwatch").describe_alarms()["MetricAlarms"]
     return {
@@ -289,7 +304,7 @@ def alarms(installed: Installation, namespace: str, metric: str, dimension: str)
     }
 
 
-def test_the_dead_and_errors_raise_alarms_that_reach_somebody(installed: Installation) -> None:
+def test_the_dead_and_errors_raise_alarms_that_reach_somebody(installed: MinistackInstallation) -> None:
     world, topic = installed.world, installed.outputs["Alarms"]
     about_queues = alarms(installed, "AWS/SQS", "ApproximateNumberOfMessagesVisible", "QueueName")
     for function in ("start_server", "stop_server", "task_changed"):
@@ -329,7 +344,7 @@ def test_the_dead_and_errors_raise_alarms_that_reach_somebody(installed: Install
 Call = tuple[str, str, dict[str, Any]]  # service, operation, arguments
 
 
-def refused(installed: Installation, role: str, call: Call) -> bool:
+def refused(installed: MinistackInstallation, role: str, call: Call) -> bool:
     """Whether whoever has this role is refused the call."""
     service, operation, arguments = call
     keys = installed.world.assume(role, TRESPASSER)
@@ -342,7 +357,7 @@ def refused(installed: Installation, role: str, call: Call) -> bool:
     return False
 
 
-def calls(installed: Installation) -> dict[str, Call]:
+def calls(installed: MinistackInstallation) -> dict[str, Call]:
     """Calls that some of the functions may make, and others not."""
     out, bucket = installed.outputs, installed.bucket
     network = {"subnets": out["Subnets"].split(","), "securityGroups": [out["SecurityGroup"]]}
@@ -410,7 +425,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("who", REFUSALS)
-def test_each_role_refuses_what_is_its_neighbours(installed: Installation, people: People, who: str) -> None:
+def test_each_role_refuses_what_is_its_neighbours(installed: MinistackInstallation, people: People, who: str) -> None:
     role = installed.outputs[who] if who in installed.outputs else installed.role(who)
     known = calls(installed)
     allowed = [what for what in (*REFUSALS[who], *EVERYBODY) if not refused(installed, role, known[what])]
@@ -438,7 +453,7 @@ SERVICES: list[tuple[str, list[str], str]] = [
 
 @pytest.mark.parametrize(("who", "actions", "what"), SERVICES, ids=[f"{who}-{what}" for who, _, what in SERVICES])
 def test_services_may_do_with_our_roles_what_they_do(
-    installed: Installation, who: str, actions: list[str], what: str
+    installed: MinistackInstallation, who: str, actions: list[str], what: str
 ) -> None:
     iam, mine = installed.world.client("iam"), resource(installed, what)
     asked = iam.simulate_principal_policy(
@@ -457,14 +472,14 @@ def test_services_may_do_with_our_roles_what_they_do(
     assert {r["EvalDecision"] for r in asked["EvaluationResults"]} == {"implicitDeny"}
 
 
-def role_of(installed: Installation, who: str) -> str:
+def role_of(installed: MinistackInstallation, who: str) -> str:
     if who == "ImageBuilder":
         names = [installed.outputs["ImageBuilder"]]
         return str(installed.world.client("codebuild").batch_get_projects(names=names)["projects"][0]["serviceRole"])
     return installed.outputs[who] if who in installed.outputs else installed.role(who)
 
 
-def resource(installed: Installation, what: str) -> str:
+def resource(installed: MinistackInstallation, what: str) -> str:
     """The ARN of a thing of the stack."""
     kind, _, name = what.partition(":")
     place = f"{REGION}:{ACCOUNT}"
@@ -479,7 +494,7 @@ def resource(installed: Installation, what: str) -> str:
     }.get(what) or installed.outputs[what]
 
 
-def test_roles_allow_what_is_their_own(installed: Installation, people: People) -> None:
+def test_roles_allow_what_is_their_own(installed: MinistackInstallation, people: People) -> None:
     """The other side of the refusals: were everything refused to everybody, they would prove nothing."""
     known = calls(installed)
     assert not refused(installed, installed.role("next_step"), known["write an answer"])
@@ -494,7 +509,7 @@ def test_roles_allow_what_is_their_own(installed: Installation, people: People) 
 # -- ready, done, stopped ---------------------------------------------------------------------------------------------
 
 
-def test_a_running_server_is_named_and_alice_is_told_where(installed: Installation, people: People) -> None:
+def test_a_running_server_is_named_and_alice_is_told_where(installed: MinistackInstallation, people: People) -> None:
     name = server_of("R_alice")
     until(
         lambda: installed.names().get(f"{name}.servers.{DOMAIN}") == people.addresses[name],
@@ -507,7 +522,7 @@ def test_a_running_server_is_named_and_alice_is_told_where(installed: Installati
     assert told["token"] == environment["TOKEN"]
 
 
-def test_the_relays_ask_for_a_proof(installed: Installation, people: People) -> None:
+def test_the_relays_ask_for_a_proof(installed: MinistackInstallation, people: People) -> None:
     browser, alice = people.alice.browser, people.alice
     where = f"projectId={PROJECT}&userId={alice.user}"
     assert browser.post(f"/stop?{where}", json={"token": "guessed"}).status_code == 403
@@ -519,7 +534,7 @@ def test_the_relays_ask_for_a_proof(installed: Installation, people: People) -> 
     assert len(installed.tasks()) <= 2
 
 
-def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, people: People) -> None:
+def test_a_forgotten_server_is_stopped_by_its_timer(installed: MinistackInstallation, people: People) -> None:
     name = server_of("R_bob")
     until(lambda: name in installed.tasks("STOPPED"), "the timer fires into the stop topic, and the task is stopped")
     until(lambda: installed.stored(server.key(label("R_bob")))["state"] == "closed", "the record is closed")
@@ -530,7 +545,9 @@ def test_a_forgotten_server_is_stopped_by_its_timer(installed: Installation, peo
     assert (told["state"], told["again"]) == ("ended", True)
 
 
-def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: Installation, people: People) -> None:
+def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(
+    installed: MinistackInstallation, people: People
+) -> None:
     alice, name = people.alice, server_of("R_alice")
     trial = Trial(alice.browser, installed.tasks()[name])
     folder = f"{PROJECT}/users/{alice.user}"
@@ -554,12 +571,12 @@ def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(installed: 
     assert code in alice.page
 
 
-def keep_warm(installed: Installation, number: int) -> None:
+def keep_warm(installed: MinistackInstallation, number: int) -> None:
     """Register the study once more, with so many warm servers."""
     register_again(installed, warmServers=number)
 
 
-def register_again(installed: Installation, **changes: Any) -> None:
+def register_again(installed: MinistackInstallation, **changes: Any) -> None:
     """Register the study once more, with changes."""
     (entry,) = installed.stored("project_master_list.json")["projects"]
     registration = {key: value for key, value in entry.items() if key not in {"salt", "version"}}
@@ -567,7 +584,9 @@ def register_again(installed: Installation, **changes: Any) -> None:
     assert answer.get("registered") == PROJECT, answer
 
 
-def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: Installation, people: People) -> None:
+def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(
+    installed: MinistackInstallation, people: People
+) -> None:
     keep_warm(installed, 1)
     (name, task) = until(lambda: [*installed.tasks().items()], "a server is started for nobody")[0]
     environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
@@ -601,7 +620,7 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(installed: I
     assert "spares" not in installed.stored(pool)
 
 
-def test_a_pair_has_one_server_and_each_an_answer(installed: Installation, people: People) -> None:
+def test_a_pair_has_one_server_and_each_an_answer(installed: MinistackInstallation, people: People) -> None:
     registration = installed.stored("project_master_list.json")["projects"][0]
     trial_of_two = {**registration["trial"], "players": {"first_0": "human", "second_0": "human"}}
     register_again(installed, players=2, trial=trial_of_two)
@@ -646,7 +665,7 @@ def test_a_pair_has_one_server_and_each_an_answer(installed: Installation, peopl
 
 
 def test_the_researcher_can_look_at_everything_of_the_study(
-    world: World, researcher: dict[str, str], people: People, tmp_path: Path
+    world: MinistackWorld, researcher: dict[str, str], people: People, tmp_path: Path
 ) -> None:
     status = world.deploy("status", "--project", PROJECT, "--json", keys=researcher)
     assert status.code == 0, status.err
@@ -662,7 +681,7 @@ def test_the_researcher_can_look_at_everything_of_the_study(
     assert {row["2.word"] for row in rows} - {""} == {SECRET_WORD, "tea"}
 
 
-def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Installation, people: People) -> None:
+def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: MinistackInstallation, people: People) -> None:
     world, out = installed.world, installed.outputs
     ours, theirs = server_of("R_alice"), "s" + "a" * 20 + "-1"
     record = [
@@ -688,7 +707,7 @@ def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Install
     assert not any(n for what, n in installed.invoke("sweep", {}).items() if what in {"tasks", "names"})
 
 
-def test_sweep_and_certificate_have_their_timers(installed: Installation) -> None:
+def test_sweep_and_certificate_have_their_timers(installed: MinistackInstallation) -> None:
     bus, arns = installed.world.client("events"), {}
     for rule in bus.list_rules()["Rules"]:
         for target in bus.list_targets_by_rule(Rule=rule["Name"])["Targets"]:
@@ -700,7 +719,9 @@ def test_sweep_and_certificate_have_their_timers(installed: Installation) -> Non
     assert arns[installed.function("renew_certificate")].startswith(("rate(", "cron("))
 
 
-def test_all_functions_ran_with_their_own_roles_and_were_never_refused(installed: Installation, people: People) -> None:
+def test_all_functions_ran_with_their_own_roles_and_were_never_refused(
+    installed: MinistackInstallation, people: People
+) -> None:
     world = installed.world
     made = {one["who"].rpartition("/")[2] for one in world.decisions(":assumed-role/")}
     worked = [name for name in FUNCTIONS if name != "renew_certificate"]  # it has no certificate authority here
@@ -710,7 +731,7 @@ def test_all_functions_ran_with_their_own_roles_and_were_never_refused(installed
     assert [one for one in denied if one["action"] != "logs:DescribeLogGroups"] == []
 
 
-def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: Installation, people: People) -> None:
+def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: MinistackInstallation, people: People) -> None:
     logs = installed.world.client("logs")
     kept = installed.stored(KEY)
     text = json.dumps(kept).encode()
@@ -732,19 +753,21 @@ def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: Installation, peop
 # -- update, a neighbour, away again --------------------------------------------------------------------------------
 
 
-def functions(world: World, stack: str = "hippodrome") -> dict[str, str]:
+def functions(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
     """The functions' code, by name."""
     found = world.client("lambda").list_functions()["Functions"]
     return {f["FunctionName"]: f["CodeSha256"] for f in found if f["FunctionName"].startswith(f"{stack}-")}
 
 
-def things(world: World, stack: str = "hippodrome") -> dict[str, str]:
+def things(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
     """What the stack is made of: physical ids by logical ids."""
     pages = world.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=stack)
     return {one["LogicalResourceId"]: one["PhysicalResourceId"] for p in pages for one in p["StackResourceSummaries"]}
 
 
-def test_an_update_changes_only_what_differs(world: World, installed: Installation, people: People) -> None:
+def test_an_update_changes_only_what_differs(
+    world: MinistackWorld, installed: MinistackInstallation, people: People
+) -> None:
     before, objects = functions(world), world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"]
     source = world.source / "lambdas" / "sweep.py"
     source.write_text(source.read_text() + "\n# changed by a test\n")
@@ -759,7 +782,7 @@ def test_an_update_changes_only_what_differs(world: World, installed: Installati
     assert {name for name in after if after[name] != before[name]} == {installed.function("sweep")}
     retention = {g["retentionInDays"] for g in world.client("logs").describe_log_groups()["logGroups"]}
     assert retention == {30}
-    assert Installation(world).status == "UPDATE_COMPLETE"
+    assert MinistackInstallation(world).status == "UPDATE_COMPLETE"
     assert world.client("s3").list_objects_v2(Bucket=installed.bucket)["KeyCount"] == objects
     assert people.alice.look(), "the study goes on"
 
@@ -779,7 +802,7 @@ Outputs:
 
 
 def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
-    world: World, installed: Installation, people: People
+    world: MinistackWorld, installed: MinistackInstallation, people: People
 ) -> None:
     before, code = things(world), functions(world)
     template = world.source / "infra" / "template.yml"
@@ -790,7 +813,7 @@ def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
     assert "Broken" in failed.err
     assert "metric math" in failed.err
     assert "Traceback" not in failed.err
-    assert Installation(world).status == "UPDATE_ROLLBACK_COMPLETE"
+    assert MinistackInstallation(world).status == "UPDATE_ROLLBACK_COMPLETE"
     assert (things(world), functions(world)) == (before, code)
     people.alice.look()
     template.write_text(sound)
@@ -799,14 +822,14 @@ def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
     assert json.loads(again.out)["changed"] is False
 
 
-def test_two_installations_live_side_by_side(world: World, installed: Installation) -> None:
-    before, status = world.inventory(), Installation(world).status
+def test_two_installations_live_side_by_side(world: MinistackWorld, installed: MinistackInstallation) -> None:
+    before, status = world.inventory(), MinistackInstallation(world).status
     made = world.deploy("apply", "--domain", f"second.{DOMAIN}", "--yes", "--anyway", stack="second")
     assert made.code == 0, made.err
-    second = Installation(world, "second")
+    second = MinistackInstallation(world, "second")
     assert second.outputs["Site"] == f"https://study.second.{DOMAIN}"
     assert second.bucket != installed.bucket
-    assert Installation(world).status == status
+    assert MinistackInstallation(world).status == status
     known = calls(installed)
     theirs = world.client("lambda").get_function_configuration(FunctionName=second.function("start_server"))["Role"]
     assert refused(installed, theirs, known["run a server"]), "a role of one stack has no say in the other"
@@ -815,7 +838,9 @@ def test_two_installations_live_side_by_side(world: World, installed: Installati
     assert world.inventory() == before
 
 
-def test_destroy_leaves_nothing(world: World, applied: Applied, installed: Installation, people: People) -> None:
+def test_destroy_leaves_nothing(
+    world: MinistackWorld, applied: Applied, installed: MinistackInstallation, people: People
+) -> None:
     installed.remove_interfaces()
     ran = world.deploy("destroy", "--data", "--yes")
     assert ran.code == 0, ran.err

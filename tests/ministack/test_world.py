@@ -11,15 +11,15 @@ from pathlib import Path
 import botocore.exceptions
 import pytest
 
-from testing.ministack.world import ROOT, World, until
+from testing.ministack.world import ROOT, MinistackWorld, until
 
 pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(120)]
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from testing.ministack.world import World
-with World(Path(sys.argv[1]), Path(sys.argv[2])) as world:
+from testing.ministack.world import MinistackWorld
+with MinistackWorld(Path(sys.argv[1]), Path(sys.argv[2])) as world:
     print(world._process.pid, flush=True)
     time.sleep(100)
 """
@@ -33,7 +33,7 @@ def is_alive(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes as Linux shows them")
-def test_the_emulator_ends_when_the_tests_are_killed(world: World, tmp_path: Path) -> None:
+def test_the_emulator_ends_when_the_tests_are_killed(world: MinistackWorld, tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(world.venv), str(tmp_path)]
     with subprocess.Popen(
         command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE
@@ -45,7 +45,7 @@ def test_the_emulator_ends_when_the_tests_are_killed(world: World, tmp_path: Pat
     until(lambda: not is_alive(emulator), "the emulator is gone")
 
 
-def test_who_calls_is_checked(world: World) -> None:
+def test_who_calls_is_checked(world: MinistackWorld) -> None:
     assert world.client("sts").get_caller_identity()["Arn"].endswith(":root")
     stranger = {"AccessKeyId": "AKIASTRANGERSTRANGER", "SecretAccessKey": "guessed"}
     with pytest.raises(botocore.exceptions.ClientError, match="InvalidAccessKeyId"):

@@ -37,7 +37,7 @@ from trial.recordings.recorder import Recorder
 from trial.recordings.spool import Spool
 from trial.recordings.store import FolderStore
 from trial.server import assignment
-from trial.settings import Settings, SettingsError, trial_section
+from trial.settings import SettingsError, TrialSettings, trial_section
 
 ROOT = Path(__file__).parents[2]
 VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}
@@ -64,7 +64,7 @@ def test_a_trial_reads_what_the_control_plane_has_written() -> None:
     platform = installed(study())
     found = request(platform)
     record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
-    settings = Settings.from_env(variables_of(found))
+    settings = TrialSettings.from_env(variables_of(found))
     assert (settings.project_id, settings.user_id, settings.server) == ("maze", "alice", record.name)
     assert settings.token == SecretCache(platform.documents).token(record)
     assert settings.credential == SecretCache(platform.documents).get_or_create().credential(record.name, record.nonce)
@@ -94,7 +94,7 @@ class Asked(dict[str, str]):
 
 def test_every_variable_that_either_end_names_is_in_the_protocol() -> None:
     told = Asked(variables_of(request(installed(study()))))
-    Settings.from_env(told)
+    TrialSettings.from_env(told)
     assert set(told) <= VARIABLES
     assert told.names == VARIABLES
     image = (ROOT / "infra/Dockerfile").read_text(encoding="utf-8")
@@ -153,9 +153,9 @@ def test_a_warm_server_reads_the_handover_that_was_written_for_it() -> None:
         written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
         assert parse(written.to_json()) == written
     env = {"PROJECT_ID": "maze", "SERVER": "s-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
-    waiting = Settings.from_env({**env, "SPARE": "on", "TRIAL": "{}"})
+    waiting = TrialSettings.from_env({**env, "SPARE": "on", "TRIAL": "{}"})
     own = assignment.assigned(waiting, parse(Handover("P1", 3, "a-2").to_json()))
-    assert own == Settings.from_env({**env, "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2", "TRIAL": "{}"})
+    assert own == TrialSettings.from_env({**env, "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2", "TRIAL": "{}"})
 
 
 def test_a_handover_of_an_earlier_version_is_read() -> None:
@@ -172,7 +172,7 @@ def test_the_answer_of_a_trial_is_read_and_moves_its_author_on(tmp_path: Path) -
 
     async def write() -> None:
         env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
-        settings = Settings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
+        settings = TrialSettings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
         store = FolderStore(tmp_path)
         await Recorder(settings, "3", "the-trial", store, Spool(settings, store)).save(played)
 
@@ -220,7 +220,7 @@ def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path
     platform.documents.put(answer_key("maze", "alice", "3"), DOCUMENTS[name])
     store.create(answer_key("maze", "alice", "3"), DOCUMENTS[name])
     env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
-    settings = Settings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
+    settings = TrialSettings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
     recorder = Recorder(settings, "3", "the-trial", store, Spool(settings, store))
     assert Answers(platform).read("maze", "alice", "3") == HELD.get(name, {})
     assert asyncio.run(recorder.earlier_answers()) == HELD.get(name, {})

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from protocol import keyboard, trial, trial_check
 
 
-def found(**section: Any) -> trial.Trial:
+def found(**section: Any) -> trial.TrialSection:
     checked, problems = trial_check.check(section)
     assert problems == []
     return checked

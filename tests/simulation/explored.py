@@ -6,11 +6,11 @@ import pytest
 
 from testing.exploration import sample
 from testing.simulation import faults
-from testing.simulation.faults import Journey
-from testing.simulation.world import World
+from testing.simulation.faults import SimulatedJourney
+from testing.simulation.world import SimulatedWorld
 
 
-def assert_no_fault_does_harm(journey: Journey, seed: int, tried: int | None = None) -> None:
+def assert_no_fault_does_harm(journey: SimulatedJourney, seed: int, tried: int | None = None) -> None:
     """A fault at so many of the calls, at a thirtieth without a number: each run ends well."""
     points = faults.points(journey, seed)
     assert len(points) > 100
@@ -21,8 +21,8 @@ def assert_no_fault_does_harm(journey: Journey, seed: int, tried: int | None = N
     assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
 
 
-def assert_faults_do_harm_without_repair(journey: Journey, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def assert_faults_do_harm_without_repair(journey: SimulatedJourney, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The exploration sees what it should: the same faults, without a sweep and a second delivery."""
-    monkeypatch.setattr(World, "_sweep", lambda world: None)
-    monkeypatch.setattr(World, "RECEIVES", 1)
+    monkeypatch.setattr(SimulatedWorld, "_sweep", lambda world: None)
+    monkeypatch.setattr(SimulatedWorld, "RECEIVES", 1)
     assert any(not outcome.well for outcome in faults.explore(journey, seed))

@@ -18,7 +18,7 @@ from hippodrome.http import Request, Response
 from hippodrome.model import messages
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import RECORDS, Server, State
+from hippodrome.model.server import RECORDS, Server, ServerState
 from hippodrome.participants.journey import Journey
 from hippodrome.ports import Message, Topic
 from hippodrome.servers.sweep import Sweep
@@ -116,7 +116,7 @@ class World:
     def plays_alone(self, user: str) -> bool:
         """Whether the participant has a server of their own, and no membership."""
         record = self.repository.server_of("maze", user)
-        has_server = record is not None and record.state is State.READY
+        has_server = record is not None and record.state is ServerState.READY
         return has_server and self.repository.membership("maze", user) is None
 
     def has_played(self, user: str) -> bool:
@@ -187,7 +187,7 @@ class World:
         for owner in sorted({one.server for one in self.people if one.server}):
             there = [one for one in self.people if one.server == owner]
             record = self.repository.server_of("maze", owner)
-            if record is None or record.state is not State.READY:
+            if record is None or record.state is not ServerState.READY:
                 for one in there:
                     one.server = None
                 continue

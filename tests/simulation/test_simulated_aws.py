@@ -15,12 +15,12 @@ from testing.clock import EPOCH
 from testing.simulation.assumptions import assumptions
 from testing.simulation.aws_bound import aws_alone, aws_alone_together
 from testing.simulation.clock import GreenletClock
-from testing.simulation.cloud import QUOTAS, Bucket, Cloud, Throttled
+from testing.simulation.cloud import QUOTAS, Cloud, Throttled, TokenBucket
 from testing.simulation.conditions import SLOW_FOR, Conditions, propagation
-from testing.simulation.functions import HOPS, Function, Lineage, Queue, Wire, ends, enter, lineage
+from testing.simulation.functions import HOPS, Lineage, SimulatedFunction, SimulatedQueue, Wire, ends, enter, lineage
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.ports import PAGE
-from testing.simulation.world import LOOPS, World
+from testing.simulation.world import LOOPS, SimulatedWorld
 from testing.tasks import Life
 
 VISIBILITY, RECEIVES = 90.0, 8
@@ -49,8 +49,8 @@ class Small:
             self.seen.append((self.clock.seconds, bodies))
             return act(self, bodies)
 
-        self.function = Function("one", handler, self.cloud, None, 60, loops=loops)
-        self.queue = Queue(self.function, self.clock, self.cloud, wire, RECEIVES)
+        self.function = SimulatedFunction("one", handler, self.cloud, None, 60, loops=loops)
+        self.queue = SimulatedQueue(self.function, self.clock, self.cloud, wire, RECEIVES)
 
     def again(self, message, seconds=1.0):
         self.queue.send(message, seconds, lineage())
@@ -103,7 +103,7 @@ def test_messages_that_are_sent_by_nobody_begin_a_chain():
 
 
 def test_an_event_of_ecs_begins_a_chain_also_when_a_function_has_caused_it():
-    world = World(1)
+    world = SimulatedWorld(1)
     sent = []
     world.platform.tasks.changed = lambda *sending: sent.append(sending)
     request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
@@ -163,7 +163,7 @@ def test_what_a_timer_invokes_waits_for_room():
 
 
 def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
-    world = World(1, concurrency=0)
+    world = SimulatedWorld(1, concurrency=0)
     answers = []
     world.clock.spawn(lambda: answers.append(world.ask("GET", "projectId=study&userId=a")))
     world.run(10)
@@ -175,7 +175,7 @@ def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
 
 def told(conditions, seconds=300.0):
     """The events of one task on Spot, as they come."""
-    world = World(2, conditions)
+    world = SimulatedWorld(2, conditions)
     found = []
     world.platform.tasks.changed = lambda event, delay: found.append(event["detail"])
     deadline = str(EPOCH.timestamp() + 3600)
@@ -201,7 +201,7 @@ def test_events_may_never_come():
 
 
 def test_an_address_may_be_seen_later_than_its_task():
-    world = World(3, Conditions(late_addresses=1.0, address_late=(10.0, 10.0)))
+    world = SimulatedWorld(3, Conditions(late_addresses=1.0, address_late=(10.0, 10.0)))
     tasks, found = world.platform.tasks, []
     request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
 
@@ -229,7 +229,7 @@ def test_route_53_is_slow_for_a_while_and_then_for_everybody():
 
 
 def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
-    names = World(7, Conditions(busy_zone=(0.0, 0.0))).platform.dns
+    names = SimulatedWorld(7, Conditions(busy_zone=(0.0, 0.0))).platform.dns
     batch = [DnsRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
     names.changed(add=batch)  # 800 of the 1,500
     with pytest.raises(Throttled):
@@ -241,7 +241,7 @@ def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
 
 
 def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
-    ration = Bucket(*QUOTAS["route53:changes"])
+    ration = TokenBucket(*QUOTAS["route53:changes"])
     assert ration.take(0.0, 1500)
     assert not ration.take(1.0, 101)
     assert ration.take(1.0, 100)
@@ -271,7 +271,7 @@ def mean(values):
 
 
 def test_a_change_takes_as_long_as_its_second_says():
-    world = World(7, Conditions(slow_zone=1.0))
+    world = SimulatedWorld(7, Conditions(slow_zone=1.0))
     made = []
 
     def change():
@@ -288,7 +288,7 @@ def test_a_change_takes_as_long_as_its_second_says():
 
 def of_s3(act):
     """What `act(world, documents)` returns, run as a function would."""
-    world, found = World(1), []
+    world, found = SimulatedWorld(1), []
     world.clock.spawn(lambda: found.append(act(world, world.platform.documents)))
     world.run(60)
     return found[0]
@@ -389,7 +389,7 @@ def test_each_condition_is_printed(what):
 
 
 def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():
-    world = World(5)
+    world = SimulatedWorld(5)
     world.clock.spawn(SimulatedParticipant(world, 0).walk)
     world.settle(7200)
     assert not any(world.left().values())

@@ -21,9 +21,9 @@ from protocol.session import Member as Seated
 from protocol.session import Session
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.conditions import Conditions
-from testing.simulation.members import POLL, PROPOSED_POLL, Habits, Member
+from testing.simulation.members import POLL, PROPOSED_POLL, Habits, SimulatedMember
 from testing.simulation.trials import SimTrial
-from testing.simulation.world import PROJECT, WIRES, World
+from testing.simulation.world import PROJECT, WIRES, SimulatedWorld
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
 
 SEED = 7
@@ -55,8 +55,8 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_strand_or_leave_so
 
 
 def crowd(people, seconds, conditions=None, *, project=PAIRS, habits=lambda number: Habits(), seed=SEED, **account):
-    world = World(seed, conditions, project, **account)
-    came = [Member(world, number, habits=habits(number)) for number in range(people)]
+    world = SimulatedWorld(seed, conditions, project, **account)
+    came = [SimulatedMember(world, number, habits=habits(number)) for number in range(people)]
     for person in came:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
     world.settle(2 * 3600)
@@ -161,8 +161,8 @@ def test_in_an_account_of_ten_executions_all_are_matched():
 
 
 def test_when_the_study_closes_while_they_wait_they_are_told():
-    world = World(SEED, None, PAIRS)
-    one = Member(world, 0)
+    world = SimulatedWorld(SEED, None, PAIRS)
+    one = SimulatedMember(world, 0)
     world.clock.spawn(one.walk)
     world.clock.after(90, world.close)
     world.settle(7200)

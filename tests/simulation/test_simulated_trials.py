@@ -13,7 +13,7 @@ from protocol.session import Member, Session, member_token
 from testing.clock import EPOCH
 from testing.simulation.conditions import Conditions
 from testing.simulation.trials import ABSENT, COUNTDOWN
-from testing.simulation.world import PROJECT, World
+from testing.simulation.world import PROJECT, SimulatedWorld
 from testing.tasks import Life
 
 SESSION, STEP, PLAY = "s." + 20 * "0", "3", 30.0
@@ -24,7 +24,9 @@ class Played:
     """A world with the server of one session, which runs; `at` lets things happen at a second of its run."""
 
     def __init__(self, **conditions):
-        self.world = World(1, Conditions(interrupted=0.0, **conditions), msgspec.structs.replace(PROJECT, players=2))
+        self.world = SimulatedWorld(
+            1, Conditions(interrupted=0.0, **conditions), msgspec.structs.replace(PROJECT, players=2)
+        )
         self.documents = self.world.platform.documents
         self.task = self.serve("a-1")
 

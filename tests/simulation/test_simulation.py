@@ -16,14 +16,14 @@ from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
 from testing.simulation.conditions import Conditions
 from testing.simulation.people import POLLS, SimulatedParticipant, retry_delay
-from testing.simulation.world import TIMEOUTS, WIRES, World
+from testing.simulation.world import TIMEOUTS, WIRES, SimulatedWorld
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
 
 SEED = 7
 
 
 def crowd(seed, people, seconds, conditions=None, **account):
-    world = World(seed, conditions, **account)
+    world = SimulatedWorld(seed, conditions, **account)
     arrived = [SimulatedParticipant(world, number) for number in range(people)]
     for person in arrived:
         world.clock.spawn(person.walk, delay=world.clock.random.uniform(0, seconds))
@@ -60,7 +60,7 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
 
 
 def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
-    journey = faults.Journey(
+    journey = faults.SimulatedJourney(
         "Spot takes the server back from somebody who plays for long",
         conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(120.0, 240.0)),
         person=lambda world: SimulatedParticipant(world, 0, play=600.0),
@@ -143,7 +143,7 @@ def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_serve
 
 
 def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
-    world = World(SEED)
+    world = SimulatedWorld(SEED)
     person = SimulatedParticipant(world, 0)
     slow = world.platform.documents
     create, times = slow.create, []
@@ -174,7 +174,7 @@ def test_a_fault_happens_at_the_call_it_is_meant_for():
 
 
 def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
-    world = World(SEED)
+    world = SimulatedWorld(SEED)
     person = SimulatedParticipant(world, 0, read=100.0)
     world.clock.spawn(person.walk)
     world.clock.after(20, world.close)
@@ -212,10 +212,10 @@ def test_queues_feed_the_functions_as_the_template_says():
     for name, wire in WIRES.items():
         mapping = mappings[named[name]]
         queue = queues[mapping["EventSourceArn"]["Fn::GetAtt"][0]]
-        concurrency = int(template.Account().resolve(mapping["ScalingConfig"]["MaximumConcurrency"]))
+        concurrency = int(template.ReferenceValues().resolve(mapping["ScalingConfig"]["MaximumConcurrency"]))
         window = "MaximumBatchingWindowInSeconds"
         assert wire == (mapping["BatchSize"], mapping.get(window, 0), concurrency, queue["VisibilityTimeout"])
-        assert queue["RedrivePolicy"]["maxReceiveCount"] == World.RECEIVES
+        assert queue["RedrivePolicy"]["maxReceiveCount"] == SimulatedWorld.RECEIVES
     made = template.resources("AWS::Lambda::Function")
     assert {name: made[named[name]]["Timeout"] for name in TIMEOUTS} == TIMEOUTS
 

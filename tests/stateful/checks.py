@@ -9,7 +9,7 @@ from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.model import ids
 from hippodrome.model.messages import STOP_REASON_PREFIX
 from hippodrome.model.records import from_json
-from hippodrome.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, State
+from hippodrome.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, ServerState
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 
@@ -70,7 +70,9 @@ def places_hold(world: World) -> None:
 def warm_servers_are_given_once(world: World) -> None:
     """A warm server is one participant's, for good; and the trial on it is told so."""
     plays = Counter(
-        record.warm_server_name for record in world.records() if record.warm_server_name and record.state is State.READY
+        record.warm_server_name
+        for record in world.records()
+        if record.warm_server_name and record.state is ServerState.READY
     )
     assert all(count == 1 for count in plays.values()), f"a warm server is given twice: {plays}"
     for record in world.records():
@@ -108,7 +110,7 @@ def owned(world: World, record: Server) -> None:
     account, name = world.account, world.who(record.name)
     living = [task for task in tasks_of(world, record) if task.alive]
     over = account.now() > record.deadline
-    if record.state is State.READY:
+    if record.state is ServerState.READY:
         task = account.fleet.tasks[record.task or ""]
         if task.alive:
             assert account.zone.records.get(record.dns) == record.host, f"{name} is ready and has no name"

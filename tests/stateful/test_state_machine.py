@@ -12,7 +12,7 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.model.records import from_json
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from hippodrome.servers import leftovers
 from hippodrome.servers.leftovers import Why
 from hippodrome.servers.sweep import Sweep, SweepResult
@@ -59,7 +59,7 @@ def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_can
     world.functions.go_on(world.functions.waiting[0])
     (bob,) = [record for record in world.records() if record.user_id == "bob"]
     held = from_json(world.account.kept[server_slots_key("maze")][0], ServerSlots).slots
-    assert (bob.state, bob.label in held) == (State.READY, True)
+    assert (bob.state, bob.label in held) == (ServerState.READY, True)
 
 
 MUTATIONS = {

@@ -17,7 +17,7 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import KeepWarm, StopServer, to_message
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.model.warm_pool import Pool, pool_key
 from hippodrome.ports import DnsRecord, TaskRequest
 from hippodrome.storage.secret import KEY, Secret
@@ -545,6 +545,6 @@ class World:
                 overdue = now > record.deadline + timedelta(minutes=5)
                 lost = now > record.requested + timedelta(minutes=10) and name not in self._listed
                 hopeless = now > record.requested + timedelta(minutes=20) and name not in self._run
-                hopeless = hopeless and record.state is State.STARTING
-                if not overdue and not lost and not hopeless and record.state is not State.DRAINING:
+                hopeless = hopeless and record.state is ServerState.STARTING
+                if not overdue and not lost and not hopeless and record.state is not ServerState.DRAINING:
                     self.wrong.append(f"sweep: {action} of {self.who(name)}, which is {record.state}")

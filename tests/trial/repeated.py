@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from protocol.trial import Trial as Section
+from protocol.trial import TrialSection as Section
 from trial.agent.agent import AgentAdapter
 from trial.agent.joint import JointAdapter
 from trial.agent.joint_calls import JointCalls
@@ -28,7 +28,7 @@ from trial.policies.places import load_policies
 from trial.recordings.recorder import rules
 from trial.recordings.recording import read_observation, text_of_line
 from trial.recordings.resume import add_lines
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 AGENT = '''
 import random
@@ -139,7 +139,7 @@ class Game:
             add_lines(recorded, earlier)
         self.begin(recorded)
 
-    def told(self, section: Mapping[str, Any]) -> Settings:
+    def told(self, section: Mapping[str, Any]) -> TrialSettings:
         """What the server is told."""
         return settings_of(section, USER_ID="P1")
 
@@ -202,11 +202,11 @@ class Game:
         return [line for line in self.lines if line["kind"] == "step"]
 
 
-def settings_of(section: Mapping[str, Any], **env: str) -> Settings:
+def settings_of(section: Mapping[str, Any], **env: str) -> TrialSettings:
     """The settings of a server of the study that is told this section and these variables."""
     trial = json.dumps({"game": "x", "actionSpace": SPACE, **section})
     common = {"PROJECT_ID": "study", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
-    return Settings.from_env({**common, "TRIAL": trial, **env})
+    return TrialSettings.from_env({**common, "TRIAL": trial, **env})
 
 
 def adapter(folder: Path) -> JointAdapter:

@@ -29,7 +29,7 @@ from trial.core.effects import (
 from trial.core.flow_control import Window
 from trial.core.players import Player, View
 from trial.core.trial import Trial
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 SPACE = ("noop", "up", "right")
 UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right"), True)
@@ -49,7 +49,7 @@ class SessionDriver:
         }  # fmt: skip
         sid = "s." + "0" * 20
         env = {"PROJECT_ID": "study", "USER_ID": "", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
-        settings = Settings.from_env({**env, "TLS": "off", "SESSION": sid, "TRIAL": json.dumps(section)})
+        settings = TrialSettings.from_env({**env, "TLS": "off", "SESSION": sid, "TRIAL": json.dumps(section)})
         places = {f"P{number}": name for number, name in enumerate(self.names) if name not in vacant}
         members = tuple(Member(human, None, self.names.index(name)) for human, name in places.items())
         self.settings = replace(settings, members=members, players=count)

@@ -20,7 +20,7 @@ from trial.wire import plain
 UI = {"start": True, "left": True, "reallyGood": True, "fire": True, "leftUp": True, "brightness": False}
 
 
-def config(ui: dict[str, Any], **more: Any) -> trial.Trial:
+def config(ui: dict[str, Any], **more: Any) -> trial.TrialSection:
     return trial_section({"game": "g", "ui": ui, **more})
 
 

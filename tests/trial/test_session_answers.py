@@ -30,7 +30,7 @@ from trial.recordings.recorder import Recorder
 from trial.recordings.spool import Spool
 from trial.recordings.store import FolderStore
 from trial.server import assignment
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 # ---- two game steps
 
@@ -192,7 +192,7 @@ def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_nex
 
 
 def recorder_of(tmp_path, *members):
-    settings = Settings.from_env({**ENV, "STORE": str(tmp_path), "TRIAL": json.dumps(TRIAL)})
+    settings = TrialSettings.from_env({**ENV, "STORE": str(tmp_path), "TRIAL": json.dumps(TRIAL)})
     formed = assignment.formed(settings, Session(SID, len(members), members))
     store = FolderStore(tmp_path)
     return Recorder(formed, "3", "the-trial", store, Spool(formed, store)), store

@@ -31,8 +31,8 @@ from tests.trial.sessions import (
 )
 from tests.trial.two_players import two_players
 from trial.server import assignment, handshake
-from trial.server.server import Server
-from trial.settings import Settings, SettingsError
+from trial.server.server import TrialServer
+from trial.settings import SettingsError, TrialSettings
 
 WARM = {"SESSION": "", "SPARE": "on", "SERVER": "warm-1"}
 
@@ -90,7 +90,7 @@ def test_a_member_who_comes_while_the_server_still_looks_for_old_recordings_is_n
 ):
     (tmp_path / "agent.py").write_text(two_players())
     env = {**ENV, "STORE": str(tmp_path / "store"), "AGENT_DIR": str(tmp_path), "PORT": "0", "HOST": "127.0.0.1"}
-    server, looks = Server(Settings.from_env({**env, "TRIAL": json.dumps(TRIAL)})), asyncio.Event()
+    server, looks = TrialServer(TrialSettings.from_env({**env, "TRIAL": json.dumps(TRIAL)})), asyncio.Event()
     form(tmp_path / "store")
 
     async def slowly(settings):
@@ -169,7 +169,7 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_document_that_is_no_session_of_this_server_lets_nobody_in(name):
-    settings = Settings.from_env(ENV)
+    settings = TrialSettings.from_env(ENV)
     with pytest.raises(ValueError, match="its document"):
         assignment._read(settings, BAD[name])
 
@@ -281,7 +281,7 @@ def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_
 
 
 def test_the_settings_of_a_session():
-    settings = Settings.from_env({**ENV, "USER_ID": "", "GROUP": "7", "PLAIN_ORIGINS": "https://a.example"})
+    settings = TrialSettings.from_env({**ENV, "USER_ID": "", "GROUP": "7", "PLAIN_ORIGINS": "https://a.example"})
     assert (settings.session, settings.user_id, settings.group, settings.assigned) == (SID, "", None, False)
     assert settings.plain_origins == frozenset()
     assert settings.private == ()
@@ -294,20 +294,20 @@ def test_the_settings_of_a_session():
 
 
 def test_a_handed_over_session_has_the_settings_of_a_session_that_was_started_for_it():
-    warm = Settings.from_env({**ENV, **WARM})
+    warm = TrialSettings.from_env({**ENV, **WARM})
     assert not warm.assigned
     given = assignment.assigned(warm, Handover(SID, None, "pair-1"))
-    assert given == Settings.from_env(ENV)
+    assert given == TrialSettings.from_env(ENV)
 
 
 @pytest.mark.parametrize("bad", ["s.", "s.0123456789ABCDEF0123", "anna", SID + "0", f"{SID}/.."])
 def test_a_session_that_is_none_is_refused(bad):
     with pytest.raises(SettingsError, match="SESSION"):
-        Settings.from_env({**ENV, "SESSION": bad})
+        TrialSettings.from_env({**ENV, "SESSION": bad})
 
 
 def test_without_a_session_nothing_of_it_is_there():
-    settings = Settings.from_env({**ENV, "SESSION": "", "USER_ID": "P1"})
+    settings = TrialSettings.from_env({**ENV, "SESSION": "", "USER_ID": "P1"})
     assert (settings.session, settings.members, settings.seats, settings.players) == ("", (), {}, 1)
     assert settings.assigned
     assert settings.private == ("P1",)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from trial.settings import Settings, SettingsError, trial_section
+from trial.settings import SettingsError, TrialSettings, trial_section
 
 ENV = {
     "PROJECT_ID": "p",
@@ -18,7 +18,7 @@ ENV = {
 
 
 def test_settings_from_the_environment():
-    found = Settings.from_env(
+    found = TrialSettings.from_env(
         {**ENV, "TRIAL": json.dumps({"ui": {"left": True, "up": False}, "actionSpace": ["NOOP", "Left"]})}
     )
     assert found.game_steps == ("2", "4")
@@ -26,21 +26,21 @@ def test_settings_from_the_environment():
     assert found.trial.action_space == ("noop", "left")
     assert (found.port, found.idle_seconds, found.grace_seconds, found.deadline) == (5000, 600, 60, None)
     assert "'t'" not in repr(found)
-    assert [Settings.from_env({**ENV, "GROUP": text}).group for text in ("", "0", "12")] == [None, 0, 12]
+    assert [TrialSettings.from_env({**ENV, "GROUP": text}).group for text in ("", "0", "12")] == [None, 0, 12]
 
 
 def test_trial_section_of_config_yml(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert Settings.from_env(ENV).trial == trial_section({})
+    assert TrialSettings.from_env(ENV).trial == trial_section({})
     (tmp_path / "config.yml").write_text(
         "project: {}\ntrial:\n  game: X-v1\n  maxEpisodes: 3\n  allowFramRateChange: true\n"
     )
-    found = Settings.from_env(ENV).trial
+    found = TrialSettings.from_env(ENV).trial
     assert (found.game, found.max_episodes, found.allow_frame_rate_change) == ("X-v1", 3, True)
     for text in ("trial: [1]", "trial: {maxEpisodes: none}", ": : :"):
         (tmp_path / "config.yml").write_text(text)
         with pytest.raises(SettingsError):
-            Settings.from_env(ENV)
+            TrialSettings.from_env(ENV)
 
 
 @pytest.mark.parametrize(
@@ -76,4 +76,4 @@ def test_trial_section_of_config_yml(tmp_path, monkeypatch):
 )
 def test_wrong_settings_are_refused(change):
     with pytest.raises(SettingsError):
-        Settings.from_env({**ENV, **change})
+        TrialSettings.from_env({**ENV, **change})

@@ -8,7 +8,7 @@ import pytest
 
 from trial.core.ended import Break, Episode
 from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState, Progress
+from trial.core.progress import PlayState, TrialProgress
 from trial.core.unfinished import RecordedTrial
 from trial.recordings import recording
 from trial.recordings.resume import add_lines
@@ -20,7 +20,7 @@ LONG = {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 600, "ui":
 
 
 def game_in_a_break(**keys):
-    game = Progress(trial_section({"maxEpisodes": 3, **keys}), alone(SPACE))
+    game = TrialProgress(trial_section({"maxEpisodes": 3, **keys}), alone(SPACE))
     game.start()
     game.began()
     game.act("left", True)
@@ -83,7 +83,7 @@ def test_a_reset_in_a_break_changes_nothing():
 def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
     assert game_in_a_break(maxEpisodes=1).over
     assert game_in_a_break(betweenEpisodes=0).playing
-    game = Progress(trial_section({}), alone(SPACE))
+    game = TrialProgress(trial_section({}), alone(SPACE))
     game.start()
     game.began()
     game.stepped({PLAYER: 1.0}, False, False)
@@ -93,7 +93,7 @@ def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero
 
 
 def test_a_participants_own_reset_is_followed_by_a_break_too():
-    game = Progress(trial_section({}), alone(SPACE))
+    game = TrialProgress(trial_section({}), alone(SPACE))
     game.start()
     game.began()
     game.stepped({PLAYER: 1.0}, False, False)

@@ -23,7 +23,7 @@ from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
-from testing.gym_server import SECONDS, Client
+from testing.gym_server import SECONDS, TextClient
 from testing.waiting import until
 from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
@@ -99,23 +99,23 @@ def test_the_same_over_tls(launch: Any, tmp_path: Path) -> None:
 
 def test_the_forms_of_make_gym_are_served(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with Client(url(server)) as gymie:
+    with TextClient(url(server)) as gymie:
         made = gymie.say('{"method": "make", "params": {"env_id": "CartPole-v1"}}')
         assert "{" not in made
         gymie.ask("reset", instance_id=made)
         assert len(gymie.ask("step", instance_id=made, action=1)) == 4
-    with Client(url(server) + "&form=gymnasium") as client:
+    with TextClient(url(server) + "&form=gymnasium") as client:
         made = client.ask("make", env_id="CartPole-v1")["instance_id"]
         client.ask("reset", instance_id=made)
         assert len(client.ask("step", instance_id=made, action=1)) == 5
     with pytest.raises(InvalidStatus) as refused:
-        Client(url(server) + "&form=other")
+        TextClient(url(server) + "&form=other")
     assert refused.value.response.status_code == 400
 
 
 def test_closes_pass_with_their_codes_and_words(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with Client(url(server)) as gymie, pytest.raises(ConnectionClosed) as closed:
+    with TextClient(url(server)) as gymie, pytest.raises(ConnectionClosed) as closed:
         gymie.say("[]")
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1003

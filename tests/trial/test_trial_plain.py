@@ -20,7 +20,7 @@ from trial.core.controls import Controls
 from trial.core.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
 from trial.recordings import recording
 from trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire import plain
 
 HERE = "https://play.example.org"
@@ -414,8 +414,8 @@ def test_a_warm_server_lets_nobody_in_without_the_token():
         "TLS": "off",
         "PLAIN_ORIGINS": HERE,
     }
-    assert Settings.from_env({**env, "USER_ID": "b"}).plain_origins == {HERE}
-    assert Settings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
+    assert TrialSettings.from_env({**env, "USER_ID": "b"}).plain_origins == {HERE}
+    assert TrialSettings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
 
 
 def test_a_refused_page_shows_the_sentence_and_is_not_sent_round_in_circles(launch):

@@ -11,7 +11,7 @@ from cryptography.x509.oid import NameOID
 
 from trial.recordings.store import FolderStore
 from trial.server.certificate import Certificate
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 
 def certificate(serial):
@@ -75,7 +75,7 @@ def test_a_running_server_takes_a_renewed_certificate(tmp_path):
         "STORE": "e",
         "TRIAL": "{}",
     }
-    served = Certificate(Settings.from_env({**required, **KEYS}), FolderStore(tmp_path))
+    served = Certificate(TrialSettings.from_env({**required, **KEYS}), FolderStore(tmp_path))
     assert served.load() is True
     assert served.load() is False
 

@@ -19,7 +19,7 @@ from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key
 from trial.server import assignment
 from trial.server.watchdog import Watchdog
-from trial.settings import Settings, SettingsError
+from trial.settings import SettingsError, TrialSettings
 
 WARM_SERVER, OWN = "sparesparesparespare-1", "a-1"
 UI = {"stop": True, "start": True}
@@ -251,7 +251,7 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
         async def give(settings, given):
             given_to.append(given)
 
-        search = assignment.Search(store, Settings.from_env({**ENV, "SPARE_SECONDS": "60"}))
+        search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
         searching = asyncio.create_task(search.run(give))
         async with asyncio.timeout(10):
             while not store.looks:
@@ -407,7 +407,7 @@ def test_whatever_stands_there_is_read_or_refused(body):
         found = handover.parse(body)
     except BadHandover:
         return
-    own = assignment.assigned(Settings.from_env(ENV), found)
+    own = assignment.assigned(TrialSettings.from_env(ENV), found)
     assert own.user_id or own.session
 
 
@@ -484,21 +484,21 @@ ENV = {
 
 def test_a_warm_server_needs_no_participant_and_believes_in_none():
     for more in ({}, {"USER_ID": "P1", "GROUP": "1"}, {"USER_ID": "../x", "GROUP": "x"}):
-        settings = Settings.from_env({**ENV, **more})
+        settings = TrialSettings.from_env({**ENV, **more})
         assert (settings.warm_server, settings.user_id, settings.group) == (True, "", None)
     assert settings.warm_server_seconds == 20
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
-    settings = assignment.assigned(Settings.from_env(ENV), Handover("P1", 3, "a-2"))
+    settings = assignment.assigned(TrialSettings.from_env(ENV), Handover("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
-    assert settings == Settings.from_env(ordinary)
+    assert settings == TrialSettings.from_env(ordinary)
 
 
 @pytest.mark.parametrize("change", [{"SPARE": "yes"}, {"SPARE": "off"}, {"SPARE": ""}, {"SERVER": ""}])
 def test_without_a_participant_only_a_warm_server_can_begin(change):
     with pytest.raises(SettingsError):
-        Settings.from_env({**ENV, **change})
+        TrialSettings.from_env({**ENV, **change})
 
 
 def test_the_watchdog_of_a_warm_server():

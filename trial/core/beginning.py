@@ -8,12 +8,12 @@ from trial.core.effects import Call, Effect, RecordLine, ReplayCall, Replayed, R
 from trial.core.message_log import MessageLog
 from trial.core.participants import Participants
 from trial.core.policies import Observed
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.recording import Recordings
 from trial.core.seeds import policy_seed
 from trial.core.timing import Timing
 from trial.core.unfinished import UnfinishedEpisode
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 
 class Beginning:
@@ -21,7 +21,7 @@ class Beginning:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: TrialSettings,
         *,
         timing: Timing,
         recording: Recordings,
@@ -41,7 +41,7 @@ class Beginning:
         self.begun_again: int | None = None
         """This episode begins anew, because it could not be replayed."""
 
-    def begin(self, progress: Progress, participants: Participants) -> Call | None:
+    def begin(self, progress: TrialProgress, participants: Participants) -> Call | None:
         """Return the call that begins the next episode; None if a recording must be opened first."""
         self._timing.begin_episode()  # what pages are told before the reset is the new episode's time
         unfinished = self.unfinished
@@ -51,11 +51,11 @@ class Beginning:
         self._recording.ask(progress, self._seed)
         return None
 
-    def _next_seed(self, progress: Progress) -> int:
+    def _next_seed(self, progress: TrialProgress) -> int:
         first = self._settings.trial.seed
         return self._new_seed() if first is None else first + progress.episode - 1
 
-    def opened(self, progress: Progress, participants: Participants, ns: int) -> Call:
+    def opened(self, progress: TrialProgress, participants: Participants, ns: int) -> Call:
         """Return the call that begins the episode, now that its recording is open. `ns` is the time, for messages."""
         unfinished, self.unfinished = self.unfinished, None
         if unfinished is not None and unfinished.steps:
@@ -66,12 +66,12 @@ class Beginning:
             self.repeat_feedback(unfinished, ns)
         return self._reset(progress, participants)
 
-    def begin_again(self, progress: Progress, participants: Participants) -> Call:
+    def begin_again(self, progress: TrialProgress, participants: Participants) -> Call:
         """Return the call that begins an episode anew because it could not be replayed."""
         self.begun_again = progress.episode
         return self._reset(progress, participants)
 
-    def _reset(self, progress: Progress, participants: Participants) -> Call:
+    def _reset(self, progress: TrialProgress, participants: Participants) -> Call:
         progress.choices.begins(self._seed)
         self._reset_policies(progress, {})
         return ResetCall(
@@ -82,12 +82,12 @@ class Beginning:
             fields=participants.of_reset(),
         )
 
-    def _reset_policies(self, progress: Progress, observed: Mapping[str, Sequence[Observed]]) -> None:
+    def _reset_policies(self, progress: TrialProgress, observed: Mapping[str, Sequence[Observed]]) -> None:
         for player in progress.choices.policies.asked:
             seed = policy_seed(self._seed, player.name)
             self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
 
-    def replayed(self, progress: Progress, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
+    def replayed(self, progress: TrialProgress, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
         """The episode stands where the earlier server left it."""
         steps = len(unfinished.steps)
         self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core.actions import Action
 from trial.core.controls import Controls
 from trial.core.messages import CommandRefused
@@ -26,7 +26,7 @@ NOT_POSSIBLE = "that move is not possible now"
 class Choices:
     """The choices of all players, by player. The caller says whether the game is on, and how many steps were taken."""
 
-    def __init__(self, config: Trial, players: Mapping[str, Player], humans: Sequence[str]) -> None:
+    def __init__(self, config: TrialSection, players: Mapping[str, Player], humans: Sequence[str]) -> None:
         """`players` are those of the environment, in its order; `humans` are those of them that humans play."""
         self._config = config
         self._players = players
@@ -89,7 +89,7 @@ class Choices:
     # ---- keys and buttons of humans
 
     def act(self, player: str, name: str, held: bool | None, *, lasts: bool, on: bool) -> None:
-        """As `Progress.act`, which says whether the game is `on`: played, and its first picture stands no longer."""
+        """As `TrialProgress.act`, which says whether the game is `on`: played, and past its first picture."""
         controls = self.controls[player]
         if self.turns is not None:
             if controls.knows(name) or not lasts:  # a client of HIPPO's says by another name that nothing is pressed

@@ -6,12 +6,12 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core import messages
 from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
 from trial.core.participants import Participants
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
@@ -32,7 +32,11 @@ class Clients:
     """The connections of all humans, one at most for each. Each shows the picture, score and turn of their player."""
 
     def __init__(
-        self, config: Trial, timing: Timing, emit: Callable[[Effect], None], assets: Sequence[Mapping[str, Any]] = ()
+        self,
+        config: TrialSection,
+        timing: Timing,
+        emit: Callable[[Effect], None],
+        assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         """`assets` are the images of a game that is drawn by objects."""
         self._timing = timing
@@ -86,12 +90,12 @@ class Clients:
             if words is not None:
                 self.send(client, messages.error(words))
 
-    def send_controls(self, client: Client, progress: Progress, participants: Participants, now: float) -> None:
+    def send_controls(self, client: Client, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send a client everything about the game and its controls."""
         times = self._timing.told(progress, now, participants.told(now))
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
-    def send_state(self, progress: Progress, participants: Participants, now: float) -> None:
+    def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send the state, with all seconds that are left, to each client whose last state was another one."""
         progress.told = participants.state()
         for client in self._by_human.values():
@@ -135,20 +139,20 @@ class Clients:
         self._emit(SendDone(client.connection, episodes, score, outcome))
 
 
-def state_of(progress: Progress, player: str) -> tuple[object, ...]:
+def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
     """What the clients' state shows. When one of these values changes, the state is sent again."""
     score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
     return progress.state, progress.episode, score, progress.frame_rate, progress.stands, progress.told, to_act
 
 
-def _of_state(progress: Progress, player: str, times: StateTimes) -> dict[str, Any]:
+def _of_state(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
     """What a client is told of the times and of its turn."""
     turn = _turn_of(progress, player, times.turn_ends_in)
     said = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
     return said if times.session is None else {**said, "session": {**times.session, "you": player}}
 
 
-def _turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str, Any]:
+def _turn_of(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
     """What a client is told of the turn: nothing in real time."""
     if progress.turns is None:
         return {}
@@ -156,7 +160,7 @@ def _turn_of(progress: Progress, player: str, ends_in: float | None) -> dict[str
     return {"to_act": mine, "turn_ends_in": ends_in if mine else None}
 
 
-def _controls_of(progress: Progress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
+def _controls_of(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
     """The message that tells a client all of the game and of its controls. `scene` as `_scene_of` has it."""
     config, action_space = progress.config, progress.players[player].action_space
     return messages.controls(
@@ -181,7 +185,7 @@ def _controls_of(progress: Progress, player: str, times: StateTimes, scene: Mapp
     )
 
 
-def _scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def _scene_of(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """What a client is told of a game that is drawn by objects; None if it is not."""
     if config.scene is None:
         return None
@@ -189,7 +193,7 @@ def _scene_of(config: Trial, assets: Sequence[Mapping[str, Any]]) -> Mapping[str
     return {"scene": told, "assets": list(assets)}
 
 
-def _input(config: Trial, player: str) -> dict[str, Any]:
+def _input(config: TrialSection, player: str) -> dict[str, Any]:
     """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
     keys, labels = config.keys_of(player), config.labels_of(player)
     said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}

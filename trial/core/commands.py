@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core import messages
 from trial.core.clients import Client, Clients
 from trial.core.controls import ARROWS, KEY
 from trial.core.message_log import MessageLog
 from trial.core.messages import CommandRefused, Message
 from trial.core.participants import Alone, Participants
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.timing import Timing
 
 ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
@@ -23,7 +23,7 @@ _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 class Commands:
     """The clients' commands, actions and keys. `reset` and `stop` wait for the end of a step."""
 
-    def __init__(self, config: Trial, clients: Clients, message_log: MessageLog) -> None:
+    def __init__(self, config: TrialSection, clients: Clients, message_log: MessageLog) -> None:
         shown = config.ui.shown()
         self._config = config
         self._offered = (*shown, *ARROWS) if config.keys else shown
@@ -35,7 +35,7 @@ class Commands:
         """The server must end: commands do nothing any more."""
 
     def receive(
-        self, client: Client, message: Message, progress: Progress, participants: Participants, now: float
+        self, client: Client, message: Message, progress: TrialProgress, participants: Participants, now: float
     ) -> None:
         """Record a client's message and do what it asks for. If that is refused, tell the client why."""
         try:
@@ -47,7 +47,7 @@ class Commands:
         except CommandRefused as refused:
             self._clients.send(client, messages.error(str(refused)))
 
-    def _check(self, message: Message, progress: Progress, participants: Participants) -> None:
+    def _check(self, message: Message, progress: TrialProgress, participants: Participants) -> None:
         """Raise CommandRefused if the project does not offer what is asked for. Then nothing of it is recorded."""
         if message.hidden is not None and isinstance(participants, Alone):
             raise CommandRefused("unknown field 'hidden'")
@@ -60,7 +60,7 @@ class Commands:
             raise CommandRefused("the game is over, and no command has an effect any more")
 
     def _carry_out(
-        self, message: Message, player: str, progress: Progress, participants: Participants, now: float
+        self, message: Message, player: str, progress: TrialProgress, participants: Participants, now: float
     ) -> None:
         """Do what the human who plays `player` asks for. Raises CommandRefused if it is not possible now."""
         if message.command is not None and not self.closed:
@@ -82,7 +82,7 @@ class Commands:
             if command == "stop":
                 participants.stop(player)
 
-    def carry_out_waiting(self, progress: Progress, participants: Participants, timing: Timing) -> None:
+    def carry_out_waiting(self, progress: TrialProgress, participants: Participants, timing: Timing) -> None:
         """Carry out the commands that have waited for the end of a step."""
         commands, self.waiting = self.waiting, []
         for command in commands:

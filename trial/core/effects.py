@@ -251,7 +251,7 @@ class SaveMember:
 
 
 @dataclass(frozen=True, slots=True)
-class Log:
+class WriteLog:
     """Write a line into the log, at a level of `logging`."""
 
     level: int
@@ -281,6 +281,6 @@ Effect = (
     | CloseRecording
     | SaveAnswer
     | SaveMember
-    | Log
+    | WriteLog
     | LogAgentError
 )

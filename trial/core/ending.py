@@ -6,25 +6,25 @@ import logging
 from collections.abc import Callable
 
 from trial.core import records
-from trial.core.effects import Effect, FeedbackCall, Log
+from trial.core.effects import Effect, FeedbackCall, WriteLog
 from trial.core.ended import Break, Episode
 from trial.core.message_log import MessageLog
 from trial.core.participants import Participants
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.recording import Recordings
 from trial.core.timing import Timing
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 LAST_CALL_SECONDS = 2.0
 """The time that a call of the agent has to come back once the server must end."""
 
 
 class Ending:
-    """Records the ends of episodes and breaks (`Progress.ended`), one after the other, and the end of the trial."""
+    """Records the ends of episodes and breaks (`TrialProgress.ended`) in turn, and the end of the trial."""
 
     def __init__(
         self,
-        settings: Settings,
+        settings: TrialSettings,
         *,
         timing: Timing,
         recording: Recordings,
@@ -42,7 +42,7 @@ class Ending:
         self.all_written = False
         """The last lines are written, and the answer was given to the store."""
 
-    def last_feedback(self, progress: Progress) -> FeedbackCall:
+    def last_feedback(self, progress: TrialProgress) -> FeedbackCall:
         """The call before the first end is recorded: the agent hears the feedback, its callbacks what has ended."""
         return FeedbackCall(
             limit=LAST_CALL_SECONDS if self.closing else self._settings.step_seconds,
@@ -52,12 +52,12 @@ class Ending:
             last=progress.over and len(progress.ended) == 1,
         )
 
-    def record(self, call: FeedbackCall, progress: Progress, participants: Participants) -> None:
+    def record(self, call: FeedbackCall, progress: TrialProgress, participants: Participants) -> None:
         """Record the first end of an episode or a break that is not recorded, with the messages before it."""
         over = progress.ended.pop(0)
         if isinstance(over, Episode):
             for player, late in progress.choices.policies.late().items():
-                self._emit(Log(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
+                self._emit(WriteLog(logging.INFO, f"the policy of {player} was late at {late} of {over.steps} steps"))
         outcomes = participants.outcomes() if progress.over and not progress.ended else None
         self._emit(records.end(over, self._message_log.messages[: call.messages], outcomes))
         self._message_log.recorded(call.messages, len(call.feedback))
@@ -66,13 +66,13 @@ class Ending:
         if self._settings.trial.data_file == "episode" and not more:
             self._close_recording(participants)
 
-    def shut_down_break(self, progress: Progress) -> None:
+    def shut_down_break(self, progress: TrialProgress) -> None:
         """End the break, if the server must end during one."""
         if self.closing and progress.on_break and not self._break_shut_down:
             self._break_shut_down = True
             progress.ended.append(Break(progress.episode, "shutdown"))
 
-    def write_last(self, progress: Progress, participants: Participants, *, broken: bool) -> None:
+    def write_last(self, progress: TrialProgress, participants: Participants, *, broken: bool) -> None:
         """Write the last lines and store the answer. No answer if the game was `broken`, or is not over."""
         self.all_written = True
         if self.closing and not progress.over and not progress.on_break:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
@@ -129,7 +129,7 @@ def parse_hello(data: str | bytes) -> Hello:
     )
 
 
-def words_of(trial: Trial) -> tuple[str, ...]:
+def words_of(trial: TrialSection) -> tuple[str, ...]:
     """The words that the project's own controls give the agent: those controls that have no action's name."""
     actions = {*trial.action_space, *_BUTTONS_OF_ACTIONS}
     return tuple(name for name in trial.ui.own if name.lower() not in actions)

@@ -1,6 +1,6 @@
 """Who takes part in a trial, and what follows from it: one participant alone, or the members of a session.
 
-`Alone` is for one participant, `Session` (`trial/core/session.py`) for several. Both have the same calls.
+`Alone` is for one participant, `TrialSession` (`trial/core/session.py`) for several. Both have the same calls.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from trial.core import records
 from trial.core.effects import SaveAnswer
 from trial.core.flow_control import Window
 from trial.core.messages import Message
-from trial.core.progress import Progress
-from trial.core.session import Session
+from trial.core.progress import TrialProgress
+from trial.core.session import TrialSession
 
 
 class Alone:
     """The one participant of a trial: who comes and goes, and what follows from it."""
 
-    def __init__(self, progress: Progress, trial_id: str) -> None:
+    def __init__(self, progress: TrialProgress, trial_id: str) -> None:
         self._progress = progress
         self._trial_id = trial_id
 
@@ -119,5 +119,5 @@ class Alone:
         return None
 
 
-Participants = Alone | Session
+Participants = Alone | TrialSession
 """Those of one trial, however many they are."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from protocol.players import GYM_PLAYER, HUMAN
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from protocol.values import show
 
 PLAYER = "player_0"
@@ -69,7 +69,9 @@ def alone(action_space: tuple[str, ...]) -> tuple[Player, ...]:
     return (Player(PLAYER, action_space, HUMAN, _idle(PLAYER, action_space, None)),)
 
 
-def who_plays(config: Trial, action_spaces: Mapping[str, tuple[str, ...]], group: int | None) -> tuple[Player, ...]:
+def who_plays(
+    config: TrialSection, action_spaces: Mapping[str, tuple[str, ...]], group: int | None
+) -> tuple[Player, ...]:
     """The players of the environment, in its order, each with what plays it in this group.
 
     `action_spaces` has the environment's players in their order. Raises PlayersError.

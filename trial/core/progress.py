@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from enum import Enum
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core.actions import Action
 from trial.core.choices import Choices
 from trial.core.ended import PARTNER_LEFT, Break, Episode
@@ -32,7 +32,7 @@ class PlayState(Enum):
     ENDED = "ended"
 
 
-class Progress:
+class TrialProgress:
     """One trial's progress. The caller steps and resets the environment and reports the results.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
@@ -40,7 +40,7 @@ class Progress:
     takes no step meanwhile, and calls `go_on`.
     """
 
-    def __init__(self, config: Trial, players: Iterable[Player]) -> None:
+    def __init__(self, config: TrialSection, players: Iterable[Player]) -> None:
         """`players` are those of the environment, in its order; one of them at least is a human."""
         self.config = config
         self.players = {player.name: player for player in players}

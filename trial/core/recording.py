@@ -6,9 +6,9 @@ import logging
 import traceback
 from collections.abc import Callable
 
-from trial.core.effects import CloseRecording, Effect, Log, LogAgentError, OpenRecording, RecordLine
+from trial.core.effects import CloseRecording, Effect, LogAgentError, OpenRecording, RecordLine, WriteLog
 from trial.core.policies import FAILURES
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 
 _POLICY_FAILURES_SAID = 20
 _LONGEST_ERROR = 2000
@@ -24,7 +24,7 @@ class Recordings:
         """One is being opened."""
         self._said: set[str] = set()  # of policies
 
-    def ask(self, progress: Progress, seed: int) -> None:
+    def ask(self, progress: TrialProgress, seed: int) -> None:
         """Ask the shell to open a recording, which begins with the present episode."""
         self.is_awaited = True
         players = tuple(progress.players.values()) if progress.several else ()
@@ -51,7 +51,7 @@ class Recordings:
         self._emit(LogAgentError(error))
         self._emit(RecordLine("error", {"episode": episode, "step": step, "error": words_of(error)}))
 
-    def policy_failed(self, progress: Progress, player: str, words: str) -> None:
+    def policy_failed(self, progress: TrialProgress, player: str, words: str) -> None:
         """A policy has failed, as `words` say: say so in the log and in the recording, once for each reason."""
         plays = progress.players[player].plays
         said = [f"the policy of {player} ({plays}) failed: {words}"]
@@ -61,7 +61,7 @@ class Recordings:
             if text in self._said or len(self._said) >= _POLICY_FAILURES_SAID:
                 continue
             self._said.add(text)
-            self._emit(Log(logging.ERROR, text))
+            self._emit(WriteLog(logging.ERROR, text))
             where = {"episode": progress.episode, "step": progress.steps, "player": player}
             self._emit(RecordLine("error", {**where, "error": text}))
 

@@ -8,7 +8,7 @@ from typing import Any
 from trial.core import messages
 from trial.core.effects import RecordLine
 from trial.core.ended import Break, Episode
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 
 
 def end(
@@ -27,14 +27,14 @@ def end(
     return RecordLine("break" if isinstance(over, Break) else "end", fields)
 
 
-def shutdown(progress: Progress, said: Sequence[Mapping[str, Any]]) -> RecordLine:
+def shutdown(progress: TrialProgress, said: Sequence[Mapping[str, Any]]) -> RecordLine:
     """The line that ends the present episode because the server must end. `said` as in `end`."""
     fields: dict[str, Any] = {"episode": progress.episode, "steps": progress.steps, "why": "shutdown"}
     fields |= _scores(progress.episode_score, progress.episode_scores if progress.several else {})
     return RecordLine("end", {**fields, "messages": said})
 
 
-def answers(progress: Progress, seconds: float, trial_id: str) -> dict[str, Any]:
+def answers(progress: TrialProgress, seconds: float, trial_id: str) -> dict[str, Any]:
     """The answer of the step. `seconds`: how long was played."""
     return {
         "episodes": progress.episodes_played,
@@ -47,7 +47,7 @@ def answers(progress: Progress, seconds: float, trial_id: str) -> dict[str, Any]
 
 
 def member_answers(
-    progress: Progress, player: str, outcome: str | None, seconds: float, trial_id: str
+    progress: TrialProgress, player: str, outcome: str | None, seconds: float, trial_id: str
 ) -> dict[str, Any]:
     """The answer of a member of a session, with their own score."""
     own = {"score": messages.tidy(progress.scores[player]), "player": player, "outcome": outcome}
@@ -55,7 +55,7 @@ def member_answers(
 
 
 def result(
-    progress: Progress, player: str, answers: Mapping[str, Any] | None, *, in_session: bool
+    progress: TrialProgress, player: str, answers: Mapping[str, Any] | None, *, in_session: bool
 ) -> tuple[int, float, str | None]:
     """What a client is told when the trial is over: episodes, the player's score, and in a session the outcome.
 

@@ -12,12 +12,12 @@ import math
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any
 
-from protocol.trial import Trial as Config
+from protocol.trial import TrialSection as Config
 from trial.core import messages, records
-from trial.core.effects import Effect, Log, RecordLine, ResetPolicy, SaveAnswer, SaveMember
+from trial.core.effects import Effect, RecordLine, ResetPolicy, SaveAnswer, SaveMember, WriteLog
 from trial.core.flow_control import Window
 from trial.core.presence import Presence, Rules, outcomes
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.recording import Recordings
 from trial.core.seeds import policy_seed
 from trial.core.unfinished import RecordedTrial
@@ -48,13 +48,13 @@ PARTNER = "partnerLeft"
 NOBODY: frozenset[str] = frozenset()
 
 
-class Session:
+class TrialSession:
     """The members of a session in one trial. `places` says which player each of them plays, by their id."""
 
     def __init__(
         self,
         config: Config,
-        progress: Progress,
+        progress: TrialProgress,
         places: Mapping[str, str],
         *,
         vacant: Sequence[str],
@@ -279,7 +279,7 @@ class Session:
                 self._record(player, "refused")
         if gone and (not self._plays_on or presence.all_refused()):
             why = "their round trip is too long" if presence.over(gone[0]) == "ping" else "they stay away"
-            self._emit(Log(logging.INFO, f"the game ends for all without {', '.join(gone)}: {why}"))
+            self._emit(WriteLog(logging.INFO, f"the game ends for all without {', '.join(gone)}: {why}"))
             progress.partner_left()
             return frozenset(presence.players)
         for player in gone:
@@ -296,7 +296,7 @@ class Session:
         ask = None if progress.needs_reset else progress.choices.ask(player, progress.steps, now)
         if ask is not None:
             self._emit(ask)
-        self._emit(Log(logging.INFO, f"{plays} plays in the place of {player}"))
+        self._emit(WriteLog(logging.INFO, f"{plays} plays in the place of {player}"))
         self._record(player, "replaced", {"seed": seed})
 
     def _say_why_over(self, players: Collection[str]) -> None:

@@ -9,17 +9,17 @@ from trial.core.clients import Clients
 from trial.core.effects import Begun, Effect, Replayed, StepCall, StepTaken, WriteLine
 from trial.core.message_log import MessageLog
 from trial.core.players import View
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.timing import Timing
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 
-class Steps:
+class Stepper:
     """Takes steps, one after the other. The caller says when, and makes the calls of the agent that are returned."""
 
     def __init__(
         self,
-        settings: Settings,
+        settings: TrialSettings,
         *,
         timing: Timing,
         message_log: MessageLog,
@@ -32,7 +32,7 @@ class Steps:
         self._clients = clients
         self._emit = emit
 
-    def take(self, progress: Progress, now: float) -> StepCall:
+    def take(self, progress: TrialProgress, now: float) -> StepCall:
         """Return the call that takes the step that is due, with the messages and the feedback since the last step."""
         said, dropped = self._message_log.messages, self._message_log.take_dropped()
         fields: dict[str, Any] = {
@@ -53,7 +53,7 @@ class Steps:
             truncated_by=self._timing.limit_of_step(progress, now),
         )
 
-    def taken(self, call: StepCall, step: StepTaken, progress: Progress, now: float) -> None:
+    def taken(self, call: StepCall, step: StepTaken, progress: TrialProgress, now: float) -> None:
         """The step was taken: record it, count it, and show what came of it."""
         self._emit(WriteLine(step.line))
         self._message_log.recorded(call.messages, len(call.feedback))
@@ -64,19 +64,19 @@ class Steps:
             self._see(step.view, progress, now)
         self._clients.show(step.pictures)
 
-    def began(self, begun: Begun, progress: Progress, now: float) -> None:
+    def began(self, begun: Begun, progress: TrialProgress, now: float) -> None:
         """The environment was reset: record it, and show the first picture."""
         self._emit(WriteLine(begun.line))
         progress.began()
         self._timing.begin_episode()
         self.show(begun, progress, now)
 
-    def show(self, found: Begun | Replayed, progress: Progress, now: float) -> None:
+    def show(self, found: Begun | Replayed, progress: TrialProgress, now: float) -> None:
         """Show the picture with which the episode begins or goes on."""
         self._see(found.view, progress, now)
         self._clients.show(found.pictures)
 
-    def _see(self, view: View | None, progress: Progress, now: float) -> None:
+    def _see(self, view: View | None, progress: TrialProgress, now: float) -> None:
         """The players see this, and those that are no humans are asked."""
         progress.choices.see(view, now)
         for ask in progress.choices.asks(progress.steps, now):

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core.episode_time import EpisodeTime
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 
 
 class Due(Enum):
@@ -63,7 +63,7 @@ class Pacer:
 class Timing:
     """The times of one trial. It ends breaks, first pictures, turns and episodes whose time is over."""
 
-    def __init__(self, config: Trial) -> None:
+    def __init__(self, config: TrialSection) -> None:
         self.seconds = 0.0
         """Seconds that were played."""
         self.wake_at: float | None = None
@@ -97,7 +97,7 @@ class Timing:
 
     # ---- what is due
 
-    def next(self, progress: Progress, now: float) -> Due:
+    def next(self, progress: TrialProgress, now: float) -> Due:
         """What is due now. With NOTHING, `wake_at` says when to ask again."""
         self.wake_at = None
         playing = progress.playing
@@ -125,7 +125,7 @@ class Timing:
         self._pacer.rest()
         self._due = self._last_step = None
 
-    def _break_left(self, progress: Progress, now: float) -> float | None:
+    def _break_left(self, progress: TrialProgress, now: float) -> float | None:
         """Seconds until the next episode, infinite if the player begins it; None if this is no break.
 
         The time of a break begins when this is asked first.
@@ -137,14 +137,14 @@ class Timing:
             self._break_began = now
         return max(0.0, self._break_began + self._between - now)
 
-    def _break_over(self, progress: Progress, left: float, now: float) -> Due:
+    def _break_over(self, progress: TrialProgress, left: float, now: float) -> Due:
         if left > 0.0:
             self.wake_at = now + left if left < math.inf else None
             return Due.NOTHING
         progress.go_on()
         return Due.MORE
 
-    def _stands(self, progress: Progress, now: float) -> bool:
+    def _stands(self, progress: TrialProgress, now: float) -> bool:
         """Whether the episode's first picture still stands; if not, the episode is played from now on."""
         left = self._episode.starts_in(now)
         if left > 0.0:
@@ -158,7 +158,7 @@ class Timing:
         self._episode.run(now)
         return False
 
-    def _step_due(self, progress: Progress, now: float) -> Due:
+    def _step_due(self, progress: TrialProgress, now: float) -> Due:
         """In real time: whether the step of the next frame is due."""
         if self._due is None:
             self._due = self._pacer.next(now, progress.frame_rate)
@@ -168,7 +168,7 @@ class Timing:
         self._due = None
         return Due.STEP
 
-    def _turn_over(self, progress: Progress, now: float) -> Due:
+    def _turn_over(self, progress: TrialProgress, now: float) -> Due:
         """Turn by turn: a step is due once all have chosen. The frame rate lets the step before be seen."""
         turns, choices = progress.turns, progress.choices
         assert turns is not None
@@ -192,7 +192,7 @@ class Timing:
             return Due.NOTHING
         return Due.STEP
 
-    def limit_of_step(self, progress: Progress, now: float) -> str | None:
+    def limit_of_step(self, progress: TrialProgress, now: float) -> str | None:
         """The key of `trial` whose limit this step reaches, so that it is the episode's last one; None if none."""
         if self._max_steps and progress.steps + 1 >= self._max_steps:
             return "maxSteps"
@@ -202,7 +202,7 @@ class Timing:
 
     # ---- what clients are told
 
-    def told(self, progress: Progress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
+    def told(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
         """All seconds that are left, and what is told of the `session`."""
         return StateTimes(
             next_in=self._break_left(progress, now),

@@ -53,24 +53,24 @@ from trial.core.effects import (
     Call,
     Effect,
     FeedbackCall,
-    Log,
     ReplayCall,
     Replayed,
     StepCall,
     TellMoved,
+    WriteLog,
 )
 from trial.core.ending import LAST_CALL_SECONDS, Ending
 from trial.core.flow_control import Window
 from trial.core.message_log import MessageLog
 from trial.core.participants import Alone, Participants
 from trial.core.players import Player, alone
-from trial.core.progress import Progress
+from trial.core.progress import TrialProgress
 from trial.core.recording import Recordings, words_of
-from trial.core.session import Session
-from trial.core.steps import Steps
+from trial.core.session import TrialSession
+from trial.core.steps import Stepper
 from trial.core.timing import Due, Timing
 from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
 EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
@@ -90,7 +90,7 @@ class Trial:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: TrialSettings,
         step: str,
         *,
         trial_id: str,
@@ -109,7 +109,7 @@ class Trial:
         """The agent has callbacks, which are told of the end of each episode and of players who come and go."""
         self.wake_at: float | None = None
         """When `advance` is to be called if nothing else happens before; None: there is no need to."""
-        self.progress = Progress(self.config, alone(self.config.action_space or ("noop",)))
+        self.progress = TrialProgress(self.config, alone(self.config.action_space or ("noop",)))
         self._now = 0.0
         self._effects: list[Effect] = []
         self._emit = self._effects.append
@@ -123,7 +123,7 @@ class Trial:
         self._beginning = Beginning(
             settings, timing=timing, recording=recording, message_log=message_log, new_seed=new_seed, emit=emit
         )
-        self._steps = Steps(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
+        self._steps = Stepper(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
         self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
         self._participants: Participants = Alone(self.progress, trial_id)
         self._failed_words: str | None = None
@@ -193,9 +193,9 @@ class Trial:
         if self.phase is not Phase.STARTING:
             return []
         self.phase = Phase.PLAYING
-        self.progress = Progress(self.config, players)
+        self.progress = TrialProgress(self.config, players)
         if places:
-            self._participants = Session(
+            self._participants = TrialSession(
                 self.config,
                 self.progress,
                 places,
@@ -312,7 +312,7 @@ class Trial:
         if isinstance(call, ReplayCall) and not hangs:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
-            self._emit(Log(logging.WARNING, text))
+            self._emit(WriteLog(logging.WARNING, text))
             self._agent.make(self._beginning.begin_again(self.progress, self._participants))
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
             self._recording.agent_failed(error, records.number(self.progress.ended[0]), self.progress.steps)
@@ -373,7 +373,7 @@ class Trial:
             if not self._participants.has_answered(human):
                 self._send_done(human, client)
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
-        return [Log(logging.INFO, text), *self._take_effects()]
+        return [WriteLog(logging.INFO, text), *self._take_effects()]
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
         """The member's answer is stored: they go on to the next step, whatever the others do."""
@@ -453,7 +453,7 @@ class Trial:
         self._beginning.replayed(self.progress, unfinished, replayed)
         self._steps.show(replayed, self.progress, self._now)
         self.ready = True
-        self._emit(Log(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
+        self._emit(WriteLog(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
         self._beginning.repeat_feedback(unfinished, self._ns())
 
     def _paused_by_stalled(self) -> bool:
@@ -462,7 +462,7 @@ class Trial:
             each for each in self._clients.stalled(self._now) if self._participants.stalls(each.player, self._now)
         ]
         for client in stalled:
-            self._emit(Log(logging.INFO, "the player's page has stopped answering: paused"))
+            self._emit(WriteLog(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering", client)
         return bool(stalled)
 

@@ -1,6 +1,6 @@
 """The messages of the subprotocol `hippodrome.gym.1`: raw arrays behind a small header (docs/gym.md). Pure.
 
-A `Layout` is made once for each space. Values travel in batches, in Gymnasium's own form of a batch
+A `ArrayLayout` is made once for each space. Values travel in batches, in Gymnasium's own form of a batch
 (`gymnasium.vector.utils.concatenate`): one array for all values of a Box, a dict of batches for a Dict. So a batch of
 64 costs one call of numpy for each part of the space, not one for each value.
 """
@@ -35,7 +35,7 @@ Infos = list[tuple[int, dict[str, Any]]]
 """The steps that have an info, by their number from 0 on, and the infos. A reset has one, numbered 0."""
 
 
-class Request(NamedTuple):
+class ArrayRequest(NamedTuple):
     """A message of the client. `steps` is how many it asks for; 0 for RESET."""
 
     kind: int
@@ -44,7 +44,7 @@ class Request(NamedTuple):
     body: memoryview
 
 
-class Steps(NamedTuple):
+class StepRows(NamedTuple):
     """What steps led to: a row for each of them; of a vector, one for each environment, those of the first step first.
 
     `observations` is a batch, the others have one axis. `infos` has the steps that have an info, by their number; that
@@ -58,7 +58,7 @@ class Steps(NamedTuple):
     infos: Infos
 
 
-class Layout:
+class ArrayLayout:
     """How values of one space lie in a message."""
 
     def empty(self, count: int) -> Any:
@@ -87,7 +87,7 @@ class Layout:
         raise NotImplementedError
 
 
-def layout(space: Space, *, action: bool = False) -> Layout:
+def layout(space: Space, *, action: bool = False) -> ArrayLayout:
     """The layout of `space`. With `action`, `unpack` refuses what `values.decoder` refuses of an action.
 
     Raises CodecError for a space that is none of Gymnasium's own.
@@ -103,7 +103,7 @@ def layout(space: Space, *, action: bool = False) -> Layout:
     return _Json(values.decoder(space, action=action))
 
 
-class _Numbers(Layout):
+class _Numbers(ArrayLayout):
     def __init__(self, space: Any, action: bool) -> None:
         self._space = space
         self._action = action
@@ -177,7 +177,7 @@ class _Discrete(_Numbers):
         return list(batch)
 
 
-class _Json(Layout):
+class _Json(ArrayLayout):
     """A column of values whose size varies: the length of the text, and the text, a list in JSON as in `values`."""
 
     def __init__(self, decode: values.Decode) -> None:
@@ -209,8 +209,8 @@ class _Json(Layout):
         return list(batch)
 
 
-class _Dict(Layout):
-    def __init__(self, parts: dict[str, Layout]) -> None:
+class _Dict(ArrayLayout):
+    def __init__(self, parts: dict[str, ArrayLayout]) -> None:
         self._parts = parts
 
     def empty(self, count: int) -> Any:
@@ -241,8 +241,8 @@ class _Dict(Layout):
         return [{key: column[row] for key, column in zip(self._parts, columns, strict=True)} for row in range(count)]
 
 
-class _Tuple(Layout):
-    def __init__(self, parts: list[Layout]) -> None:
+class _Tuple(ArrayLayout):
+    def __init__(self, parts: list[ArrayLayout]) -> None:
         self._parts = parts
 
     def empty(self, count: int) -> Any:
@@ -274,7 +274,7 @@ class _Tuple(Layout):
         return [tuple(column[row] for column in columns) for row in range(count)]
 
 
-def batch_of(layout: Layout, rows: Sequence[Any]) -> Any:
+def batch_of(layout: ArrayLayout, rows: Sequence[Any]) -> Any:
     """`rows`, values of the layout's space, as one batch. Raises CodecError if one does not have its shape or kind."""
     batch = layout.empty(len(rows))
     for row, value in enumerate(rows):
@@ -282,7 +282,7 @@ def batch_of(layout: Layout, rows: Sequence[Any]) -> Any:
     return batch
 
 
-def step_request(kind: int, handle: int, steps: int, actions: Layout, batch: Any, *, num_envs: int = 1) -> bytes:
+def step_request(kind: int, handle: int, steps: int, actions: ArrayLayout, batch: Any, *, num_envs: int = 1) -> bytes:
     """STEP or STEP_MANY: steps of an environment, or of each one of a vector, with a batch of actions."""
     parts: list[bytes] = [_REQUEST.pack(kind, handle, steps)]
     actions.pack(batch, steps * num_envs, parts)
@@ -294,7 +294,7 @@ def reset_request(handle: int, seed: Any, options: Any) -> bytes:
     return _REQUEST.pack(RESET, handle, 0) + exact.to_text({"seed": seed, "options": options}).encode()
 
 
-def read_request(data: bytes) -> Request:
+def read_request(data: bytes) -> ArrayRequest:
     """The header of a client's message, and the body unread. Raises CodecError."""
     if len(data) < _REQUEST.size:
         raise CodecError("The message is too short for its header.")
@@ -303,15 +303,15 @@ def read_request(data: bytes) -> Request:
         raise CodecError(f"There is no message of kind {kind}.")
     if (kind == STEP and count != 1) or (kind == STEP_MANY and not 0 < count <= MAX_STEPS):
         raise CodecError(f"A message asks for one step, or by STEP_MANY for 1 to {MAX_STEPS}, not for {count}.")
-    return Request(kind, handle, count, memoryview(data)[_REQUEST.size :])
+    return ArrayRequest(kind, handle, count, memoryview(data)[_REQUEST.size :])
 
 
-def read_actions(request: Request, actions: Layout, num_envs: int = 1) -> Any:
+def read_actions(request: ArrayRequest, actions: ArrayLayout, num_envs: int = 1) -> Any:
     """The batch of actions of a STEP or STEP_MANY: `steps * num_envs` rows. Raises CodecError."""
     return _whole(actions, request.body, request.steps * num_envs)
 
 
-def refused(request: Request, space: Space, num_envs: int = 1) -> Any:
+def refused(request: ArrayRequest, space: Space, num_envs: int = 1) -> Any:
     """The first action for which `read_actions` refuses a request; the size of its body if that cannot be read."""
     unchecked, checked = layout(space), layout(space, action=True)
     count = request.steps * num_envs
@@ -326,7 +326,7 @@ def refused(request: Request, space: Space, num_envs: int = 1) -> Any:
     return f"{len(request.body)} bytes"
 
 
-def read_reset(request: Request) -> tuple[Any, dict[str, Any] | None]:
+def read_reset(request: ArrayRequest) -> tuple[Any, dict[str, Any] | None]:
     """The seed and the options of a RESET. Raises CodecError."""
     said = exact.from_text(bytes(request.body)) if len(request.body) else {}
     if not isinstance(said, dict) or not said.keys() <= {"seed", "options"}:
@@ -339,7 +339,7 @@ def read_reset(request: Request) -> tuple[Any, dict[str, Any] | None]:
     return seed, options
 
 
-def steps_reply(kind: int, handle: int, observations: Layout, steps: Steps) -> bytes:
+def steps_reply(kind: int, handle: int, observations: ArrayLayout, steps: StepRows) -> bytes:
     """The answer to STEP and STEP_MANY."""
     rows = len(steps.rewards)
     columns: list[bytes] = [np.asarray(steps.rewards, "<f8").tobytes()]
@@ -348,7 +348,7 @@ def steps_reply(kind: int, handle: int, observations: Layout, steps: Steps) -> b
     return _reply(kind, handle, rows, columns, steps.infos)
 
 
-def reset_reply(handle: int, observations: Layout, rows: int, batch: Any, infos: Infos) -> bytes:
+def reset_reply(handle: int, observations: ArrayLayout, rows: int, batch: Any, infos: Infos) -> bytes:
     """The answer to RESET: a row for each environment."""
     columns: list[bytes] = []
     observations.pack(batch, rows, columns)
@@ -375,7 +375,7 @@ def check_reply(data: bytes, kind: int, handle: int, steps: int, num_envs: int =
         raise CodecError(f"It has {rows} rows for {steps} steps, or answers something else.")
 
 
-def read_steps(data: bytes, observations: Layout) -> Steps:
+def read_steps(data: bytes, observations: ArrayLayout) -> StepRows:
     """What `steps_reply` was given. Raises CodecError."""
     kind, rows, columns, infos = _opened(data)
     if kind not in (STEP, STEP_MANY):
@@ -386,10 +386,10 @@ def read_steps(data: bytes, observations: Layout) -> Steps:
     first, last = rows * _DOUBLE, len(columns) - 2 * rows
     rewards = np.frombuffer(columns, "<f8", rows).astype(np.float64)
     terminated, truncated = (_flags(columns, last + at * rows, rows) for at in (0, 1))
-    return Steps(_whole(observations, columns[first:last], rows), rewards, terminated, truncated, infos)
+    return StepRows(_whole(observations, columns[first:last], rows), rewards, terminated, truncated, infos)
 
 
-def read_reset_reply(data: bytes, observations: Layout) -> tuple[Any, Infos]:
+def read_reset_reply(data: bytes, observations: ArrayLayout) -> tuple[Any, Infos]:
     """The batch of observations of a RESET, and the infos. Raises CodecError."""
     kind, rows, columns, infos = _opened(data)
     if kind != RESET:
@@ -427,7 +427,7 @@ def _flags(columns: memoryview, at: int, rows: int) -> np.ndarray[Any, np.dtype[
     return np.frombuffer(columns, np.uint8, rows, at).astype(np.bool_)
 
 
-def _whole(layout: Layout, data: memoryview, rows: int) -> Any:
+def _whole(layout: ArrayLayout, data: memoryview, rows: int) -> Any:
     batch, end = layout.unpack(data, 0, rows)
     if end != len(data):
         raise CodecError("The message is longer than its values.")

@@ -34,7 +34,7 @@ class ConnectionLost(RemoteError):
     """There is no connection any more, and its environments are closed. The message says why."""
 
 
-class Client:
+class GymClient:
     """One connection. Each request waits for its answer; threads take turns.
 
     `url` is `ws://` or `wss://`, its path `/gym` if it has none. `timeout` is in seconds, for connecting and for each

@@ -21,7 +21,7 @@ from trial.gym.errors import GymError
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class MessageForm:
     """How results and errors become messages."""
 
     name: str
@@ -43,9 +43,9 @@ class Form:
         return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
 
 
-GYMIE = Form("gymie", five=False, bare_id=True, closes=True)
-DOCUMENTED = Form("documented", five=False)
-GYMNASIUM = Form("gymnasium", five=True)
-ARRAYS = Form("arrays", five=True, arrays=True)
+GYMIE = MessageForm("gymie", five=False, bare_id=True, closes=True)
+DOCUMENTED = MessageForm("documented", five=False)
+GYMNASIUM = MessageForm("gymnasium", five=True)
+ARRAYS = MessageForm("arrays", five=True, arrays=True)
 
 NAMES = {form.name: form for form in (GYMIE, DOCUMENTED, GYMNASIUM)}

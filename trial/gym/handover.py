@@ -10,7 +10,7 @@ _START = struct.Struct("<IHI")  # number, length of the form's name, length of w
 _ENDED = struct.Struct("<IHH")  # number, close code, length of the sentence
 
 
-class Start(NamedTuple):
+class NewConnection(NamedTuple):
     """A connection that needs a worker. `number` names it; `received` are bytes that the client has sent already."""
 
     number: int
@@ -32,7 +32,7 @@ class Ended(NamedTuple):
         return _ENDED.pack(self.number, self.code, len(words)) + words
 
 
-def send(control: socket.socket, start: Start) -> None:
+def send(control: socket.socket, start: NewConnection) -> None:
     """Hand a connection over. The caller's own descriptor of it stays open. Raises OSError."""
     name = start.form.encode()
     header = _START.pack(start.number, len(name), len(start.received))
@@ -40,7 +40,7 @@ def send(control: socket.socket, start: Start) -> None:
     control.sendall(header[sent:] + name + start.received)
 
 
-def receive(control: socket.socket) -> Start | None:
+def receive(control: socket.socket) -> NewConnection | None:
     """The next connection; None if the server is gone."""
     header, found, _, _ = socket.recv_fds(control, _START.size, 1)
     if not header or not found:
@@ -48,7 +48,7 @@ def receive(control: socket.socket) -> Start | None:
     header += _exactly(control, _START.size - len(header))
     number, name, received = _START.unpack(header)
     form = _exactly(control, name).decode()
-    return Start(number, form, _exactly(control, received), socket.socket(fileno=found[0]))
+    return NewConnection(number, form, _exactly(control, received), socket.socket(fileno=found[0]))
 
 
 def read_ended(buffer: bytearray) -> Ended | None:

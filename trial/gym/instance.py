@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from trial.gym import overrides
 from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
-from trial.gym.recordings import Recorded, Recorder
+from trial.gym.recordings import ConnectionRecorder, Recorded
 
 CUT_OFF = "TimeLimit.truncated"
 """The key of an info by which gym's TimeLimit says that its limit ended the episode."""
@@ -20,7 +20,7 @@ CUT_OFF = "TimeLimit.truncated"
 MODES = {mode.value: mode for mode in AutoresetMode}
 
 
-class Step(NamedTuple):
+class InstanceStep(NamedTuple):
     """The results of one step."""
 
     observation: Any
@@ -91,17 +91,17 @@ class Instance:
         self._ended = False
         return guarded(self._reset, seed, options)  # type: ignore[no-any-return]
 
-    def step(self, action: Any) -> Step:
+    def step(self, action: Any) -> InstanceStep:
         """One step. Raises WrongAction, as Gymie does whatever the environment raises."""
         try:
             found = self.env.step(action)
-            return Step(*_five(found))
+            return InstanceStep(*_five(found))
         except GymError:
             raise
         except BaseException as error:
             raise WrongAction(action, of(error)) from error
 
-    def processed(self, step: Step) -> Step:
+    def processed(self, step: InstanceStep) -> InstanceStep:
         """The step after the program's own `process_step`, if it has one."""
         if self._process is None:
             return step
@@ -117,7 +117,7 @@ class Instance:
             raise EnvironmentFailed("process_step must return observation, reward, done and info.") from None
         if bool(changed) != bool(done):
             terminated, truncated = changed, False
-        return Step(observation, reward, terminated, truncated, info)
+        return InstanceStep(observation, reward, terminated, truncated, info)
 
     def steps(self, actions: Sequence[Any]) -> Iterator[Any]:
         """Take a step for each action: their results. Raises GymError.
@@ -200,7 +200,7 @@ class VectorInstance(Instance):
     def single_action_space(self) -> Any:
         return self.env.single_action_space
 
-    def processed(self, step: Step) -> Step:
+    def processed(self, step: InstanceStep) -> InstanceStep:
         return step
 
     def steps(self, actions: Sequence[Any]) -> Iterator[Any]:
@@ -214,7 +214,7 @@ def make(
     mode: AutoresetMode,
     options: dict[str, Any],
     *,
-    recorder: Recorder | None = None,
+    recorder: ConnectionRecorder | None = None,
 ) -> Instance:
     """Make an environment, or with `num_envs` a vector of that many, all recorded by `recorder`. Raises GymError."""
     own = overrides.replaced("get_env")
@@ -254,10 +254,10 @@ def _five(found: Any) -> Any:
     raise EnvironmentFailed("step() must return five values: observation, reward, terminated, truncated and info.")
 
 
-def _old(found: Any) -> Step:
+def _old(found: Any) -> InstanceStep:
     observation, reward, done, info = found
     cut = bool(info.get(CUT_OFF)) if isinstance(info, dict) else False
-    return Step(observation, reward, bool(done) and not cut, bool(done) and cut, info)
+    return InstanceStep(observation, reward, bool(done) and not cut, bool(done) and cut, info)
 
 
 def number(reward: Any) -> float:

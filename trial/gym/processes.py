@@ -15,7 +15,7 @@ from pathlib import Path
 
 from trial.gym import handover
 from trial.gym.limits import Limits
-from trial.gym.server import PATH, WITHOUT_HANDSHAKE, Listener, Server
+from trial.gym.server import PATH, WITHOUT_HANDSHAKE, GymServer, ListeningSocket
 
 
 def serve(
@@ -48,7 +48,7 @@ def serve(
 
 
 def serve_from(
-    listener: Listener,
+    listener: ListeningSocket,
     limits: Limits,
     *,
     modules: Sequence[str] = (),
@@ -64,7 +64,7 @@ def serve_from(
         if not _is_ready(control):
             os.waitpid(spawner, 0)
             return 1
-        server = Server(listener, control, limits, origins)
+        server = GymServer(listener, control, limits, origins)
         before = signal.signal(signal.SIGTERM, _interrupt)
         try:
             ready()
@@ -97,7 +97,7 @@ def _allow_files(count: int) -> None:
 
 
 def _fork_spawner(
-    listener: Listener, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
+    listener: ListeningSocket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
 ) -> tuple[socket.socket, int]:
     """Start the spawner; our end of its socket, and its process id."""
     ours, theirs = socket.socketpair()

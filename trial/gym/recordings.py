@@ -25,7 +25,7 @@ FLUSH_SECONDS = 1.0
 """Steps that may be lost if a process is killed."""
 
 
-class Recorder:
+class ConnectionRecorder:
     """Writes the recordings of one connection into a folder."""
 
     def __init__(self, folder: Path) -> None:

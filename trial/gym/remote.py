@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from trial.gym import arrays, spaces, values
-from trial.gym.client import TIMEOUT, Client
+from trial.gym.client import TIMEOUT, GymClient
 from trial.gym.spaces import CodecError
 
 Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
@@ -24,7 +24,7 @@ Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
 class _Made:
     """An environment on the server: its description and its messages."""
 
-    def __init__(self, client: Client, env_id: str, **params: Any) -> None:
+    def __init__(self, client: GymClient, env_id: str, **params: Any) -> None:
         self.client = client
         self.closer = weakref.finalize(self, client.close)
         try:
@@ -54,14 +54,14 @@ class _Made:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise CodecError(f"It describes no environment: {type(error).__name__}: {error}.") from error
 
-    def steps(self, kind: int, steps: int, actions: Any) -> arrays.Steps:
+    def steps(self, kind: int, steps: int, actions: Any) -> arrays.StepRows:
         size = self.num_envs or 1
         batch = self._batch(actions, steps * size)
         message = arrays.step_request(kind, self._handle, steps, self._actions, batch, num_envs=size)
-        found: arrays.Steps = self.client.read(self._read_steps, self.client.send(message), kind, steps)
+        found: arrays.StepRows = self.client.read(self._read_steps, self.client.send(message), kind, steps)
         return found
 
-    def _read_steps(self, reply: bytes, kind: int, steps: int) -> arrays.Steps:
+    def _read_steps(self, reply: bytes, kind: int, steps: int) -> arrays.StepRows:
         size = self.num_envs or 1
         arrays.check_reply(reply, kind, self._handle, steps, size)
         found = arrays.read_steps(reply, self.observations)
@@ -138,7 +138,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
         _refuse_window(render_mode)
         connection = {"token": token, "ca": ca, "timeout": timeout}
         given = options if render_mode is None else options | {"render_mode": render_mode}
-        made = _Made(Client(url, token=token, ca=ca, timeout=timeout), env_id, **given)
+        made = _Made(GymClient(url, token=token, ca=ca, timeout=timeout), env_id, **given)
         self._made = made
         self.observation_space = made.observation_space
         self.action_space = made.action_space
@@ -213,7 +213,7 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
         _refuse_window(render_mode)
         mode = AutoresetMode(autoreset_mode)
         given = options if render_mode is None else options | {"render_mode": render_mode}
-        client = Client(url, token=token, ca=ca, timeout=timeout)
+        client = GymClient(url, token=token, ca=ca, timeout=timeout)
         made = _Made(client, env_id, num_envs=num_envs, autoreset_mode=mode.value, **given)
         self._made = made
         self.num_envs = made.num_envs

@@ -42,7 +42,7 @@ WITHOUT_HANDSHAKE = 100
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
-class Listener(Protocol):
+class ListeningSocket(Protocol):
     """What connections are accepted from: a listening socket, or what stands for one."""
 
     def accept(self) -> tuple[socket.socket, Any]:
@@ -71,10 +71,12 @@ class _Connection:
     closing: bool = False
 
 
-class Server:
+class GymServer:
     """Listens until `run` is interrupted."""
 
-    def __init__(self, listener: Listener, control: socket.socket, limits: Limits, origins: Sequence[str]) -> None:
+    def __init__(
+        self, listener: ListeningSocket, control: socket.socket, limits: Limits, origins: Sequence[str]
+    ) -> None:
         self._listener = listener
         self._control = control
         self._limits = limits
@@ -237,7 +239,9 @@ class Server:
         connection.number = self._numbers
         self._served[connection.number] = connection
         received, connection.received = connection.received, b""
-        handover.send(self._control, handover.Start(connection.number, connection.form, received, connection.socket))
+        handover.send(
+            self._control, handover.NewConnection(connection.number, connection.form, received, connection.socket)
+        )
 
     # ---- the end of workers, and of connections
 

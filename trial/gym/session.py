@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from trial.gym import arrays, instance, spaces, values
-from trial.gym.arrays import Layout
+from trial.gym.arrays import ArrayLayout
 from trial.gym.errors import (
     EnvironmentFailed,
     GymError,
@@ -27,10 +27,10 @@ from trial.gym.errors import (
     WrongParameters,
     short,
 )
-from trial.gym.forms import Form
-from trial.gym.instance import Instance, Step, as_dict, guarded, number
+from trial.gym.forms import MessageForm
+from trial.gym.instance import Instance, InstanceStep, as_dict, guarded, number
 from trial.gym.limits import Limits, Rate
-from trial.gym.recordings import Recorder
+from trial.gym.recordings import ConnectionRecorder
 from trial.gym.spaces import CodecError
 
 _read = json.JSONDecoder().decode
@@ -38,7 +38,7 @@ _ENDS = ("false,{}]", "true,{}]")
 _ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")
 
 
-class Held:
+class HeldEnvironment:
     """An environment and what is made once for it."""
 
     def __init__(self, made: Instance, instance_id: str, handle: int) -> None:
@@ -48,10 +48,10 @@ class Held:
         env = made.env
         self.decode = guarded(_decoder, env.action_space)
         self.bytes = _bytes(made.single_observation_space) * made.size
-        self._layouts: tuple[Layout, Layout] | None = None
+        self._layouts: tuple[ArrayLayout, ArrayLayout] | None = None
 
     @property
-    def layouts(self) -> tuple[Layout, Layout]:
+    def layouts(self) -> tuple[ArrayLayout, ArrayLayout]:
         """How observations and actions lie in binary messages. Raises CodecError."""
         if self._layouts is None:
             made = self.instance
@@ -62,16 +62,16 @@ class Held:
         return self._layouts
 
 
-class Session:
+class GymSession:
     """Answers the requests of one connection. Its environments are closed with it."""
 
-    def __init__(self, form: Form, limits: Limits, recorder: Recorder | None = None) -> None:
+    def __init__(self, form: MessageForm, limits: Limits, recorder: ConnectionRecorder | None = None) -> None:
         self.form = form
         self._limits = limits
         self._rate = Rate(limits.steps_per_second) if limits.steps_per_second else None
         self._recorder = recorder
-        self._held: dict[str, Held] = {}
-        self._by_handle: dict[int, Held] = {}
+        self._held: dict[str, HeldEnvironment] = {}
+        self._by_handle: dict[int, HeldEnvironment] = {}
         self._handles = 0
         self._methods: dict[str, Callable[..., str]] = {
             name: getattr(self, name)
@@ -131,7 +131,7 @@ class Session:
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
 
-    def _reset_arrays(self, held: Held, request: arrays.Request) -> bytes:
+    def _reset_arrays(self, held: HeldEnvironment, request: arrays.ArrayRequest) -> bytes:
         try:
             seed, options = arrays.read_reset(request)
         except CodecError as error:
@@ -146,7 +146,7 @@ class Session:
             observations.put(batch, 0, observation)
         return arrays.reset_reply(held.handle, observations, held.instance.size, batch, [(0, info)])
 
-    def _step_arrays(self, held: Held, request: arrays.Request) -> bytes:
+    def _step_arrays(self, held: HeldEnvironment, request: arrays.ArrayRequest) -> bytes:
         made, count = held.instance, request.steps
         self.allow(held, count)
         observations, actions = held.layouts
@@ -157,7 +157,7 @@ class Session:
         steps = self._vector_steps(held, batch, count) if made.num_envs else self._single_steps(held, batch, count)
         return arrays.steps_reply(request.kind, held.handle, observations, steps)
 
-    def _single_steps(self, held: Held, batch: Any, count: int) -> arrays.Steps:
+    def _single_steps(self, held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
         observations, actions = held.layouts
         found = observations.empty(count)
         put, made = observations.put, held.instance
@@ -167,7 +167,7 @@ class Session:
         infos: arrays.Infos = []
         steps = made.steps(actions.rows(batch, count))
         if made.processes:
-            steps = (made.processed(Step(*step)) for step in steps)
+            steps = (made.processed(InstanceStep(*step)) for step in steps)
         for at, (observation, reward, end, cut, info) in enumerate(steps):
             put(found, at, observation)
             rewards.append(reward)
@@ -175,9 +175,9 @@ class Session:
             truncated.append(cut)
             if info:
                 infos.append((at, as_dict(info)))
-        return arrays.Steps(found, _numbers(rewards), _flags(terminated), _flags(truncated), infos)
+        return arrays.StepRows(found, _numbers(rewards), _flags(terminated), _flags(truncated), infos)
 
-    def _vector_steps(self, held: Held, batch: Any, count: int) -> arrays.Steps:
+    def _vector_steps(self, held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
         observations, actions = held.layouts
         made = held.instance
         each = list(actions.rows(batch, count * made.size))
@@ -195,7 +195,7 @@ class Session:
             truncated.append(cut)
             if info:
                 infos.append((at, info))
-        return arrays.Steps(
+        return arrays.StepRows(
             found, np.concatenate(rewards), np.concatenate(terminated), np.concatenate(truncated), infos
         )
 
@@ -235,7 +235,7 @@ class Session:
             env_id, seed, num_envs or 0, instance.MODES[autoreset_mode], options, recorder=self._recorder
         )
         self._handles += 1
-        held = Held(made, uuid.uuid4().hex, self._handles)
+        held = HeldEnvironment(made, uuid.uuid4().hex, self._handles)
         self._held[held.instance_id] = self._by_handle[held.handle] = held
         if self.form.bare_id:
             return held.instance_id
@@ -260,7 +260,7 @@ class Session:
         _check(isinstance(actions, list), "actions must be a list")
         self.allow(held, len(actions))
         decoded = [self._action(held, action) for action in actions]
-        steps = [held.instance.processed(Step(*step)) for step in held.instance.steps(decoded)]
+        steps = [held.instance.processed(InstanceStep(*step)) for step in held.instance.steps(decoded)]
         columns = [[step[at] for step in steps] for at in range(5)]
         if not held.instance.num_envs:
             columns[1] = [number(reward) for reward in columns[1]]
@@ -304,7 +304,7 @@ class Session:
 
     # ---- what the methods share
 
-    def allow(self, held: Held, steps: int) -> None:
+    def allow(self, held: HeldEnvironment, steps: int) -> None:
         """Check the limits of a request for so many steps. Raises LimitReached."""
         if steps > arrays.MAX_STEPS:
             raise LimitReached(f"One request may ask for {arrays.MAX_STEPS} steps, not for {steps}.")
@@ -315,19 +315,19 @@ class Session:
         if self._rate is not None:
             self._rate.take(steps * held.instance.size, time.monotonic())
 
-    def _find(self, instance_id: Any) -> Held:
+    def _find(self, instance_id: Any) -> HeldEnvironment:
         try:
             return self._held[instance_id]
         except (KeyError, TypeError):
             raise InstanceNotFound(short(str(instance_id), 80)) from None
 
-    def _action(self, held: Held, action: Any) -> Any:
+    def _action(self, held: HeldEnvironment, action: Any) -> Any:
         try:
             return held.decode(action)
         except CodecError as error:
             raise WrongAction(json.dumps(action), str(error)) from None
 
-    def _plain(self, found: Step) -> str:
+    def _plain(self, found: InstanceStep) -> str:
         """The answer to the usual step, as fast as can be: numbers in an array, and no info. Empty for another one."""
         observation, reward, terminated, truncated, info = found
         if info or type(observation) is not np.ndarray or observation.dtype.kind not in "fiu":
@@ -338,7 +338,7 @@ class Session:
         said = f"[{observation.tolist()!r},{reward!r},{end}"  # Python writes finite numbers as JSON has them
         return "" if "n" in said else said  # but nan and inf
 
-    def _shaped(self, found: Step, made: Instance) -> list[Any]:
+    def _shaped(self, found: InstanceStep, made: Instance) -> list[Any]:
         observation, reward, terminated, truncated, info = found
         if type(observation) is np.ndarray and not self.form.arrays:
             observation = observation.tolist()
@@ -353,7 +353,7 @@ class Session:
             info = {**info, instance.CUT_OFF: not terminated}
         return [observation, reward, bool(terminated or truncated), info]
 
-    def _described(self, held: Held) -> dict[str, Any]:
+    def _described(self, held: HeldEnvironment) -> dict[str, Any]:
         made = held.instance
         return {
             "instance_id": held.instance_id,

@@ -22,10 +22,10 @@ from pathlib import Path
 
 from trial.gym import handover, linux
 from trial.gym.forms import ARRAYS, NAMES
-from trial.gym.handover import Ended, Start
+from trial.gym.handover import Ended, NewConnection
 from trial.gym.limits import Limits
 from trial.gym.wakeup import Wakeup
-from trial.gym.worker import State
+from trial.gym.worker import WorkerState
 from trial.gym.worker import main as work
 
 TICK_SECONDS = 0.25
@@ -40,7 +40,7 @@ _AWAY, _FAILED = 1001, 1011  # close codes
 class _Watched:
     number: int
     slot: int
-    state: State
+    state: WorkerState
     interrupted: bool = False
     verdict: tuple[int, str] | None = None
 
@@ -95,7 +95,7 @@ class Spawner:
         self._watch(time.monotonic())
         return True
 
-    def _start(self, start: Start, wakeup: Wakeup) -> None:
+    def _start(self, start: NewConnection, wakeup: Wakeup) -> None:
         if not self._free:
             self._reap()  # one may have ended since
         if not self._free:
@@ -103,7 +103,7 @@ class Spawner:
             self._tell(start.number, 1013, f"{self._limits.workers} connections use environments already; try later.")
             return
         slot = min(self._free)
-        state = State(self._memory, slot)
+        state = WorkerState(self._memory, slot)
         try:
             pid = os.fork()
         except OSError as error:
@@ -116,7 +116,7 @@ class Spawner:
         self._free.discard(slot)
         self._workers[pid] = _Watched(start.number, slot, state)
 
-    def _become_worker(self, start: Start, state: State, wakeup: Wakeup) -> None:
+    def _become_worker(self, start: NewConnection, state: WorkerState, wakeup: Wakeup) -> None:
         """In the new process. Does not return."""
         status = 1
         try:

@@ -1,7 +1,7 @@
 """The process of one connection: it owns the socket, and steps the connection's environments in place.
 
 No other thread or process takes part in a request: receive, step, send. What limits it stands in `spawner.py`, which
-watches from outside; `State` is what both know about the moment.
+watches from outside; `WorkerState` is what both know about the moment.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from websockets.protocol import State as Connected
 
 from trial.gym import linux
 from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
-from trial.gym.forms import Form
+from trial.gym.forms import MessageForm
 from trial.gym.limits import Limits
-from trial.gym.recordings import Recorder
-from trial.gym.session import Session
+from trial.gym.recordings import ConnectionRecorder
+from trial.gym.session import GymSession
 from trial.wire import websocket_frames as frames
 
 _READ = 256 * 1024
@@ -37,7 +37,7 @@ _SEND_SECONDS = 30  # that a client may leave a reply unread
 _CLOSE_SECONDS = 2  # that a client has to answer a close
 
 
-class State:
+class WorkerState:
     """A number that worker and spawner share: since when the worker is busy or, negative, has nothing to do."""
 
     def __init__(self, memory: Any, at: int) -> None:
@@ -64,20 +64,25 @@ class State:
         return now + since if since < 0 else 0.0
 
 
-class Gone(Exception):
+class ConnectionGone(Exception):
     """The connection is over."""
 
 
-class Worker:
+class ConnectionWorker:
     """Serves one connection until it ends."""
 
     def __init__(
-        self, connection: socket.socket, form: Form, limits: Limits, state: State, recorder: Recorder | None = None
+        self,
+        connection: socket.socket,
+        form: MessageForm,
+        limits: Limits,
+        state: WorkerState,
+        recorder: ConnectionRecorder | None = None,
     ) -> None:
         self._socket = connection
         self._form = form
         self._state = state
-        self._session = Session(form, limits, recorder)
+        self._session = GymSession(form, limits, recorder)
         self._protocol = Protocol(Side.SERVER, state=Connected.OPEN, max_size=limits.message_bytes, logger=_silent())
         self._most = limits.message_bytes
         self._incomplete = b""
@@ -93,7 +98,7 @@ class Worker:
             self._receive(received)
             while True:
                 self._receive(self._read())
-        except Gone:
+        except ConnectionGone:
             pass
         except OSError as error:
             if error.errno == errno.EBADF:  # the environment has closed the socket; the server tells the client
@@ -107,7 +112,7 @@ class Worker:
     def _read(self) -> bytes:
         data = self._socket.recv(_READ)
         if not data:
-            raise Gone
+            raise ConnectionGone
         return data
 
     def _receive(self, data: bytes) -> None:
@@ -119,7 +124,7 @@ class Worker:
             end = start + length
             if start and length > self._most:
                 self._other_frames(data)  # refuses it
-                raise Gone
+                raise ConnectionGone
             if not start or len(data) < end:
                 break
             masked = start > frames.UNMASKED[data[1] & 0x7F]
@@ -188,7 +193,7 @@ class Worker:
                 self._socket.sendall(part)
         if self._protocol.close_sent is not None:
             self._drain()
-            raise Gone
+            raise ConnectionGone
 
     def _drain(self) -> None:
         """Read on for a moment after a close: the system discards what it has sent if there is something unread."""
@@ -210,9 +215,9 @@ class Worker:
 def main(
     connection: socket.socket,
     received: bytes,
-    form: Form,
+    form: MessageForm,
     limits: Limits,
-    state: State,
+    state: WorkerState,
     *,
     output: bool,
     record: Path | None,
@@ -227,8 +232,8 @@ def main(
     linux.limit_memory(limits.megabytes)
     connection.setblocking(True)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", _SEND_SECONDS, 0))
-    recorder = None if record is None else Recorder(record)
-    Worker(connection, form, limits, state, recorder).run(received)
+    recorder = None if record is None else ConnectionRecorder(record)
+    ConnectionWorker(connection, form, limits, state, recorder).run(received)
 
 
 def _discard_output() -> None:

@@ -15,7 +15,7 @@ from trial.interactive_gym.configuration_constants import ActionSettings, InputM
 from trial.interactive_gym.looking import Look
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.sources import MADE, Source
+from trial.interactive_gym.sources import MADE, ConfigModule
 
 LEAST_PATIENCE, MOST_PATIENCE = 10, 3600
 """Seconds, as `project.patience` may be."""
@@ -26,7 +26,7 @@ _MADE_BY = "made by `python {file}`; change that file and run it again"
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class MadeProject:
     """A project that was made."""
 
     folder: Path
@@ -34,7 +34,7 @@ class Made:
     """What has no effect, or is not as in Interactive Gym."""
 
 
-def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, ...] = ()) -> Made:
+def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, ...] = ()) -> MadeProject:
     """Make the project in `folder`, or beside the experiment's file.
 
     A file that was changed by hand since it was made stays. Raises Unplayable if the experiment cannot be played here
@@ -47,10 +47,12 @@ def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, 
     files = files_of(config, source, target, remarks.append)
     remarks += ignored(config)
     remarks += write(target, files)
-    return Made(target, remarks)
+    return MadeProject(target, remarks)
 
 
-def files_of(config: RemoteConfig, source: Source, target: Path, remark: Callable[[str], None]) -> dict[str, bytes]:
+def files_of(
+    config: RemoteConfig, source: ConfigModule, target: Path, remark: Callable[[str], None]
+) -> dict[str, bytes]:
     """The project's files, by their paths there. Raises Unplayable, and what the experiment's code raises."""
     look = looking.look(config)
     looking.check_actions(config, look.actions)
@@ -150,7 +152,7 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
     return trial
 
 
-def agent_file(source: Source, policies: list[tuple[str, Any]]) -> str:
+def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
     """The project's agent.py: the experiment's agent, and a class for each policy: its name and the player."""
     lines = [
         f'"""The agent of {source.file.name}, {_MADE_BY.format(file=source.file.name)}."""',
@@ -221,7 +223,7 @@ def _players(
     return found
 
 
-def _project(config: RemoteConfig, source: Source, steps: list[str]) -> dict[str, Any]:
+def _project(config: RemoteConfig, source: ConfigModule, steps: list[str]) -> dict[str, Any]:
     named = "page_title" in config.given
     project: dict[str, Any] = {
         "id": _id(config.env_name or source.file.stem),
@@ -248,7 +250,7 @@ def _keys(key: Any) -> str:
     return "+".join(map(str, key)) if isinstance(key, tuple) else str(key)
 
 
-def _yaml(document: Mapping[str, Any], source: Source) -> str:
+def _yaml(document: Mapping[str, Any], source: ConfigModule) -> str:
     import yaml  # noqa: PLC0415 - servers do without
 
     head = f"# {source.file.name}, {_MADE_BY.format(file=source.file.name)}.\n\n"

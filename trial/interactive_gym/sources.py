@@ -32,7 +32,7 @@ _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ConfigModule:
     """The module in which a config stands."""
 
     module: str
@@ -43,7 +43,7 @@ class Source:
     names: Mapping[str, Any]
 
 
-def find(*configs: Any) -> Source:
+def find(*configs: Any) -> ConfigModule:
     """Where one of these stands. Raises Unplayable unless it is a variable of a module of the researcher's.
 
     What stands below `if __name__ == "__main__"` is a variable too, but not on a server, so the last one counts most.
@@ -57,7 +57,7 @@ def find(*configs: Any) -> Source:
     )
 
 
-def _find(config: Any) -> Source | None:
+def _find(config: Any) -> ConfigModule | None:
     main = sys.modules.get("__main__")
     others = [module for module in list(sys.modules.values()) if module is not main and _file(module) is not None]
     for module in filter(None, (main, *others)):
@@ -70,7 +70,7 @@ def _find(config: Any) -> Source | None:
     return None
 
 
-def _source(module: ModuleType, variable: str, file: Path) -> Source:
+def _source(module: ModuleType, variable: str, file: Path) -> ConfigModule:
     spec = getattr(module, "__spec__", None)
     name = spec.name if spec is not None else file.stem if module.__name__ == "__main__" else module.__name__
     if name.partition(".")[0] in _TAKEN:
@@ -78,10 +78,10 @@ def _source(module: ModuleType, variable: str, file: Path) -> Source:
     if not all(part.isidentifier() for part in name.split(".")):
         raise Unplayable(f"give {file.name} a name that Python can import: letters, digits, underscores")
     root = file.parents[name.count(".")]
-    return Source(name, variable, file, root, vars(module))
+    return ConfigModule(name, variable, file, root, vars(module))
 
 
-def locate(source: Source) -> Any:
+def locate(source: ConfigModule) -> Any:
     """A function that finds a file that an option names: from here, or from the experiment's file upwards."""
     here = [Path.cwd(), source.file.parent, *list(source.file.parents)[1:5]]
 
@@ -98,7 +98,7 @@ def locate(source: Source) -> Any:
     return find_file
 
 
-def belonging(source: Source, target: Path) -> tuple[dict[str, Path], list[str]]:
+def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list[str]]:
     """The files that go into the project, by their paths there, and sentences about those that do not.
 
     They are the modules that the experiment has imported from folders of the researcher's, and all that lies beside its

@@ -42,7 +42,7 @@ class AssetError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Animation:
+class AtlasAnimation:
     """Frames of an atlas that are shown one after the other."""
 
     frames: tuple[str, ...]
@@ -63,7 +63,7 @@ class Asset:
     hash: str
     """Of `packed`; the same bytes have the same hash."""
     frames: Mapping[str, Box] = field(default_factory=dict)
-    animations: Mapping[str, Animation] = field(default_factory=dict)
+    animations: Mapping[str, AtlasAnimation] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def read(path: Path, name: str) -> Asset:
     image = _bytes(path)
     kind, size = _kind(image)
     frames: dict[str, Box] = {}
-    animations: dict[str, Animation] = {}
+    animations: dict[str, AtlasAnimation] = {}
     atlas = path.with_suffix(".json")
     if atlas.is_file() and not atlas.is_symlink():
         try:
@@ -182,7 +182,7 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
 # ---- atlases
 
 
-def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[str, Animation]]:
+def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[str, AtlasAnimation]]:
     """The frames and animations of an atlas: TexturePacker's and Phaser's JSON, or frames of one size.
 
     Raises AssetError. https://docs.phaser.io/phaser/concepts/textures#atlas names the forms.
@@ -245,7 +245,7 @@ def _is_whole(value: Any, least: int) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= LONGEST_SIDE
 
 
-def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> Animation:
+def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> AtlasAnimation:
     if isinstance(value, list):
         value = {"frames": value}
     listed = value.get("frames") if isinstance(value, dict) else None
@@ -257,4 +257,4 @@ def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> Animation:
     rate = value.get("frameRate", 8)
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not math.isfinite(rate) or not 0 < rate <= 240:
         raise AssetError(f"has the animation {name[:40]!r} with a frameRate that is no number up to 240")
-    return Animation(tuple(str(each) for each in listed), rate)
+    return AtlasAnimation(tuple(str(each) for each in listed), rate)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.pictures.assets import Asset, Assets
 from trial.pictures.frames import Frame
 from trial.pictures.scene import Scene

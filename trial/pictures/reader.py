@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.pictures import frames
 from trial.pictures.assets import Assets
 from trial.pictures.picture import Picture, as_picture

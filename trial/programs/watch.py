@@ -26,7 +26,7 @@ _UNREAD = 1000  # lines that wait for a program; one more ends its connection
 _UNREAD_BYTES = 16 * 1024**2  # the same of their bytes; a single line may be longer
 
 Advise = Callable[[int, str | None], None]
-"""Takes the number of an action, and the player or None (`Progress.advise`). Raises CommandRefused."""
+"""Takes the number of an action, and the player or None (`TrialProgress.advise`). Raises CommandRefused."""
 
 
 class Watchers:

@@ -11,7 +11,7 @@ from typing import Any
 
 from protocol.answer import GAME, Answer, answers_in, to_json
 from protocol.keys import answer_key
-from protocol.trial import Trial
+from protocol.trial import TrialSection
 from trial.core.effects import OpenRecording
 from trial.core.players import Player
 from trial.core.unfinished import RecordedTrial
@@ -20,7 +20,7 @@ from trial.recordings.recording import Recording
 from trial.recordings.resume import load_recorded
 from trial.recordings.spool import Spool, retry_forever, store_file
 from trial.recordings.store import Store, short_error
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
 
@@ -31,7 +31,7 @@ FLUSH_SECONDS = 0.5
 class Recorder:
     """Writes what one trial leaves behind, and reads what earlier servers left of the same step."""
 
-    def __init__(self, settings: Settings, step: str, trial_id: str, store: Store, spool: Spool) -> None:
+    def __init__(self, settings: TrialSettings, step: str, trial_id: str, store: Store, spool: Spool) -> None:
         self._settings = settings
         self._step = step
         self._trial_id = trial_id
@@ -218,12 +218,12 @@ class Recorder:
         await retry_forever("write the answer", lambda: asyncio.to_thread(self._store.create, key, data))
 
 
-def _whose(settings: Settings) -> dict[str, Any]:
+def _whose(settings: TrialSettings) -> dict[str, Any]:
     """Whose recording it is. No participant's id stands in that of a session."""
     return {"sessionId": settings.session, "group": settings.group} if settings.session else {"user": settings.user_id}
 
 
-def rules(config: Trial, players: Sequence[Player]) -> dict[str, Any]:
+def rules(config: TrialSection, players: Sequence[Player]) -> dict[str, Any]:
     """By which rules several players act: what is needed to take the steps of a recording again.
 
     `idleActions` are the numbers that the environment was given for players whose `action` is null.

@@ -15,7 +15,7 @@ from typing import TypeVar
 from protocol.keys import with_number
 from trial.recordings.recording import Recording
 from trial.recordings.store import FolderStore, Store, short_error
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 T = TypeVar("T")
 log = logging.getLogger("trial")
@@ -26,7 +26,7 @@ _LONGEST_PAUSE = 20.0
 class Spool:
     """The folder where recordings are written before they are stored."""
 
-    def __init__(self, settings: Settings, store: Store) -> None:
+    def __init__(self, settings: TrialSettings, store: Store) -> None:
         self.local_only = not settings.trial.s3upload
         if settings.spool is not None:
             self.folder = settings.spool

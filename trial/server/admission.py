@@ -28,7 +28,7 @@ from trial.server.handshake import (
     show_refusal,
     tokens_for,
 )
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire.reconnects import Reconnects
 
 log = logging.getLogger("trial")
@@ -45,7 +45,7 @@ class Admission:
     """
 
     def __init__(
-        self, settings: Callable[[], Settings], search: Search, store: Store, finished_steps: Collection[str]
+        self, settings: Callable[[], TrialSettings], search: Search, store: Store, finished_steps: Collection[str]
     ) -> None:
         self._settings = settings
         self._search = search

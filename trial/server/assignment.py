@@ -18,21 +18,21 @@ from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key, session_key
 from protocol.session import BadSession, Session, is_session_id
 from trial.recordings.store import Store, short_error
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
 
 Found = Handover | Session
 
 
-def assigned(settings: Settings, found: Handover) -> Settings:
+def assigned(settings: TrialSettings, found: Handover) -> TrialSettings:
     """The settings of a warm server after its handover: those of an ordinary server, or of a session's."""
     if is_session_id(found.user_id):
         return replace(settings, warm_server=False, session=found.user_id, group=found.group, server=found.server)
     return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
 
 
-def formed(settings: Settings, found: Session) -> Settings:
+def formed(settings: TrialSettings, found: Session) -> TrialSettings:
     """The settings of a session's server once its members are known. Raises BadSession."""
     if found.id != settings.session:
         raise BadSession("its document is that of another session")
@@ -60,14 +60,14 @@ class Search:
     The interval is `warm_server_seconds` of the settings.
     """
 
-    def __init__(self, store: Store, settings: Settings) -> None:
+    def __init__(self, store: Store, settings: TrialSettings) -> None:
         self._store = store
         self._settings = settings
         self._asked = asyncio.Event()
         self._looked = asyncio.Event()
         self._logged = ""
 
-    async def run(self, assign: Callable[[Settings, Found], Awaitable[None]]) -> None:
+    async def run(self, assign: Callable[[TrialSettings, Found], Awaitable[None]]) -> None:
         """Look until all is known. `assign` is told of each document; it has returned before any `look` returns."""
         while not self._settings.assigned:
             looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next one
@@ -89,7 +89,7 @@ class Search:
         self._asked.set()
         await looked.wait()
 
-    async def _find(self) -> tuple[Settings, Found] | None:
+    async def _find(self) -> tuple[TrialSettings, Found] | None:
         """The next document, and the settings with what it says."""
         settings, found, problem = self._settings, None, ""
         try:
@@ -105,14 +105,14 @@ class Search:
         return found
 
 
-def _key(settings: Settings) -> str:
+def _key(settings: TrialSettings) -> str:
     """The key of the document that says what is not known yet."""
     if settings.warm_server:
         return handover_key(settings.project_id, settings.server)
     return session_key(settings.project_id, settings.session)
 
 
-def _read(settings: Settings, body: bytes) -> tuple[Settings, Found]:
+def _read(settings: TrialSettings, body: bytes) -> tuple[TrialSettings, Found]:
     """Raises BadHandover and BadSession."""
     if settings.warm_server:
         given = handover.parse(body)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trial.recordings.store import Store, open_store
-from trial.settings import Settings, SettingsError
+from trial.settings import SettingsError, TrialSettings
 
 RELOAD_SECONDS = 3600.0
 
@@ -29,7 +29,7 @@ class Certificate:
     does not fit or is missing, because the two were read while a new certificate replaced them.
     """
 
-    def __init__(self, settings: Settings, store: Store) -> None:
+    def __init__(self, settings: TrialSettings, store: Store) -> None:
         self._chain_key = settings.ssl_fullchain
         self._private_key = settings.ssl_privkey
         self._store = store if not settings.ssl_bucket else open_store(_place(settings.ssl_bucket))

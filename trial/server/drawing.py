@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.frames import Frame

@@ -18,7 +18,7 @@ from protocol.session import member_token
 from trial.core import messages
 from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
 from trial.programs import environments, watch
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire import notice, plain
 from trial.wire.connection import SUBPROTOCOLS
 from trial.wire.inbound import RateLimit
@@ -89,7 +89,7 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
     return hello if hello.token is not None else replace(hello, token=token_in_address(websocket))
 
 
-def tokens_for(settings: Settings, user_id: str | None) -> tuple[str, ...]:
+def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
     """The tokens with which a client that says this id may play.
 
     In a session it is the member's own (`protocol.session.member_token`). The server's token opens no session: who has
@@ -103,7 +103,7 @@ def tokens_for(settings: Settings, user_id: str | None) -> tuple[str, ...]:
     return own if settings.session else (settings.token,)
 
 
-def check_member(websocket: ServerConnection, user_id: str | None, settings: Settings) -> None:
+def check_member(websocket: ServerConnection, user_id: str | None, settings: TrialSettings) -> None:
     """Check that the participant is a member of the session, and that their client speaks ours. Raises CloseConnection.
 
     What a client without a subprotocol sends along is recorded, and could hold another member's id.

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from trial.server.watchdog import Watchdog
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 _LOOK_AGAIN_SECONDS = 5.0
 _LONGEST_TIMER = 86400.0  # the event loop refuses an infinite time
@@ -19,7 +19,7 @@ _LONGEST_TIMER = 86400.0  # the event loop refuses an infinite time
 class Lifetime:
     """Ends the server once, with a reason. `saving` tells whether an idle server has still something to store."""
 
-    def __init__(self, settings: Settings, saving: Callable[[], bool]) -> None:
+    def __init__(self, settings: TrialSettings, saving: Callable[[], bool]) -> None:
         self._loop = asyncio.get_running_loop()
         self._saving = saving
         self._ended: asyncio.Future[str] = self._loop.create_future()

@@ -16,7 +16,7 @@ from trial.recordings.store import Store
 from trial.server.certificate import RELOAD_SECONDS, Certificate
 from trial.server.handshake import process_request, select_subprotocol
 from trial.server.preauth_limit import PreauthLimitedSocket
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire.connection import SUBPROTOCOLS
 from trial.wire.player_socket import PlayerSocket
 
@@ -31,7 +31,9 @@ CLOSE_SECONDS = 2.0
 class Listener:
     """Accepts connections. `handle` is called for each one that speaks WebSocket."""
 
-    def __init__(self, settings: Settings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]) -> None:
+    def __init__(
+        self, settings: TrialSettings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]
+    ) -> None:
         self._settings = settings
         self._handle = handle
         self._certificate = Certificate(settings, store) if settings.tls else None

@@ -23,7 +23,6 @@ from trial.core.effects import (
     CloseRecording,
     Effect,
     FeedbackCall,
-    Log,
     LogAgentError,
     OpenRecording,
     RecordLine,
@@ -39,6 +38,7 @@ from trial.core.effects import (
     StepCall,
     TellMoved,
     WriteLine,
+    WriteLog,
 )
 from trial.core.messages import Message
 from trial.core.players import Player, PlayersError
@@ -53,7 +53,7 @@ from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
 from trial.server.callbacks import TrialCallbacks
 from trial.server.started import Started, Table
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire.connection import Connection
 
 log = logging.getLogger("trial")
@@ -64,7 +64,7 @@ class TrialLoop:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: TrialSettings,
         step: str,
         *,
         worker: Worker,
@@ -116,7 +116,7 @@ class TrialLoop:
             CloseRecording: lambda _: self._recorder.close(),
             SaveAnswer: self._save,
             SaveMember: self._save_member,
-            Log: lambda effect: log.log(effect.level, effect.text),
+            WriteLog: lambda effect: log.log(effect.level, effect.text),
             LogAgentError: self._log_agent_error,
             AskPolicy: self._places.ask,
             ResetPolicy: self._places.reset,

@@ -21,7 +21,7 @@ from trial.agent.tracebacks import report
 from trial.agent.worker import Worker
 from trial.core.effects import AgentTimeout
 from trial.recordings.store import Store, short_error
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
 
@@ -32,7 +32,7 @@ LOOK_SECONDS = 2.0
 class Matching:
     """Answers questions until the server has members."""
 
-    def __init__(self, store: Store, settings: Callable[[], Settings], function: Callable[..., Any]) -> None:
+    def __init__(self, store: Store, settings: Callable[[], TrialSettings], function: Callable[..., Any]) -> None:
         """`settings` returns those of now."""
         self._store = store
         self._settings = settings

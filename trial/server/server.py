@@ -47,7 +47,7 @@ from trial.server.loop import TrialLoop
 from trial.server.matching import Matching
 from trial.server.private_log import WithoutIds
 from trial.server.started import Started
-from trial.settings import Settings
+from trial.settings import TrialSettings
 from trial.wire import round_trips
 from trial.wire.connection import Connection
 from trial.wire.inbound import Inbound
@@ -65,10 +65,10 @@ _TOLD_SECONDS = 0.3  # the same, once a client has been told
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
-class Server:
+class TrialServer:
     """The server of one participant, or of one session. `run` returns the process's exit status."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: TrialSettings) -> None:
         self.settings = settings
         self._store: Store
         self._spool: Spool
@@ -185,7 +185,7 @@ class Server:
             return
         await Matching(self._store, lambda: self.settings, function).run()
 
-    async def _assign(self, settings: Settings, found: Found) -> None:
+    async def _assign(self, settings: TrialSettings, found: Found) -> None:
         """Make this server the one of the participant or the session that was found."""
         if self.settings.warm_server:
             self._keep(self._store_files(await self._leftovers(settings)))
@@ -197,7 +197,7 @@ class Server:
         if settings.assigned:
             self._lifetime.expect_participant()
 
-    async def _leftovers(self, settings: Settings) -> list[tuple[str, Path]]:
+    async def _leftovers(self, settings: TrialSettings) -> list[tuple[str, Path]]:
         """Recordings that an earlier process of this server left. Call it before this process records anything."""
         if not self._spool.local_only:
             with contextlib.suppress(OSError):

@@ -12,7 +12,7 @@ from trial.agent.joint import JointAdapter
 from trial.core.players import PLAYER, Player, PlayersError, who_plays
 from trial.policies.places import load_policies
 from trial.policies.policy import Policy
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +37,14 @@ class Table:
 class Started:
     """What a trial is played with. Its methods block; they are for the agent's thread."""
 
-    settings: Settings
+    settings: TrialSettings
     agent: AgentAdapter | JointAdapter
     callbacks: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     """Those that the agent has."""
     _loaded: dict[int | None, Table] = field(default_factory=dict)
 
     @classmethod
-    def start(cls, adapter: AgentAdapter, settings: Settings) -> Started:
+    def start(cls, adapter: AgentAdapter, settings: TrialSettings) -> Started:
         """Start the agent, and load the policies of every group that the server may get.
 
         Raises PlayersError and PolicyError with a sentence, AgentError, and whatever the researcher's code raises.
@@ -61,7 +61,7 @@ class Started:
         """The group, if who plays whom differs between groups."""
         return group if self.settings.trial.groups() else None
 
-    def take(self, settings: Settings) -> Table:
+    def take(self, settings: TrialSettings) -> Table:
         """Who plays whom, for one trial: the next one gets policies of its own. Raises as `start`.
 
         `settings` are those of now: a server may have learnt its group and its session since it has started.
@@ -69,7 +69,7 @@ class Started:
         table = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
         return self._with_members(table, settings) if settings.session else table
 
-    def _with_members(self, table: Table, settings: Settings) -> Table:
+    def _with_members(self, table: Table, settings: TrialSettings) -> Table:
         """The table of a session: each member has a place, and `substitute` plays in the places that are left."""
         config, seats = settings.trial, [player.name for player in table.players if player.human]
         if len(seats) != settings.players:

@@ -15,7 +15,7 @@ from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import Server, State, next_attempt
+from hippodrome.model.server import Server, ServerState, next_attempt
 from hippodrome.ports import Documents, Platform, Topic
 from hippodrome.servers import causes, resources
 from hippodrome.storage.repository import Repository
@@ -32,10 +32,10 @@ Reach = Callable[[str], object]  # asks an https address; raises OSError without
 
 STAGES = {
     None: "the start message is on its way",
-    State.STARTING: "the server is starting",
-    State.NAMING: "it runs, and its name is being made known",
-    State.READY: "ready",
-    State.CLOSED: "closed",
+    ServerState.STARTING: "the server is starting",
+    ServerState.NAMING: "it runs, and its name is being made known",
+    ServerState.READY: "ready",
+    ServerState.CLOSED: "closed",
 }
 
 
@@ -43,10 +43,10 @@ STAGES = {
 class SecondsToStates:
     """Seconds from the start message to each state."""
 
-    seconds: dict[State, float] = field(default_factory=dict)
+    seconds: dict[ServerState, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        names = {State.STARTING: "claimed", State.NAMING: "running", State.READY: "ready"}
+        names = {ServerState.STARTING: "claimed", ServerState.NAMING: "running", ServerState.READY: "ready"}
         return ", ".join(f"{names[state]} after {seconds:.0f} s" for state, seconds in self.seconds.items())
 
 
@@ -111,9 +111,9 @@ class Rehearsal:
             self._record = record or self._record
             state = record.state if record else None
             self._told(f"{seconds:3.0f} s  {STAGES[state]}")
-            if record and state is not State.CLOSED:
+            if record and state is not ServerState.CLOSED:
                 self.took.seconds.setdefault(record.state, seconds)
-            if state is State.READY:
+            if state is ServerState.READY:
                 return
             if record and record.is_closed and next_attempt(record) is None:
                 raise CheckFailed(f"The server was closed: {record.reason}.", _why(record))
@@ -128,7 +128,7 @@ class Rehearsal:
 
     def _late(self, record: Server | None) -> CheckFailed:
         """Why it may have taken too long: the state, and whether ECS knows the task."""
-        if record is not None and record.state is State.STARTING:
+        if record is not None and record.state is ServerState.STARTING:
             if self._platform.tasks.find(record.name, record.cluster):
                 return CheckFailed(
                     f"Its task was started {WAIT:.0f} seconds ago, and no word of it has come.",
@@ -139,7 +139,7 @@ class Rehearsal:
                 f"There is no task after {WAIT:.0f} seconds.",
                 "It was not run, or it ended at once: see `python -m deploy logs start_server` and `… logs trial`.",
             )
-        if record is not None and record.state is State.NAMING:
+        if record is not None and record.state is ServerState.NAMING:
             return CheckFailed(
                 f"It runs, and its name is not known everywhere after {WAIT:.0f} seconds.",
                 "See `python -m deploy logs task_changed`.",

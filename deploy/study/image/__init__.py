@@ -13,7 +13,7 @@ from deploy.aws.account import Account, Installation
 from deploy.study.image import docker
 from deploy.study.image.bundle import Bundle, make_bundle
 from deploy.study.image.codebuild import Builder
-from deploy.study.image.ecr import Repository, content_tag
+from deploy.study.image.ecr import ImageRepository, content_tag
 from deploy.study.image.order import Order
 
 __all__ = ["Image", "Plan", "build", "plan"]
@@ -54,7 +54,7 @@ def plan(
     Raises `Problem`.
     """
     bundle = make_bundle(folder, base, trial)
-    repository = Repository(account, installation["Repository"])
+    repository = ImageRepository(account, installation["Repository"])
     content = content_tag(project_id, bundle.hash)
     images = repository.images()
     cache = "" if again else images.alike(project_id)

@@ -18,7 +18,7 @@ from console import formatting, screen
 from console.problem import Problem
 from deploy.aws.account import Account
 from deploy.study.image.bundle import HERE
-from deploy.study.image.follow import Log
+from deploy.study.image.follow import BuildLog
 from deploy.study.image.order import Order
 from hippodrome.aws import errors
 
@@ -116,7 +116,7 @@ class Builder:
 
 
 def _follow(account: Account, build_id: str) -> None:
-    client, log = account.client("codebuild"), Log()
+    client, log = account.client("codebuild"), BuildLog()
     token: str | None = None
     shown = ""
     while True:
@@ -136,7 +136,7 @@ def _follow(account: Account, build_id: str) -> None:
         raise _failure(build, log)
 
 
-def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log: Log) -> str | None:
+def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log: BuildLog) -> str | None:
     """Show what is new in the build's log; where to go on."""
     place = build.get("logs", {})
     if not place.get("groupName") or not place.get("streamName"):
@@ -158,7 +158,7 @@ def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log
         token = page["nextForwardToken"]
 
 
-def _failure(build: Mapping[str, Any], log: Log) -> Problem:
+def _failure(build: Mapping[str, Any], log: BuildLog) -> Problem:
     status = build["buildStatus"]
     said = [
         f"{phase['phaseType']}: {context['message']}"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from console import screen
 from console.problem import Problem
-from deploy.study.image.ecr import Repository
-from deploy.study.image.follow import Log
+from deploy.study.image.ecr import ImageRepository
+from deploy.study.image.follow import BuildLog
 from deploy.study.image.order import Order
 
 PATIENCE = 15  # seconds for an answer of the engine
@@ -41,7 +41,7 @@ def build(order: Order) -> None:
     command += ["--cache-from", f"type=registry,ref={order.cache_from}"] if order.cache_from else []
     with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
         order.bundle.write_folder(Path(folder))
-        log = Log()
+        log = BuildLog()
         with subprocess.Popen(
             [*command, "--tag", order.image, "--push", folder],
             stdin=subprocess.DEVNULL,
@@ -62,7 +62,7 @@ def build(order: Order) -> None:
             raise log.failure("The image could not be built.")
 
 
-def _login(repository: Repository) -> None:
+def _login(repository: ImageRepository) -> None:
     command = ["docker", "login", "--username", "AWS", "--password-stdin", repository.registry]
     done = subprocess.run(command, input=repository.password(), capture_output=True, text=True, check=False)
     if done.returncode:

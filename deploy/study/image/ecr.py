@@ -35,7 +35,7 @@ class Tagged(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Repository:
+class ImageRepository:
     """A repository by its URI, such as 123456789012.dkr.ecr.ca-central-1.amazonaws.com/hippodrome."""
 
     account: Account

@@ -48,7 +48,7 @@ _ADVICE: tuple[tuple[str, str], ...] = (
 )
 
 
-class Log:
+class BuildLog:
     """The lines of a build. They are shown, and the last ones kept."""
 
     def __init__(self, show: Callable[[str], None] | None = None) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from deploy.study.image.bundle import Bundle
-from deploy.study.image.ecr import Repository
+from deploy.study.image.ecr import ImageRepository
 
 
 @dataclass(frozen=True)
 class Order:
     """Build this bundle and push it to the repository under this tag."""
 
-    repository: Repository
+    repository: ImageRepository
     content: str  # the tag that says what is in it, the same for the same bundle
     tag: str
     bundle: Bundle

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from hippodrome.http import Response
 from hippodrome.model.project import Project, Step
-from hippodrome.participants.forms import Form
+from hippodrome.participants.forms import PostedForm
 from hippodrome.participants.steps.game import GameStep
 from hippodrome.participants.steps.page import PageStep
 from hippodrome.participants.steps.services import StepServices
@@ -20,7 +20,7 @@ class StepHandler(Protocol):
     def show(self, visit: Visit) -> Response:
         """Return the response to a GET. Raises `PageError` if the step cannot be shown."""
 
-    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
         """Handle a form that the participant may send at this step."""
 
 

@@ -12,9 +12,9 @@ from hippodrome.http import Response
 from hippodrome.model import ids, participant, server
 from hippodrome.model.messages import StartServer, to_message
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, State, next_attempt, requestable_attempt
+from hippodrome.model.server import Server, ServerState, next_attempt, requestable_attempt
 from hippodrome.participants import frame, pages
-from hippodrome.participants.forms import Form
+from hippodrome.participants.forms import PostedForm
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.shared_game import SharedGame, StepAnswered
 from hippodrome.participants.steps.sources import rendering, source_of
@@ -79,7 +79,7 @@ class GameStep:
         project, cache = visit.project, self._services.project_cache
         return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
 
-    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
         """Request another server, if the form asks for a restart and the participant may have one."""
         if form.action != "restart":
             return
@@ -131,7 +131,7 @@ class GameStep:
         now, full = self._services.platform.now(), server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else next_attempt(record)
-        stuck = record.state is State.STARTING and now - record.requested > STUCK
+        stuck = record.state is ServerState.STARTING and now - record.requested > STUCK
         return record.attempt if stuck else None
 
     def _request_server(self, project: Project, owner: str, attempt: int, players: int = 0) -> None:
@@ -144,7 +144,7 @@ def _page_for_program(view: pages.GameView, method: str) -> str:
 
     That front end polls only after a form whose answer says `wait`. After a game it asks once, with a GET.
     """
-    if view.state["state"] == State.READY:
+    if view.state["state"] == ServerState.READY:
         return "show_game_page"
     moved = view.state["replaces"] and not pages.is_over(view.state)
     if (method == "GET" and moved) or (pages.is_over(view.state) and not (method == "POST" and view.state["again"])):

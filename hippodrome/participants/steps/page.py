@@ -7,7 +7,7 @@ from hippodrome.http import Response
 from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import frame, pages
-from hippodrome.participants.forms import Form
+from hippodrome.participants.forms import PostedForm
 from hippodrome.participants.steps.services import StepServices
 from hippodrome.participants.steps.sources import rendering, source_of
 from hippodrome.participants.steps.visit import Visit
@@ -44,6 +44,6 @@ class PageStep:
             page = pages.step_page(view)
         return http.html(200, page.html, page.headers)
 
-    def post(self, project: Project, user_id: str, step: Step, form: Form) -> None:
+    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
         """Store the answers, which moves the participant on (`participants/answers.py`)."""
         self._services.answers.store(project, user_id, step, form.answers)

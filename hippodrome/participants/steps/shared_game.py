@@ -13,7 +13,7 @@ from hippodrome.lobby.lobby import Lobby, LobbyState, NoServerYet
 from hippodrome.model import participant
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.participants.pages import LOBBY
 from hippodrome.participants.steps.services import StepServices
 from protocol.session import member_token
@@ -139,6 +139,6 @@ class SharedGame:
 
 def _not_yet_ready(record: Server | None) -> Server | None:
     """The record of a server that is not the session's for good: nobody is told its address."""
-    if record is None or record.state is not State.READY:
+    if record is None or record.state is not ServerState.READY:
         return record
-    return msgspec.structs.replace(record, state=State.NAMING)
+    return msgspec.structs.replace(record, state=ServerState.NAMING)

@@ -14,7 +14,7 @@ from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Conflict, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.errors import RetryLater
@@ -44,7 +44,7 @@ class Handovers:
             return None
         warm_id, entry = taken
         found = self._repository.server(ids.server_label(project.id, warm_id))
-        if found is None or found.server.state is not State.READY:
+        if found is None or found.server.state is not ServerState.READY:
             return None  # it has ended; the sweep removes it from its pool
         warm_server, attempt = found.server, stored.server.attempt
         named = self._repository.update(
@@ -69,7 +69,9 @@ class Handovers:
         assigned = self._repository.update(
             named,
             lambda r: (
-                server.assigned(r, warm_server, now) if r.name == record.name and r.state is State.STARTING else None
+                server.assigned(r, warm_server, now)
+                if r.name == record.name and r.state is ServerState.STARTING
+                else None
             ),
         )
         if assigned is None:
@@ -82,7 +84,7 @@ class Handovers:
         """Delete the handover document of the record's warm server, if it has one, before the record is closed."""
         if record.warm_server_name:
             self._pools.delete_handover(record.project_id, record.warm_server_name)
-            if record.state is State.STARTING:  # the handover was interrupted by a stop
+            if record.state is ServerState.STARTING:  # the handover was interrupted by a stop
                 self._take_over(record)
 
     def _take_over(self, record: Server) -> Server | None:
@@ -93,7 +95,7 @@ class Handovers:
         now, label = self._platform.now(), record.label
         found = self._repository.server(record.warm_server_label)
         taken = self._repository.update(
-            found, lambda s: server.handed_over(s, label, now) if s.state is State.READY else None
+            found, lambda s: server.handed_over(s, label, now) if s.state is ServerState.READY else None
         )
         present = taken or self._repository.server(record.warm_server_label)
         if present is None or present.server.assigned_to != label:
@@ -119,4 +121,4 @@ class Handovers:
 
 def _may_reserve(record: Server, warm_server: Server) -> bool:
     """Whether the record names no warm server yet, or this one (the reply to that write was lost)."""
-    return record.state is State.STARTING and record.warm_server_name in (None, warm_server.name)
+    return record.state is ServerState.STARTING and record.warm_server_name in (None, warm_server.name)

@@ -16,7 +16,7 @@ from hippodrome.log import failure, logger
 from hippodrome.model import ids, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
 from hippodrome.model.project import Project
-from hippodrome.model.server import Reason, State
+from hippodrome.model.server import Reason, ServerState
 from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Platform, Topic
 from hippodrome.servers.batches import for_each
@@ -133,24 +133,26 @@ class Pools:
         return {registered[key] for key in found if key in registered}
 
     def _repair(self, project_id: str, pool: Pool, repository: Repository) -> None:
-        def state_of(warm_id: str) -> State:
+        def state_of(warm_id: str) -> ServerState:
             stored = repository.server(ids.server_label(project_id, warm_id))
-            return stored.server.state if stored else State.QUEUED
+            return stored.server.state if stored else ServerState.QUEUED
 
         states, _ = for_each(self._platform, pool.warm_servers, state_of, "a warm server's record cannot be read")
         now = self._platform.now()
 
-        def in_state(*present: State, after: timedelta = timedelta(0)) -> list[str]:
+        def in_state(*present: ServerState, after: timedelta = timedelta(0)) -> list[str]:
             return [
                 warm_id
                 for warm_id, state in states
                 if state in present and now >= pool.warm_servers[warm_id].requested + after
             ]
 
-        closed, ready = in_state(State.CLOSED), in_state(State.READY)
+        closed, ready = in_state(ServerState.CLOSED), in_state(ServerState.READY)
         self._change(project_id, lambda present: present.without(closed).with_ready(ready))
-        self._start_servers(project_id, in_state(State.QUEUED, after=NO_RECORD_AFTER))
-        self._stop_servers(project_id, in_state(State.STARTING, State.NAMING, State.DRAINING, after=NOT_READY_AFTER))
+        self._start_servers(project_id, in_state(ServerState.QUEUED, after=NO_RECORD_AFTER))
+        self._stop_servers(
+            project_id, in_state(ServerState.STARTING, ServerState.NAMING, ServerState.DRAINING, after=NOT_READY_AFTER)
+        )
 
     def _change(self, project_id: str, change: Callable[[Pool], Pool]) -> Changed[Pool]:
         return self._shared.change(warm_pool.pool_key(project_id), Pool, change, renew=True)

@@ -10,7 +10,7 @@ from botocore.exceptions import ClientError
 from deploy.aws import concurrency
 from deploy.aws.account import Account
 from deploy.code.template import Template
-from deploy.stack.settings import Settings
+from deploy.stack.settings import StackSettings
 
 LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org", "ZoneA": "us-east-1a", "ZoneB": "us-east-1b"}
 
@@ -71,5 +71,5 @@ def test_the_template_takes_what_lambda_takes() -> None:
 def test_deploying_chooses_by_what_the_account_has_left(
     answer: int | ClientError, before: dict[str, str], chosen: str
 ) -> None:
-    found = Settings().parameters(Lambda(answer), Template.read().defaults, {**LEFT, **before}, "code")
+    found = StackSettings().parameters(Lambda(answer), Template.read().defaults, {**LEFT, **before}, "code")
     assert found["StartConcurrency"] == chosen

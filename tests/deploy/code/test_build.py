@@ -258,7 +258,7 @@ def test_the_zip_holds_no_dates_and_plain_permissions(for_here: dict[str, build.
     ],
 )
 def test_imports_are_found(text: str, package: bool, expected: set[str]) -> None:
-    assert build.imported(build.Source(text, package), "p.q.m") == expected
+    assert build.imported(build.SourceModule(text, package), "p.q.m") == expected
 
 
 def test_a_module_that_no_package_has_is_a_sentence(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from deploy.core.stages import Executor, Step, step
+from deploy.core.stages import Executor, PlanStep, step
 
 THINGS = ("task", "timer", "name", "cluster", "record")
 
@@ -25,7 +25,7 @@ class World:
         self._call()
         return [*self.things]
 
-    def plan(self, found: list[str]) -> list[Step]:
+    def plan(self, found: list[str]) -> list[PlanStep]:
         return [step(self.remove, thing) for thing in found]
 
     def remove(self, thing: str) -> None:
@@ -45,7 +45,7 @@ class World:
 
 def test_a_plan_is_data_that_can_be_compared() -> None:
     world = World()
-    assert world.plan(["task", "timer"]) == [Step(world.remove, ("task",)), Step(world.remove, ("timer",))]
+    assert world.plan(["task", "timer"]) == [PlanStep(world.remove, ("task",)), PlanStep(world.remove, ("timer",))]
 
 
 def test_a_plan_is_executed_in_its_order_and_what_it_did_is_looked_at() -> None:

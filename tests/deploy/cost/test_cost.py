@@ -29,7 +29,7 @@ from deploy.cost.estimate import (
 from deploy.cost.prices import REGION, Price, Prices, Usd, current
 from deploy.cost.spent import spent
 from hippodrome.config import read_project
-from hippodrome.model.server import PastAttempt, Reason, Server, State
+from hippodrome.model.server import PastAttempt, Reason, Server, ServerState
 from testing.studies import study
 from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
 
@@ -210,7 +210,7 @@ def ran(minutes: float, *, spot: bool = False, earlier: tuple[PastAttempt, ...] 
         "project_id": "maze",
         "user_id": "alice",
         "attempt": 1 + len(earlier),
-        "state": State.CLOSED,
+        "state": ServerState.CLOSED,
         "token": "",
         "requested": start,
         "deadline": start + timedelta(hours=1),
@@ -241,7 +241,7 @@ def test_what_ran_is_counted_attempt_by_attempt() -> None:
 
 def test_a_minute_is_billed_at_least_and_what_runs_costs_up_to_now() -> None:
     assert spent([ran(0.1)], Prices(), NOW, {}).hours == pytest.approx(1 / 60)
-    still = ran(0, closed=None, state=State.READY, reason=None)
+    still = ran(0, closed=None, state=ServerState.READY, reason=None)
     assert spent([still], Prices(), NOW, {}).hours == pytest.approx(5)
     assert spent([still], Prices(), NOW, {}, since=NOW - timedelta(hours=2)).hours == pytest.approx(2)
     assert spent([ran(30)], Prices(), NOW, {}, since=NOW).hours == 0
@@ -346,9 +346,14 @@ def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_their
     closed = msgspec.structs.replace(study(warm_servers=2), id="closed", live=False)
     installed.register(live, closed)
     now = datetime.now(UTC)
-    installed.record(WARM_SERVER, State.CLOSED, closed=now, reason=Reason.ASSIGNED, spot=False)
+    installed.record(WARM_SERVER, ServerState.CLOSED, closed=now, reason=Reason.ASSIGNED, spot=False)
     installed.record(
-        "alice", State.CLOSED, requested=now, closed=now + timedelta(minutes=20), warm_server_name="s-1", spot=False
+        "alice",
+        ServerState.CLOSED,
+        requested=now,
+        closed=now + timedelta(minutes=20),
+        warm_server_name="s-1",
+        spot=False,
     )
     ran = installed.run(capsys, "cost", "--project", "maze", "--json").json
     maze = ran["projects"]["maze"]
@@ -399,8 +404,8 @@ def test_after_a_study(installed: Installed, capsys: Any) -> None:  # noqa: F811
     other = msgspec.structs.replace(study(), id="other")
     installed.register(study(), other)
     for number in range(3):
-        installed.record(f"p{number}", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
-    installed.record("x", State.CLOSED, project=other, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
+        installed.record(f"p{number}", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
+    installed.record("x", ServerState.CLOSED, project=other, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
     installed.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"?")
     found = installed.run(capsys, "cost", "--project", "maze", "--json").json
     assert set(found["projects"]) == {"maze"}
@@ -451,7 +456,7 @@ def test_without_cost_explorer_there_is_everything_but_the_bill(
     says: str,
 ) -> None:
     installed.register(study())
-    installed.record("alice", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
+    installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     installed.fail("ce:GetCostAndUsage", code, times=2)
     ran = installed.run(capsys, "cost", "--billed", "--json")
     assert (ran.code, ran.json["projects"]["maze"]["servers"], ran.json["billed"]) == (Exit.DONE, 1, None)
@@ -476,7 +481,7 @@ def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any
 
 def test_as_a_process(installed: Installed) -> None:  # noqa: F811
     installed.register(study())
-    installed.record("alice", State.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
+    installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     with installed.served() as env:
         ran = process(env, "cost", "--project", "maze", "--json")
         plain = process(env, "cost", "--project", "maze")

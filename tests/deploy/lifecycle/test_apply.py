@@ -14,14 +14,14 @@ from deploy.lifecycle import plan as plans
 from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.lifecycle.plan import plan
 from deploy.stack.changes import Prepared
-from deploy.stack.settings import Settings
+from deploy.stack.settings import StackSettings
 from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, refusal
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
 
 __all__ = ["world"]
 
-FIRST = Settings(domain=DOMAIN)
-AGAIN = Settings()
+FIRST = StackSettings(domain=DOMAIN)
+AGAIN = StackSettings()
 OUTPUTS = {"Site": "https://study.example.org", "Bucket": "hippodrome-bucket-1"}
 
 
@@ -100,7 +100,7 @@ def test_new_code_is_a_change(world: World) -> None:
 def test_a_parameter_is_a_change(world: World) -> None:
     world.stand()
     world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed
     (asked,) = world.cloud.called("create_change_set")
     assert {"ParameterKey": "MaxRuntime", "ParameterValue": "30"} in asked["Parameters"]
     assert {"ParameterKey": "RootDomain", "ParameterValue": DOMAIN} in asked["Parameters"]
@@ -197,7 +197,7 @@ def test_an_update_that_fails(world: World, capsys: pytest.CaptureFixture[str]) 
         ]
     ]
     with pytest.raises(Problem, match="could not be updated") as caught:
-        apply(world.account, "hippodrome", Settings(max_runtime=30))
+        apply(world.account, "hippodrome", StackSettings(max_runtime=30))
     assert len(caught.value.details) == 2
     assert "permission" in caught.value.advice
     assert "Sweep failed" in capsys.readouterr().err
@@ -259,12 +259,12 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
     world.stand()
     world.cloud.changes = [replaced("AWS::SQS::Queue")]
     with pytest.raises(Problem) as caught:
-        apply(world.account, "hippodrome", Settings(max_runtime=30))
+        apply(world.account, "hippodrome", StackSettings(max_runtime=30))
     assert caught.value.exit_code == Exit.DECLINED
     assert "messages on their way are lost" in capsys.readouterr().err
     assert not world.cloud.called("execute_change_set")
     assert len(world.cloud.called("delete_change_set")) == 2
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30), ApplyRequest(yes=True)).changed
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=30), ApplyRequest(yes=True)).changed
 
 
 def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
@@ -277,7 +277,7 @@ def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
     world.stand()
     world.cloud.changes = [changed_resource("Sweep", "AWS::Lambda::Function", "Environment")]
     with pytest.raises(Problem, match="no certificate"):
-        apply(world.account, "hippodrome", Settings(max_runtime=30))
+        apply(world.account, "hippodrome", StackSettings(max_runtime=30))
     assert not world.cloud.called("execute_change_set")
 
 
@@ -319,7 +319,7 @@ def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
         changed_resource("NextStep", "AWS::Lambda::Function", "Code", "Timeout"),
         changed_resource("Vpc", "AWS::EC2::VPC", "CidrBlock", Replacement="True"),
     ]
-    found = plan(world.account, "hippodrome", Settings(max_runtime=30))
+    found = plan(world.account, "hippodrome", StackSettings(max_runtime=30))
     assert found.kind == "update"
     assert [(change.name, change.action, change.properties) for change in found.changes] == [
         ("sweep", "change", ("Code",)),
@@ -340,7 +340,7 @@ def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
 def test_a_plan_without_the_code_bucket(world: World) -> None:
     world.stand()
     with pytest.raises(Problem, match="code bucket"):
-        plan(world.account, "hippodrome", Settings(max_runtime=30))
+        plan(world.account, "hippodrome", StackSettings(max_runtime=30))
 
 
 def test_a_plan_of_nothing(world: World) -> None:

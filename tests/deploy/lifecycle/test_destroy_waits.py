@@ -17,7 +17,7 @@ from deploy.lifecycle.apply import apply
 from deploy.lifecycle.removal import Removal
 from deploy.stack import cooldown, inventory
 from deploy.stack.code_bucket import CodeBucket
-from deploy.stack.settings import Settings
+from deploy.stack.settings import StackSettings
 from hippodrome.model import ids
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
@@ -229,7 +229,7 @@ def test_made_again_within_a_minute(
     removal = Removal(stack.world.account, "hippodrome")
     removal.run(removal.look(), data=False)
     gone = stack.clock.time
-    outcome = apply(stack.world.account, "hippodrome", Settings(domain=DOMAIN))
+    outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
     assert outcome.created
     assert 60 <= (stack.clock.time - gone).total_seconds() <= 80
     assert "AWS keeps the names of deleted queues" in capsys.readouterr().err
@@ -242,7 +242,7 @@ def test_timers_that_are_still_being_deleted_are_waited_for(
         return {"Name": Name, "State": "DELETING" if clock.slept < 30 else "ACTIVE"}
 
     monkeypatch.setattr(world.account.client("scheduler"), "get_schedule_group", get, raising=False)
-    assert apply(world.account, "hippodrome", Settings(domain=DOMAIN)).created
+    assert apply(world.account, "hippodrome", StackSettings(domain=DOMAIN)).created
     assert clock.slept == 30
     assert "still deleting the timers" in capsys.readouterr().err
 
@@ -281,7 +281,7 @@ def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
     stack.cloud.stack["StackStatus"] = "ROLLBACK_FAILED"
     for group in inventory.log_groups(stack.world.account, "hippodrome"):
         stack.client("logs").delete_log_group(logGroupName=group)
-    outcome = apply(stack.world.account, "hippodrome", Settings(domain=DOMAIN))
+    outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
     assert outcome.created
     assert stack.clock.slept >= 40 * 60
     assert "10 to 60 minutes" in capsys.readouterr().err

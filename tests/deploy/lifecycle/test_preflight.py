@@ -22,25 +22,27 @@ from deploy.lifecycle import preflight
 from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.lifecycle.plan import plan
 from deploy.stack.changes import prepare
-from deploy.stack.settings import Settings
+from deploy.stack.settings import StackSettings
 from tests.certificate.nameserver import SERVFAIL, answering, ask_only
 from tests.deploy.registering import write_study
 from tests.deploy.stack_world import DOMAIN, World, world
 
 __all__ = ["world"]
 
-FIRST = Settings(domain=DOMAIN)
+FIRST = StackSettings(domain=DOMAIN)
 NOBODY = Delegation((), "The Internet knows no name servers for example.org.")
 Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def game(tmp_path: Path) -> project_folder.Study:
+def game(tmp_path: Path) -> project_folder.ProjectFolder:
     """A study whose servers have a vCPU each."""
     return project_folder.read(write_study(tmp_path / "study"))
 
 
-def looked(world: World, settings: Settings = FIRST, game: project_folder.Study | None = None) -> list[Finding]:
+def looked(
+    world: World, settings: StackSettings = FIRST, game: project_folder.ProjectFolder | None = None
+) -> list[Finding]:
     return preflight.look_at(preflight.InstallationCheck(prepare(world.account, "hippodrome", settings), game))
 
 
@@ -64,7 +66,7 @@ def test_where_all_is_well_nothing_is_said(world: World) -> None:
 
 
 def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
-    world: World, game: project_folder.Study, capsys: Capsys
+    world: World, game: project_folder.ProjectFolder, capsys: Capsys
 ) -> None:
     world.delegated = NOBODY
     world.caa[f"study.{DOMAIN}"] = caa.Caa(DOMAIN, (("issue", "digicert.com"),))
@@ -99,7 +101,7 @@ def test_mistakes_in_the_study_stand_in_the_same_list(world: World, capsys: Caps
 def test_a_domain_without_a_zone_does_not_hide_the_rest(world: World, capsys: Capsys) -> None:
     world.limits.quotas[quotas.SPOT] = 6
     with pytest.raises(Problem, match="1 thing is in the way"):
-        apply(world.account, "hippodrome", Settings(domain="example.com"))
+        apply(world.account, "hippodrome", StackSettings(domain="example.com"))
     said = capsys.readouterr().err
     assert "✗ installation: This account has no public hosted zone for example.com." in said
     assert "! Fargate, Spot: 6 vCPU: 6 servers of 1 vCPU may run at once." in said
@@ -134,7 +136,7 @@ def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
 def test_a_plan_of_a_change_shows_what_is_in_its_way_too(world: World) -> None:
     apply(world.account, "hippodrome", FIRST)
     world.delegated = NOBODY
-    found = plan(world.account, "hippodrome", Settings(site="lab"))
+    found = plan(world.account, "hippodrome", StackSettings(site="lab"))
     assert found.kind == "update"
     assert [one.check for one in found.findings] == ["domain"]
 
@@ -144,7 +146,7 @@ def test_a_plan_says_what_address_participants_will_open(world: World) -> None:
     first = [line for line, _ in plans.lines(plan(world.account, "hippodrome", FIRST))]
     assert f"Participants will open https://study.{DOMAIN}/next" in first
     apply(world.account, "hippodrome", FIRST)
-    moved = [line for line, _ in plans.lines(plan(world.account, "hippodrome", Settings(site="lab")))]
+    moved = [line for line, _ in plans.lines(plan(world.account, "hippodrome", StackSettings(site="lab")))]
     assert f"Participants will open https://lab.{DOMAIN}/next" in moved
 
 
@@ -173,9 +175,9 @@ def test_a_standing_installation_is_only_looked_at_where_it_changes(world: World
     world.limits.quotas.clear()
     record(world, f"study.{DOMAIN}")  # its own
     world.stand()
-    assert looked(world, Settings(max_runtime=30)) == []
-    assert {one.check for one in looked(world, Settings(site="lab"))} == {"domain"}
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    assert looked(world, StackSettings(max_runtime=30)) == []
+    assert {one.check for one in looked(world, StackSettings(site="lab"))} == {"domain"}
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed
 
 
 # -- the account -------------------------------------------------------------------------------------------------------
@@ -204,7 +206,7 @@ def test_few_executions_are_a_remark_that_says_what_they_do_for(world: World) ->
 
 
 @pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server"), (0, "0 servers")])
-def test_few_vcpus_are_a_remark(world: World, game: project_folder.Study, vcpu: float, servers: str) -> None:
+def test_few_vcpus_are_a_remark(world: World, game: project_folder.ProjectFolder, vcpu: float, servers: str) -> None:
     world.limits.quotas |= {quotas.SPOT: vcpu, quotas.ON_DEMAND: vcpu}
     spot, on_demand = looked(world, game=game)
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)
@@ -215,7 +217,7 @@ def test_few_vcpus_are_a_remark(world: World, game: project_folder.Study, vcpu: 
 
 
 def test_without_docker_and_without_a_build_nobody_could_build_the_image(
-    world: World, game: project_folder.Study
+    world: World, game: project_folder.ProjectFolder
 ) -> None:
     world.docker = False
     world.limits.quotas[quotas.BUILDS] = 0
@@ -229,7 +231,7 @@ def test_without_docker_and_without_a_build_nobody_could_build_the_image(
 
 @pytest.mark.parametrize(("docker", "builds"), [(True, 0), (False, 1), (False, None)])
 def test_docker_or_one_build_will_do(
-    world: World, game: project_folder.Study, docker: bool, builds: float | None
+    world: World, game: project_folder.ProjectFolder, docker: bool, builds: float | None
 ) -> None:
     world.docker = docker
     del world.limits.quotas[quotas.BUILDS]
@@ -322,7 +324,7 @@ def test_both_authorities_must_be_let(world: World, name: str, records: list[caa
 
 def test_records_above_the_domain_are_overruled_in_it_not_changed(world: World) -> None:
     world.caa["study.lab.example.org"] = caa.Caa("example.org", (("issue", "digicert.com"),))
-    found = only(looked(world, Settings(domain="lab.example.org")))
+    found = only(looked(world, StackSettings(domain="lab.example.org")))
     assert "The CAA records of example.org" in found.text
     assert "Add two CAA records to lab.example.org:" in found.advice
 
@@ -360,7 +362,7 @@ def test_dns_is_not_asked_for_names_that_are_still_to_be_made(
     heard: set[str] = set()
     with answering({("org", "CAA"): ['0 issue "amazon.com"', '0 issue "letsencrypt.org"']}, heard) as port:
         ask_only(monkeypatch, port)
-        assert looked(world, Settings(domain="lab.example.org")) == []
+        assert looked(world, StackSettings(domain="lab.example.org")) == []
     assert heard == asked
 
 
@@ -397,7 +399,7 @@ def test_the_sites_address_must_be_free(world: World) -> None:
     found = only(looked(world))
     assert "already has a record of type A for study.example.org" in found.text
     assert "--site" in found.advice
-    assert looked(world, Settings(domain=DOMAIN, site="lab")) == []
+    assert looked(world, StackSettings(domain=DOMAIN, site="lab")) == []
 
 
 def test_the_sites_address_must_be_free_at_api_gateway(world: World) -> None:
@@ -430,7 +432,7 @@ def test_subnets_are_looked_at(world: World) -> None:
     ]
 
     def found(subnet: str) -> list[tuple[Mark, str]]:
-        settings = Settings(domain=DOMAIN, vpc=vpcs[0], subnets=subnet)
+        settings = StackSettings(domain=DOMAIN, vpc=vpcs[0], subnets=subnet)
         return [(one.mark, one.text) for one in looked(world, settings)]
 
     in_one_zone = (Mark.LOOK, "All those subnets are in one zone: when Spot runs out of room there, servers cost more.")

@@ -13,7 +13,7 @@ from console.problem import Exit, Problem
 from deploy import __main__ as deploy
 from deploy.aws.account import Installation
 from deploy.lifecycle import up
-from deploy.lifecycle.apply import ApplyRequest, Outcome
+from deploy.lifecycle.apply import ApplyOutcome, ApplyRequest
 from deploy.stack.certificate import Choice, Report
 from hippodrome.certificates.rules import PRODUCTION, STAGING, Decision, Verdict
 
@@ -64,10 +64,10 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"certificate {names[choice.directory]}")
         return report(choice.directory or "own", Verdict.ORDER)
 
-    def apply(account: Any, stack: str, settings: Any, wish: ApplyRequest) -> Outcome:
+    def apply(account: Any, stack: str, settings: Any, wish: ApplyRequest) -> ApplyOutcome:
         assert not wish.wrong
         done.append(f"apply {settings.domain}")
-        return Outcome(True, 1.0, outputs={"Site": "https://study.example.org"})
+        return ApplyOutcome(True, 1.0, outputs={"Site": "https://study.example.org"})
 
     def register(folder: Path, **options: Any) -> int:
         done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))

@@ -26,7 +26,7 @@ from hippodrome.aws.tasks import EcsTasks
 from hippodrome.limits.slots import Slots
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, parse_task_changed
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from hippodrome.ports import RunningTask
 from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.storage.repository import Repository
@@ -272,13 +272,13 @@ class Thief:
             self.used = True
 
 
-@pytest.mark.parametrize("state", [State.READY, State.CLOSED])
+@pytest.mark.parametrize("state", [ServerState.READY, ServerState.CLOSED])
 def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
-    world: Installed, capsys: Any, monkeypatch: Any, state: State
+    world: Installed, capsys: Any, monkeypatch: Any, state: ServerState
 ) -> None:
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
-    closed = world.platform.now() - STORE_AFTER_CLOSE if state is State.CLOSED else None
+    closed = world.platform.now() - STORE_AFTER_CLOSE if state is ServerState.CLOSED else None
     world.record(ANN, state, closed=closed)
     thief = Thief(world)
     made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
@@ -293,7 +293,7 @@ def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, mo
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     over = timedelta(seconds=VALID_SECONDS + SIGNING)
-    world.record(ANN, State.CLOSED, closed=world.platform.now() - STORE_AFTER_CLOSE - over)
+    world.record(ANN, ServerState.CLOSED, closed=world.platform.now() - STORE_AFTER_CLOSE - over)
     slept: list[float] = []
     assert not eraser(world, sleep=slept.append).run()
     assert slept == []
@@ -425,7 +425,7 @@ def test_a_server_started_a_moment_ago_that_ecs_does_not_list_yet(world: Install
     world.participant(ANN, answered=1)
     world.platform.timers.set(ids.server_name(ids.server_label("maze", ANN), 1), world.platform.now(), {})
     now = world.platform.now()
-    world.record(ANN, State.STARTING, requested=now)
+    world.record(ANN, ServerState.STARTING, requested=now)
     time = [0.0]
     made = eraser(world, clock=lambda: time[0], sleep=lambda seconds: time.__setitem__(0, time[0] + 10))
     tasks = made._tasks

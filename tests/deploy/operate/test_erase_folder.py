@@ -25,7 +25,7 @@ from hippodrome.lobby import decisions
 from hippodrome.lobby.decisions import Decisions, Unmatched
 from hippodrome.model import ids, server
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from protocol.handover import Handover
 from protocol.keys import handover_key, session_key
 from protocol.session import parse
@@ -192,7 +192,7 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(machine: Machine, owne
     machine.put(session_key("maze", SID), session(ANN, "").to_json())
     now, label = datetime.now(UTC), ids.server_label("maze", "~warm")
     name = ids.server_name(label, 1)
-    record = Server("maze", owner, 1, State.CLOSED, "", now, now, "c", warm_server_name=name)
+    record = Server("maze", owner, 1, ServerState.CLOSED, "", now, now, "c", warm_server_name=name)
     machine.put(server.key(record.label), to_json(record))
     machine.put(server.key(label), to_json(msgspec.structs.replace(record, user_id="~warm", assigned_to=record.label)))
     machine.put(handover_key("maze", name), Handover(owner, None, name).to_json())

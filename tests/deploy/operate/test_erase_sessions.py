@@ -25,7 +25,7 @@ from hippodrome.lobby.lobby import Lobby
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.storage.repository import Repository
 from protocol.keys import groups_key, session_key, sessions_folder, waiting_key
@@ -253,7 +253,7 @@ def test_a_session_that_plays_is_stopped_first(world: Installed, tmp_path: Path,
     assert order == ["rewritten"]
     assert traces(world) == []
     record = from_json(world.get(server.key(ids.server_label("maze", SID))), server.Server)
-    assert (record.state, record.user_id) == (State.CLOSED, SID), "what the others' page needs to go on"
+    assert (record.state, record.user_id) == (ServerState.CLOSED, SID), "what the others' page needs to go on"
     assert not [*world.platform.tasks.list()]
     assert not world.timers()
     assert not world.records()
@@ -265,7 +265,7 @@ def test_what_the_sessions_server_may_still_store_is_waited_for(
     """Its record stays, for the others: it may get requests for a while after its end."""
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     pair(world.put, tmp_path)
-    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now())
+    world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now())
     slept: list[float] = []
 
     def sleep(seconds: float) -> None:
@@ -281,7 +281,7 @@ def test_what_the_sessions_server_may_still_store_is_waited_for(
 def test_a_session_that_was_over_long_ago_is_not_waited_for(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     pair(world.put, tmp_path)
-    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(minutes=10))
+    world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(minutes=10))
     slept: list[float] = []
     assert not eraser(world, executor=Executor(slept.append)).run()
     assert slept == []
@@ -308,7 +308,7 @@ def test_a_session_that_plays_again_meanwhile_is_stopped_again(
 
 def test_when_all_members_are_erased_the_session_is_gone(world: Installed, tmp_path: Path, capsys: Any) -> None:
     pair(world.put, tmp_path)
-    world.record(SID, State.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(hours=1))
+    world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(hours=1))
     assert erase(world, capsys, ANN).code == Exit.DONE
     assert [key for key, _ in contents(world) if SID in key or ids.server_label("maze", SID) in key]
     assert erase(world, capsys, BOB).code == Exit.DONE

@@ -29,7 +29,7 @@ from hippodrome.lobby import decisions
 from hippodrome.lobby.decisions import Ahead, Decisions
 from hippodrome.model.project import MASTER_LIST, MasterList, Step, UnreadableEntry, read_list, write_list
 from hippodrome.model.records import to_json
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from hippodrome.storage.project_cache import FRESH
 from protocol.keys import session_key
 from protocol.session import Member, Session
@@ -208,7 +208,7 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInst
     copy.make(registered_projects(platform.documents)[0])
     walked = copy.user("1")
     running.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
-    running.record(copy.user("2"), State.CLOSED, copy.project)  # it has nothing but a server's record
+    running.record(copy.user("2"), ServerState.CLOSED, copy.project)  # it has nothing but a server's record
     now = datetime.now(UTC)
     assert left_behind(platform.documents, now) == [], "it may be under way"
     assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
@@ -225,8 +225,8 @@ def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningIn
     walked, sid, ahead = copy.user("1"), f"s.{1:020x}", f"s.{2:020x}"
     running.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
     running.put(session_key(copy.id, sid), Session(sid, 2, (Member(walked, None, 0),)).to_json())
-    running.record(sid, State.CLOSED, copy.project)
-    running.record(ahead, State.READY, copy.project)
+    running.record(sid, ServerState.CLOSED, copy.project)
+    running.record(ahead, ServerState.READY, copy.project)
     running.put(f"_lobby/{copy.id}/slabel.way", b"{}")
     running.put(decisions.key(copy.id), to_json(Decisions(1, open=(Ahead(ahead, datetime.now(UTC)),))))
     remove(account, installation, platform, copy.id, users=copy.users)

@@ -15,7 +15,7 @@ from deploy.core import server_records
 from deploy.core.server_records import Records
 from deploy.operate import status
 from hippodrome.model import server
-from hippodrome.model.server import Reason, State
+from hippodrome.model.server import Reason, ServerState
 from hippodrome.servers.causes import Cause
 from protocol.keys import session_key
 from protocol.session import Member, Session
@@ -95,8 +95,8 @@ def test_beyond_a_page_of_keys_no_participant_is_missing_and_none_is_read(
 
 def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> None:
     ready = world.record("alice")
-    world.record("bob", State.STARTING)
-    world.record("carol", State.CLOSED, reason=Reason.LOST, closed=datetime.now(UTC))
+    world.record("bob", ServerState.STARTING)
+    world.record("carol", ServerState.CLOSED, reason=Reason.LOST, closed=datetime.now(UTC))
     world.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"not a record")
     before = datetime.now(UTC)
     found, shown = look(world, capsys)["servers"], world.run(capsys, "status").out
@@ -116,14 +116,14 @@ def test_why_servers_failed_is_told_with_what_to_do(world: Installed, capsys: An
     now = datetime.now(UTC)
 
     def lost(user: str, ago: timedelta, cause: str, **more: Any) -> server.Server:
-        return world.record(user, State.CLOSED, reason=Reason.LOST, closed=now - ago, cause=cause, **more)
+        return world.record(user, ServerState.CLOSED, reason=Reason.LOST, closed=now - ago, cause=cause, **more)
 
     first = server.past_attempt(lost("carol", timedelta(minutes=3), Cause.SPOT))
     last = lost("carol", timedelta(0), Cause.IMAGE, attempt=2, earlier=(first,))
     lost("dave", timedelta(minutes=9), Cause.IMAGE)
     lost("eve", timedelta(hours=25), Cause.OUT_OF_MEMORY)
     lost("frank", timedelta(0), "of a later version")
-    world.record("grace", State.CLOSED, reason=Reason.ENDED, closed=now)
+    world.record("grace", ServerState.CLOSED, reason=Reason.ENDED, closed=now)
     image, spot = look(world, capsys)["servers"]["failed"]
     assert (image["project"], image["cause"], image["servers"], image["lastServer"]) == ("maze", "image", 2, last.name)
     assert image["matters"]
@@ -148,8 +148,8 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
     world.register(study(warm_servers=4), CLOSED)
     for warm_server in WARM_SERVERS[:3]:
         world.record(warm_server)
-    world.record(WARM_SERVERS[3], State.STARTING)
-    world.record(WARM_SERVERS[4], State.CLOSED, reason=Reason.ASSIGNED, closed=datetime.now(UTC))
+    world.record(WARM_SERVERS[3], ServerState.STARTING)
+    world.record(WARM_SERVERS[4], ServerState.CLOSED, reason=Reason.ASSIGNED, closed=datetime.now(UTC))
     world.record("alice", warm_server_name="s" + "a" * 20 + "-1")
     found = look(world, capsys)
     maze, old = found["projects"]
@@ -191,14 +191,14 @@ def test_servers_of_single_participants_are_told_as_ever(world: Installed, capsy
 
 def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4, live=False))
-    world.record(WARM_SERVERS[0], State.DRAINING)
+    world.record(WARM_SERVERS[0], ServerState.DRAINING)
     assert look(world, capsys)["projects"][0]["warmServers"]["wanted"] == 0
     assert "maze: 1 warm server on the way out." in world.run(capsys, "status").out
 
 
 def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
     assert look(world, capsys)["spentToday"]["likely"] == 0
-    world.record("alice", State.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
+    world.record("alice", ServerState.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
     before = datetime.now(UTC)
     spent = look(world, capsys)["spentToday"]["likely"]
     after = datetime.now(UTC)

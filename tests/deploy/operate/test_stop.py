@@ -14,7 +14,7 @@ from hippodrome.aws.tasks import EcsTasks
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Reason, State
+from hippodrome.model.server import Reason, ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import DnsRecord, RunningTask, TaskRequest
 from hippodrome.storage.repository import Repository
@@ -99,7 +99,7 @@ def test_a_dry_run_and_no_answer_change_nothing(world: Installed, capsys: Any) -
 
 def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: Installed, capsys: Any) -> None:
     closed = ids.server_name(ids.server_label("maze", "alice"), 1)
-    world.record("alice", State.CLOSED, reason=Reason.ENDED)
+    world.record("alice", ServerState.CLOSED, reason=Reason.ENDED)
     nobody = ids.server_name(ids.server_label("maze", "nobody"), 1)
     platform = world.platform
     for name in (closed, nobody):
@@ -123,7 +123,7 @@ def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(worl
 
 
 def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, capsys: Any) -> None:
-    world.record("alice", State.STARTING)  # claimed; neither timer nor task yet
+    world.record("alice", ServerState.STARTING)  # claimed; neither timer nor task yet
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
     Servers(world.platform).start(StartServer("maze", "alice"))
     assert running_servers(world) == []

@@ -13,7 +13,7 @@ from deploy.aws.account import Account, open_account
 from deploy.stack import domain_change
 from deploy.stack.changes import Prepared
 from deploy.stack.stack import Stack
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from tests.deploy.installation import KEYS, Installed
 
 
@@ -54,7 +54,7 @@ def test_servers_named_after_people_must_have_ended_before(world: Installed) -> 
     with pytest.raises(Problem, match="whose names the installation could not remove any more") as caught:
         domain_change.check(prepared(world))
     assert "deploy stop" in caught.value.advice
-    world.record("alice", State.CLOSED, dns="alice.example.org")
+    world.record("alice", ServerState.CLOSED, dns="alice.example.org")
     domain_change.check(prepared(world))
 
 

@@ -17,7 +17,7 @@ from deploy.aws import hosted_zone as zones
 from deploy.code.template import PATH, Template
 from deploy.stack import stack as stacks
 from deploy.stack.code_bucket import CodeBucket
-from deploy.stack.settings import Settings, option
+from deploy.stack.settings import StackSettings, option
 from deploy.stack.stack import Stack
 from tests.deploy.stack_world import ACCOUNT, REGION, TEMPLATE, World, function, world
 
@@ -340,21 +340,21 @@ def dns(monkeypatch: pytest.MonkeyPatch) -> Any:
 # -- the settings ------------------------------------------------------------------------------------------------------
 
 
-def decide(world: World, settings: Settings, previous: dict[str, str] | None = None) -> dict[str, str]:
+def decide(world: World, settings: StackSettings, previous: dict[str, str] | None = None) -> dict[str, str]:
     return settings.parameters(world.account, Template(TEMPLATE).defaults, previous or {}, world.code_bucket)
 
 
 def test_the_first_time(world: World) -> None:
-    assert decide(world, Settings(domain="Example.org.", max_runtime=60)) == world.parameters(MaxRuntime="60")
+    assert decide(world, StackSettings(domain="Example.org.", max_runtime=60)) == world.parameters(MaxRuntime="60")
 
 
 def test_the_sites_name_is_one_that_a_certificate_can_have(world: World) -> None:
     """ACM: the first name has 64 characters at most."""
     domain = f"{'x' * 50}.example"
     world.make_zone(domain)
-    assert decide(world, Settings(domain=domain, site="study"))["SiteHost"] == "study"
+    assert decide(world, StackSettings(domain=domain, site="study"))["SiteHost"] == "study"
     with pytest.raises(Problem, match="65 characters") as caught:
-        decide(world, Settings(domain=domain, site="studie"))
+        decide(world, StackSettings(domain=domain, site="studie"))
     assert "--site" in caught.value.advice
 
 
@@ -362,7 +362,7 @@ def chosen(world: World, previous: dict[str, str] | None = None, **asked: Any) -
     """The zones that are decided on, with a template that has them as parameters."""
     defaults = Template(TEMPLATE).defaults | {"ZoneA": None, "ZoneB": None}
     subnets = asked.pop("standing", ())
-    settings = Settings(domain="example.org", **asked)
+    settings = StackSettings(domain="example.org", **asked)
     found = settings.parameters(world.account, defaults, previous or {}, world.code_bucket, subnets)
     return {name: found[name] for name in ("ZoneA", "ZoneB")}
 
@@ -415,9 +415,9 @@ def test_a_network_of_yours_needs_no_chosen(world: World) -> None:
 
 def test_what_is_left_out_stays(world: World) -> None:
     before = world.parameters(SiteHost="lab", MaxRuntime="30", AlarmEmail="a@b.c")
-    assert decide(world, Settings(), before) == before
-    assert decide(world, Settings(email=""), before)["AlarmEmail"] == ""
-    assert decide(world, Settings(max_runtime=45), before)["MaxRuntime"] == "45"
+    assert decide(world, StackSettings(), before) == before
+    assert decide(world, StackSettings(email=""), before)["AlarmEmail"] == ""
+    assert decide(world, StackSettings(max_runtime=45), before)["MaxRuntime"] == "45"
 
 
 def test_servers_listen_on_443_unless_another_port_was_asked_for_once() -> None:
@@ -453,37 +453,37 @@ def test_values_that_the_template_does_not_take_are_told_by_their_options() -> N
 
 
 def test_parameters_that_the_template_no_longer_has_are_dropped(world: World) -> None:
-    assert "Old" not in decide(world, Settings(), world.parameters(Old="1"))
+    assert "Old" not in decide(world, StackSettings(), world.parameters(Old="1"))
 
 
 def test_the_first_time_needs_a_domain(world: World) -> None:
     with pytest.raises(Problem, match="Which domain"):
-        decide(world, Settings())
+        decide(world, StackSettings())
 
 
 def test_the_same_domain_keeps_its_zone_without_looking(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("deploy.stack.settings.find_zone", lambda *_: pytest.fail("looked"))
-    assert decide(world, Settings(domain="example.org"), world.parameters())["HostedZoneId"] == world.zone
+    assert decide(world, StackSettings(domain="example.org"), world.parameters())["HostedZoneId"] == world.zone
 
 
 def test_a_zone_by_its_id(world: World) -> None:
     second = world.make_zone("example.org")
-    assert decide(world, Settings(domain="example.org", zone=second))["HostedZoneId"] == second
+    assert decide(world, StackSettings(domain="example.org", zone=second))["HostedZoneId"] == second
     other = world.make_zone("elsewhere.org")
     with pytest.raises(Problem, match="not below"):
-        decide(world, Settings(domain="example.org", zone=other))
+        decide(world, StackSettings(domain="example.org", zone=other))
     with pytest.raises(Problem, match="not below"):
-        decide(world, Settings(domain="notelsewhere.org", zone=other))
+        decide(world, StackSettings(domain="notelsewhere.org", zone=other))
 
 
-@pytest.mark.parametrize("settings", [Settings(vpc="vpc-1"), Settings(subnets="subnet-1,subnet-2")])
-def test_vpc_and_subnets_go_together(world: World, settings: Settings) -> None:
+@pytest.mark.parametrize("settings", [StackSettings(vpc="vpc-1"), StackSettings(subnets="subnet-1,subnet-2")])
+def test_vpc_and_subnets_go_together(world: World, settings: StackSettings) -> None:
     with pytest.raises(Problem, match="go together"):
         decide(world, settings, world.parameters())
 
 
 def test_subnets_are_put_in_order(world: World) -> None:
-    found = decide(world, Settings(vpc="vpc-1", subnets=" subnet-1 , subnet-2,"), world.parameters())
+    found = decide(world, StackSettings(vpc="vpc-1", subnets=" subnet-1 , subnet-2,"), world.parameters())
     assert found["SubnetIds"] == "subnet-1,subnet-2"
 
 

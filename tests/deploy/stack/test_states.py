@@ -11,8 +11,8 @@ from console.problem import Problem
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle.apply import apply
 from deploy.stack import states
-from deploy.stack.settings import Settings
-from deploy.stack.states import Action
+from deploy.stack.settings import StackSettings
+from deploy.stack.states import StackAction
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import Step, happy
 from tests.deploy.stack_world import DOMAIN, World, world
@@ -21,7 +21,7 @@ __all__ = ["world"]
 
 CLOUDFORMATION = botocore.session.get_session().get_service_model("cloudformation")
 STATES: list[str] = CLOUDFORMATION.shape_for("StackStatus").enum
-FIRST = Settings(domain=DOMAIN)
+FIRST = StackSettings(domain=DOMAIN)
 DELETED: list[Step] = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
 TAKEN_BACK: list[Step] = [("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]
 WORKS = {
@@ -48,15 +48,15 @@ ENDS = {  # how each operation that is under way may end
 def what_follows(status: str) -> list[list[Step]]:
     """What CloudFormation does of what `apply` asks it to, in that state."""
     return {
-        Action.RECREATE: [list(DELETED)],
-        Action.ROLL_BACK: [list(TAKEN_BACK)],
-        Action.CONTINUE: [list(TAKEN_BACK)],
+        StackAction.RECREATE: [list(DELETED)],
+        StackAction.ROLL_BACK: [list(TAKEN_BACK)],
+        StackAction.CONTINUE: [list(TAKEN_BACK)],
     }.get(states.action_for(status), [])
 
 
 def test_no_state_is_forgotten() -> None:
     assert set(states.ACTIONS) == set(STATES)
-    assert set(ENDS) == {status for status in STATES if states.action_for(status) is Action.WAIT}
+    assert set(ENDS) == {status for status in STATES if states.action_for(status) is StackAction.WAIT}
 
 
 @pytest.mark.explores
@@ -72,7 +72,7 @@ def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_wh
     try:
         apply(world.account, "hippodrome", FIRST)
     except Problem as problem:
-        assert states.action_for(end or status) is Action.STOP
+        assert states.action_for(end or status) is StackAction.STOP
         assert str(problem).count(". ") == 0, "one sentence"
         assert problem.advice.startswith("Remove it with `python -m deploy destroy --stack hippodrome` (the data stay)")
         assert not world.cloud.called("create_change_set")
@@ -88,7 +88,7 @@ def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_wh
 
 def apply_again(world: World) -> Any:
     world.cloud.text = world.built.text
-    return apply(world.account, "hippodrome", Settings())
+    return apply(world.account, "hippodrome", StackSettings())
 
 
 @pytest.mark.explores
@@ -98,10 +98,15 @@ def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy
     try:
         found = plans.plan(world.account, "hippodrome", FIRST)
     except Problem as problem:
-        assert states.action_for(status) in {Action.WAIT, Action.STOP, Action.ROLL_BACK, Action.CONTINUE}
+        assert states.action_for(status) in {
+            StackAction.WAIT,
+            StackAction.STOP,
+            StackAction.ROLL_BACK,
+            StackAction.CONTINUE,
+        }
         assert problem.advice
     else:
-        made = states.action_for(status) in {Action.CREATE, Action.RECREATE}
+        made = states.action_for(status) in {StackAction.CREATE, StackAction.RECREATE}
         assert found.kind == ("create" if made else "nothing")
     assert not world.cloud.calls or {name for name, _ in world.cloud.calls} == {"get_template"}
 
@@ -117,7 +122,7 @@ def test_a_failed_update_that_was_left_as_it_is_is_taken_back_before_the_next(wo
     """CloudFormation takes no change set with rollback in UPDATE_FAILED, which is left by updates without rollback."""
     world.stand("UPDATE_FAILED")
     world.cloud.operations = [list(TAKEN_BACK)]
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed
     assert [name for name, _ in world.cloud.calls if name in {"rollback_stack", "execute_change_set"}] == [
         "rollback_stack",
         "execute_change_set",
@@ -136,4 +141,4 @@ def test_an_update_that_cannot_be_taken_back_says_why(world: World) -> None:
         apply(world.account, "hippodrome", FIRST)
     assert any(reason in line for line in caught.value.details)
     world.cloud.operations = [list(TAKEN_BACK), happy("UPDATE")]
-    assert apply(world.account, "hippodrome", Settings(max_runtime=30)).changed
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed

@@ -25,14 +25,14 @@ import pytest
 
 from hippodrome.model import ids
 from testing import clocked_moto, exploration
-from testing.aws_faults import AwsFault, Kind, Made, Reach, invisible, kinds, reaches
+from testing.aws_faults import AwsFault, FaultKind, MadeCall, Reach, invisible, kinds, reaches
 from testing.clocked_moto import GAME, PROJECT, TimedInstallation, VisitorOnMoto
 from testing.exploration import sample
 from testing.quiet_log import quiet
 
 USER, OTHER = "R_alice", "R_bob"
 EACH, ALL = 1, 99  # fault points at each call
-Calls = dict[str, list[Made]]  # by journey
+Calls = dict[str, list[MadeCall]]  # by journey
 
 
 @dataclass(frozen=True)
@@ -268,8 +268,8 @@ class Outcome:
 
     journey: str
     fault: AwsFault | None
-    made: Made | None
-    calls: list[Made]
+    made: MadeCall | None
+    calls: list[MadeCall]
     wrong: list[str]  # nothing where all is well
     failures: list[str]
 
@@ -317,14 +317,14 @@ def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
     return points
 
 
-def every(action: str) -> list[tuple[Kind, Reach]]:
+def every(action: str) -> list[tuple[FaultKind, Reach]]:
     """All that can go wrong with an operation."""
     return [(kind, reach) for kind in kinds(action) for reach in reaches(action, kind)]
 
 
-def order(combos: list[tuple[Kind, Reach]]) -> list[tuple[Kind, Reach]]:
+def order(combos: list[tuple[FaultKind, Reach]]) -> list[tuple[FaultKind, Reach]]:
     """The worst first: calls that were made and whose reply is lost; then the errors of the port."""
-    return sorted(combos, key=lambda combo: (combo[1] is Reach.ATTEMPT, combo[0] is not Kind.READ))
+    return sorted(combos, key=lambda combo: (combo[1] is Reach.ATTEMPT, combo[0] is not FaultKind.READ))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -396,5 +396,5 @@ def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behin
     installation.hold_study()
     stops = [n for n, call in enumerate(calls[JOURNEYS[0].name], 1) if call.function == "stop_server"]
     assert all(
-        run(installation, Journey("unswept", unswept), AwsFault(n, Kind.CONNECT, Reach.CALL)).wrong for n in stops
+        run(installation, Journey("unswept", unswept), AwsFault(n, FaultKind.CONNECT, Reach.CALL)).wrong for n in stops
     )

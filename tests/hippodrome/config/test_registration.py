@@ -272,10 +272,10 @@ json_values = st.recursive(
 )
 known_keys = st.sampled_from(
     sorted(
-        project_keys.Project.names()
+        project_keys.ProjectKeys.names()
         | {"trial"}
-        | trial_keys.names(trial.Trial)
-        | project_keys.AwsSetup.names()
+        | trial_keys.names(trial.TrialSection)
+        | project_keys.AwsSetupKeys.names()
         | {"1", "2", "finalStep"}
     )
 )
@@ -426,9 +426,9 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
 
 def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = (project_keys.Project, project_keys.AwsSetup, project_keys.Events, project_keys.Ssl)
+    sections = (project_keys.ProjectKeys, project_keys.AwsSetupKeys, project_keys.EventsKeys, project_keys.SslKeys)
     keys = frozenset().union(
-        *(section.names() for section in sections), trial_keys.names(trial.Trial), trial_keys.names(trial.Ui)
+        *(section.names() for section in sections), trial_keys.names(trial.TrialSection), trial_keys.names(trial.Ui)
     )
     missing = [key for key in keys if f"`{key}`" not in text]
     assert not missing

@@ -79,7 +79,7 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
         return [f"{problem.where}: {problem.message}" for problem in errors.diagnostics]
 
 
-def started(section: dict[str, Any]) -> trial.Trial | str:
+def started(section: dict[str, Any]) -> trial.TrialSection | str:
     """What a server makes of it, or what is wrong with the section."""
     try:
         return trial_section(section)
@@ -88,7 +88,7 @@ def started(section: dict[str, Any]) -> trial.Trial | str:
 
 
 def test_every_key_is_tried_here() -> None:
-    assert set(KEYS) | {"game"} == trial_keys.names(trial.Trial) | {trial.RATE_CHANGE_MISSPELT}
+    assert set(KEYS) | {"game"} == trial_keys.names(trial.TrialSection) | {trial.RATE_CHANGE_MISSPELT}
 
 
 @given(SECTIONS)
@@ -105,7 +105,7 @@ def test_the_same_section_gives_the_same_at_both_ends(section: dict[str, Any]) -
 def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> None:
     found, problems = trial_check.check(section)
     wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
-    defaults = trial.Trial().document()
+    defaults = trial.TrialSection().document()
     document = found.document()
     assert {key: document[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}} == {
         key: defaults[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}
@@ -130,7 +130,7 @@ def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
     assert isinstance(told, dict)
     assert told["actionSpace"] == ["0", "1"]
     made = started({"actionSpace": [0, "1"]})
-    assert isinstance(made, trial.Trial)
+    assert isinstance(made, trial.TrialSection)
     assert made.action_space == ("0", "1")
 
 
@@ -151,7 +151,7 @@ def test_a_number_that_names_an_action_is_the_same_text_wherever_it_stands() -> 
 @pytest.mark.parametrize("section", ["x", [1], 3, True])
 def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
     found, problems = trial_check.check(section)
-    assert found == trial.Trial()
+    assert found == trial.TrialSection()
     assert [problem.path for problem in problems] == [()]
 
 
@@ -163,7 +163,7 @@ def test_a_policy_that_may_not_think_at_all_is_a_mistake() -> None:
 @pytest.mark.parametrize(("seconds", "fits"), [(-0.5, False), (0, True), (600, True), (600.5, False)])
 def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) -> None:
     told, made = registered({"game": "x/Y-v0", "betweenEpisodes": seconds}), started({"betweenEpisodes": seconds})
-    assert isinstance(told, dict) == isinstance(made, trial.Trial) == fits
+    assert isinstance(told, dict) == isinstance(made, trial.TrialSection) == fits
     if fits:
         assert (told["betweenEpisodes"], made.between_episodes) == (seconds, seconds)
 

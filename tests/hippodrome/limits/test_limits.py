@@ -25,7 +25,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged
 from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.errors import RetryLater
@@ -36,7 +36,7 @@ from testing.moto_world import MotoWorld
 from testing.servers import Servers
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.world import PROJECT as SIMULATED
-from testing.simulation.world import World
+from testing.simulation.world import SimulatedWorld
 from testing.studies import PAGES, installed, study
 from testing.visitors import Browser
 from tests.hippodrome.participants.test_journey import to_game
@@ -243,7 +243,7 @@ def test_beyond_max_servers_nothing_is_started_and_the_page_says_so_until_there_
     to_game(alice)
     platform.bus.sent.clear()
     assert begin(platform, "alice") == ""
-    assert (record(platform).state, record(platform).reason) == (State.CLOSED, Reason.FULL)
+    assert (record(platform).state, record(platform).reason) == (ServerState.CLOSED, Reason.FULL)
     assert set(platform.timers.due) == {ids.server_name(ids.server_label("maze", "bob"), 1)}
     page = alice.get()
     assert "The study is full just now" in page
@@ -271,7 +271,7 @@ def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
     assert running(platform) == ServerSlots({record(platform).label: ServerSlot(1)}, 600)
     assert begin(platform, "bob") == ""
     Servers(platform).start(StartServer("maze", "alice", 2))
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
     assert running(platform) == ServerSlots({record(platform).label: ServerSlot(2, 1800)}, 600)
 
 
@@ -446,7 +446,7 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     level = logger.log_level
     logger.setLevel(logging.CRITICAL)
     project = msgspec.structs.replace(SIMULATED, max_participants=50, max_servers=8, max_server_hours=9)
-    world = World(seed, project=project)
+    world = SimulatedWorld(seed, project=project)
     tasks, most = world.platform.tasks, 0
     run = tasks.run
 

@@ -31,7 +31,7 @@ def test_the_pair_gets_a_server_that_is_ready_though_another_was_started_first(r
     room.wait(30)
     room.arrive_at_start("bob", "cem")
     first, second = room.started()
-    room.serve(first, state=server.State.NAMING)
+    room.serve(first, state=server.ServerState.NAMING)
     room.poll("ann", "bob", seconds=4)
     assert room.session("ann").id == second
     assert [each.id for each in room.document().open] == [first]
@@ -42,7 +42,7 @@ def test_a_pair_whose_server_is_not_ready_is_formed_and_waits_for_the_first_that
     room.wait(1)
     room.arrive_at_start("cem", ready=False)
     first, second = room.started()
-    room.serve(first, second, state=server.State.STARTING)
+    room.serve(first, second, state=server.ServerState.STARTING)
     told = room.poll("ann", "bob", seconds=4)
     assert told["ann"] == NoServerYet(first, 2, room.repository.server_of("maze", first), 2)
     assert (room.membership("ann"), room.stored(f"sessions/{first}/session.json")) == (None, None)
@@ -59,7 +59,7 @@ def test_of_two_pairs_the_first_gets_the_server_that_is_ready_first(room: Waitin
     room.wait(1)
     room.arrive_at_start("cem", "dan", ready=False)
     first, second = room.started()
-    room.serve(first, second, state=server.State.STARTING)
+    room.serve(first, second, state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=4)
     room.poll("cem", "dan", seconds=4)
     room.serve(second)
@@ -76,7 +76,7 @@ def test_of_two_pairs_the_first_gets_the_server_that_is_ready_first(room: Waitin
 def test_a_pair_whose_server_has_ended_keeps_it_and_is_told(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
-    room.serve(first, state=server.State.CLOSED, reason=server.Reason.REFUSED)
+    room.serve(first, state=server.ServerState.CLOSED, reason=server.Reason.REFUSED)
     room.poll("ann", "bob", seconds=4)
     assert room.session("ann").id == first
 
@@ -87,8 +87,8 @@ def test_a_pair_whose_server_has_ended_waits_for_another_that_starts(room: Waiti
         room.arrive_at_start(*users, ready=False)
         room.wait(1)
     servers = room.started()
-    room.serve(*servers, state=server.State.STARTING)
-    room.serve(servers[which], state=server.State.CLOSED, reason=server.Reason.FULL)
+    room.serve(*servers, state=server.ServerState.STARTING)
+    room.serve(servers[which], state=server.ServerState.CLOSED, reason=server.Reason.FULL)
     room.poll("ann", "bob", seconds=4)
     room.poll("cem", "dan", seconds=4)
     told = room.poll("ann", "bob", "cem", "dan")
@@ -104,7 +104,7 @@ def test_a_pair_whose_server_has_ended_gets_one_that_is_ready_however_many_other
         room.arrive_at_start(f"ann{number}", f"bob{number}", ready=False)
         room.wait(1)
     *ended, last = room.started()
-    room.serve(*ended, state=server.State.CLOSED, reason=server.Reason.FULL)
+    room.serve(*ended, state=server.ServerState.CLOSED, reason=server.Reason.FULL)
     room.serve(last)
     room.poll("ann0", "bob0", seconds=4)
     assert room.session("ann0").id == last
@@ -133,7 +133,7 @@ def test_a_group_that_was_proposed_before_the_number_of_players_changed_is_not_f
 
 def test_a_pair_that_waits_for_its_server_stays_a_pair_when_the_number_of_players_changes(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
-    room.serve(*room.started(), state=server.State.STARTING)
+    room.serve(*room.started(), state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=4)
     room.project = pairs(players=3)
     room.serve(*room.started())
@@ -145,7 +145,7 @@ def test_a_pair_that_waits_for_its_server_stays_a_pair_when_the_number_of_player
 def test_a_pair_whose_server_is_lost_and_replaced_waits_for_it(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
-    room.serve(first, state=server.State.CLOSED, reason=server.Reason.LOST)
+    room.serve(first, state=server.ServerState.CLOSED, reason=server.Reason.LOST)
     told = room.poll("ann", "bob", seconds=4)
     assert isinstance(told["ann"], NoServerYet)
 
@@ -153,7 +153,7 @@ def test_a_pair_whose_server_is_lost_and_replaced_waits_for_it(room: WaitingRoom
 def test_after_five_minutes_a_pair_keeps_the_server_it_was_given(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
-    room.serve(first, state=server.State.STARTING)
+    room.serve(first, state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=298)
     assert room.membership("ann") is None
     room.poll("ann", "bob", seconds=6)
@@ -163,7 +163,7 @@ def test_after_five_minutes_a_pair_keeps_the_server_it_was_given(room: WaitingRo
 def test_the_sweep_gives_ready_servers_to_pairs_that_ask_no_more(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
-    room.serve(first, state=server.State.STARTING)
+    room.serve(first, state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=4)
     room.serve(first)
     room.lobby.repair(room.project)
@@ -172,7 +172,7 @@ def test_the_sweep_gives_ready_servers_to_pairs_that_ask_no_more(room: WaitingRo
 
 def test_a_start_message_that_comes_late_leaves_nobody_under_way_who_waits_for_a_server(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
-    room.serve(*room.started(), state=server.State.STARTING)
+    room.serve(*room.started(), state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=4)
     room.arrive_at_start("ann", ready=False)
     assert room.entries() == []
@@ -210,7 +210,7 @@ def test_no_more_servers_are_started_ahead_than_may_run_however_many_are_under_w
         room.arrive_at_start(f"p{number}", ready=False)
     first = room.started()
     assert len(set(first)) == len(room.document().open) == 3
-    room.serve(*first, state=server.State.CLOSED, reason=server.Reason.FULL, closed=room.platform.now())
+    room.serve(*first, state=server.ServerState.CLOSED, reason=server.Reason.FULL, closed=room.platform.now())
     room.wait(300)
     room.lobby.repair(room.project)
     assert len(set(room.started())) == 6

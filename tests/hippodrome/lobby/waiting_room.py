@@ -19,7 +19,7 @@ from hippodrome.model.memberships import Membership
 from hippodrome.model.messages import StartServer
 from hippodrome.model.project import Project
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import State, new_attempt
+from hippodrome.model.server import ServerState, new_attempt
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Topic
 from hippodrome.storage.repository import Repository
@@ -37,7 +37,7 @@ def pairs(**changes: Any) -> Project:
 
 
 def serve(
-    platform: FakePlatform, project: Project, session_id: str, state: State = State.READY, **changes: Any
+    platform: FakePlatform, project: Project, session_id: str, state: ServerState = ServerState.READY, **changes: Any
 ) -> None:
     """Write the record of a session's server."""
     record = new_attempt(project, session_id, 1, settings=platform.settings, now=platform.now())
@@ -127,7 +127,7 @@ class WaitingRoom:
         if ready:
             self.serve(*self.started())
 
-    def serve(self, *session_ids: str, state: State = State.READY, **changes: Any) -> None:
+    def serve(self, *session_ids: str, state: ServerState = ServerState.READY, **changes: Any) -> None:
         """The servers of these sessions come into this state."""
         for session_id in session_ids:
             serve(self.platform, self.project, session_id, state, **changes)

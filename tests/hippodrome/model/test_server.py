@@ -11,7 +11,7 @@ import pytest
 from hippodrome.model import ids, server
 from hippodrome.model.project import AwsSetup
 from hippodrome.model.records import from_json
-from hippodrome.model.server import Reason, Server, State, TaskStopped
+from hippodrome.model.server import Reason, Server, ServerState, TaskStopped
 from hippodrome.ports import Address, DnsRecord
 from testing.fake_platform import FakePlatform
 from testing.studies import study
@@ -39,7 +39,7 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         project_id="maze",
         user_id="alice",
         attempt=1,
-        state=State.STARTING,
+        state=ServerState.STARTING,
         token="t",
         requested=NOW,
         deadline=NOW + timedelta(minutes=30),
@@ -122,15 +122,15 @@ def test_the_way_from_the_start_to_ready_and_closed() -> None:
     assert changes(first, server.on_demand(first)) == {"spot": False}
     named = server.naming(first, "task", Address("192.0.2.1", 5001), LATER)
     assert changes(first, named) == {
-        "state": State.NAMING,
+        "state": ServerState.NAMING,
         "task": "task",
         "host": "192.0.2.1",
         "port": 5001,
         "running": LATER,
     }
-    assert changes(named, server.ready(named, LATER)) == {"state": State.READY, "ready": LATER}
+    assert changes(named, server.ready(named, LATER)) == {"state": ServerState.READY, "ready": LATER}
     assert changes(named, server.close(named, Reason.LOST, LATER, "spot")) == {
-        "state": State.CLOSED,
+        "state": ServerState.CLOSED,
         "closed": LATER,
         "reason": Reason.LOST,
         "cause": "spot",
@@ -151,7 +151,7 @@ def test_a_tombstone_is_closed_from_the_beginning() -> None:
         project_id="maze",
         user_id="alice",
         attempt=2,
-        state=State.CLOSED,
+        state=ServerState.CLOSED,
         token="",
         requested=NOW,
         deadline=NOW,
@@ -192,7 +192,7 @@ def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() 
     full = server.close(second, Reason.FULL, LATER)
     assert [server.found_no_slot(full, attempt) for attempt in (1, 2, 3)] == [False, True, False]
     assert not server.found_no_slot(server.close(second, Reason.LOST, LATER), 2)
-    assert not server.found_no_slot(msgspec.structs.replace(full, state=State.STARTING), 2)
+    assert not server.found_no_slot(msgspec.structs.replace(full, state=ServerState.STARTING), 2)
     assert server.repeating(full, claimed(attempt=2)).earlier == second.earlier
 
 
@@ -219,7 +219,7 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
     assert (wanting.name, wanting.warm_server_label) == (waiting.name, waiting.label)
     assert own.warm_server_label == ""
     given = server.assigned(wanting, waiting, LATER)
-    assert changes(wanting, given) == {"state": State.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
+    assert changes(wanting, given) == {"state": ServerState.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
     fresh = msgspec.structs.replace(claimed(), nonce="another")
     assert server.without_warm_server(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
 
@@ -227,12 +227,12 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
 def test_a_warm_server_is_taken_or_told_to_go() -> None:
     waiting = warm_server()
     assert changes(waiting, server.handed_over(waiting, LABEL, LATER)) == {
-        "state": State.CLOSED,
+        "state": ServerState.CLOSED,
         "closed": LATER,
         "reason": Reason.ASSIGNED,
         "assigned_to": LABEL,
     }
-    assert changes(waiting, server.draining(waiting)) == {"state": State.DRAINING}
+    assert changes(waiting, server.draining(waiting)) == {"state": ServerState.DRAINING}
     assert waiting.is_warm_server
 
 
@@ -255,7 +255,7 @@ def test_what_to_make_of_a_task_that_ended(code: str | None, exit_code: int | No
 
 
 def test_the_words_of_states_and_reasons_stand_in_records_and_pages() -> None:
-    assert list(State) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
+    assert list(ServerState) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
     assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
     assert server.key(LABEL) == f"_servers/{LABEL}.json"
 

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from hippodrome.model import server
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.participants.waiting import FAILURES, ServerStates
 from hippodrome.ports import Address
 from hippodrome.storage.secret import SecretCache
@@ -63,7 +63,7 @@ def test_who_asks_without_standing_at_a_game_is_told_the_first_game_step() -> No
 
 
 def test_a_server_that_starts_is_counted_from_when_it_was_asked_for() -> None:
-    state = told(started(2, state=State.NAMING), since=NOW - timedelta(hours=1))
+    state = told(started(2, state=ServerState.NAMING), since=NOW - timedelta(hours=1))
     assert (state["state"], state["attempt"], state["seconds"], "url" in state) == ("naming", 2, 7, False)
 
 
@@ -74,7 +74,11 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
     host = PLATFORM.dns.browser_host(running(60).dns_record)  # type: ignore[arg-type]
     assert (state["url"], state["token"]) == (f"{PLATFORM.settings.game_scheme}://{host}:5000/", token)
     assert len(token) == 48
-    for record in (started(), started(state=State.READY), started(state=State.NAMING, host="192.0.2.1", port=5000)):
+    for record in (
+        started(),
+        started(state=ServerState.READY),
+        started(state=ServerState.NAMING, host="192.0.2.1", port=5000),
+    ):
         assert not {"url", "token"} & told(record).keys()
 
 

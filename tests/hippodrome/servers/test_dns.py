@@ -12,7 +12,7 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList, Project, Step
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
 from hippodrome.servers.dns import MAX_ADDRESS_CHECKS, MAX_CHECKS, PAUSES, RETRY_PAUSE, pause
 from testing import template
@@ -42,7 +42,7 @@ def name(user: str) -> str:
     return ids.server_name(ids.server_label("maze", user), 1)
 
 
-def states(platform: FakePlatform) -> list[State]:
+def states(platform: FakePlatform) -> list[ServerState]:
     kept = platform.documents.kept
     return [from_json(kept[server.key(ids.server_label("maze", user))][0], Server).state for user in PEOPLE]
 
@@ -58,7 +58,7 @@ def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(
     first, second = follow_ups(platform)
     platform.dns.pending.remove(first.change)
     assert Servers(platform).dns_changed(first, second) == []
-    assert states(platform) == [State.READY, State.NAMING]
+    assert states(platform) == [ServerState.READY, ServerState.NAMING]
     assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[1]]
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
 
@@ -75,7 +75,7 @@ def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> N
     platform.dns.settle()
     Servers(platform).dns_changed(*follow_ups(platform))
     assert batches == [2, 2], "the looks, and then the records of all that are ready"
-    assert states(platform) == [State.READY, State.READY]
+    assert states(platform) == [ServerState.READY, ServerState.READY]
 
 
 def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
@@ -90,7 +90,7 @@ def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
 
     platform.dns.in_sync = throttled  # type: ignore[method-assign]
     assert Servers(platform).dns_changed(first, second) == [first]
-    assert states(platform) == [State.NAMING, State.READY]
+    assert states(platform) == [ServerState.NAMING, ServerState.READY]
 
 
 def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trouble(platform: FakePlatform) -> None:
@@ -133,7 +133,7 @@ def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platfor
     assert set(platform.dns.records) == {f"{name(user)}.servers.example.org" for user in PEOPLE}
     platform.dns.settle()
     servers.dns_changed(*follow_ups(platform))
-    assert states(platform) == [State.READY, State.READY]
+    assert states(platform) == [ServerState.READY, ServerState.READY]
 
 
 def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatform) -> None:
@@ -184,7 +184,7 @@ def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platf
     platform.dns.settle()
     one.dns_changed(second)
     kept = platform.documents.kept[server.key(ids.server_label("maze", user))]
-    assert from_json(kept[0], Server).state is State.READY
+    assert from_json(kept[0], Server).state is ServerState.READY
 
 
 def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
@@ -232,7 +232,7 @@ def looks(platform: FakePlatform) -> list[int]:
 def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform) -> None:
     platform.bus.delayed.pop()
     assert len(looks(platform)) == MAX_CHECKS
-    assert states(platform) == [State.NAMING] * 2
+    assert states(platform) == [ServerState.NAMING] * 2
 
 
 def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: FakePlatform) -> None:
@@ -267,7 +267,7 @@ def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_fo
     assert servers.tasks_changed([asked]) == [asked]
     servers.tasks_changed([asked._replace(interface="eni-1")])
     record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
-    assert record.state is State.READY
+    assert record.state is ServerState.READY
 
 
 # Names that the zone refuses
@@ -306,7 +306,7 @@ def both(platform: FakePlatform) -> list[TaskChanged]:
 def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePlatform) -> None:
     refuse(by_id, lambda wanted: wanted.startswith("alice."))
     assert Servers(by_id).tasks_changed(both(by_id)) == []
-    assert states(by_id) == [State.READY, State.READY]
+    assert states(by_id) == [ServerState.READY, ServerState.READY]
     assert sorted(by_id.dns.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
 
 
@@ -314,7 +314,7 @@ def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -
     refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
     events = both(by_id)
     assert Servers(by_id).tasks_changed(events) == events[:1]
-    assert states(by_id) == [State.NAMING, State.READY]
+    assert states(by_id) == [ServerState.NAMING, ServerState.READY]
 
 
 def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakePlatform) -> None:
@@ -325,4 +325,4 @@ def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakeP
     named = [ServerAttempt(ids.server_label("maze", user), 1) for user in PEOPLE]
     first, second = (DnsChanged("", [one], 1, unmade=True) for one in named)
     assert Servers(by_id).dns_changed(first, second) == [first]
-    assert states(by_id) == [State.NAMING, State.READY]
+    assert states(by_id) == [ServerState.NAMING, ServerState.READY]

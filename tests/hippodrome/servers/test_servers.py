@@ -12,7 +12,7 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State, requestable_attempt
+from hippodrome.model.server import Reason, Server, ServerState, requestable_attempt
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.sweep import Sweep
@@ -73,7 +73,7 @@ def test_a_start_schedules_the_shutdown_and_runs_one_task_on_spot(platform: Fake
     at, message = platform.timers.due[f"{LABEL}-1"]
     assert (at - platform.now()).total_seconds() == 30 * 60
     assert message == {"projectId": "maze", "userId": "alice", "attempt": 1, "reason": "deadline"}
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
 
 
 def test_the_installations_limit_is_stronger_than_the_projects() -> None:
@@ -116,7 +116,7 @@ def test_what_aws_refuses_is_closed_with_its_reason_and_leaves_nothing(
 ) -> None:
     platform.tasks.fail = [Refused("no such task definition")]
     servers.start(START)
-    assert (record(platform).state, record(platform).reason) == (State.CLOSED, Reason.REFUSED)
+    assert (record(platform).state, record(platform).reason) == (ServerState.CLOSED, Reason.REFUSED)
     assert nothing_left(platform)
     assert not platform.bus.sent
 
@@ -218,13 +218,13 @@ def test_a_running_server_is_named_and_ready_once_the_name_is_known_everywhere(
     platform.dns.slow = True
     servers.start(START)
     assert servers.tasks_changed([event(platform, "RUNNING")]) == []
-    assert record(platform).state is State.NAMING
+    assert record(platform).state is ServerState.NAMING
     assert platform.dns.records == {f"{LABEL}-1.servers.example.org": record(platform).host}
     servers.dns_changed(follow_up(platform))
-    assert record(platform).state is State.NAMING
+    assert record(platform).state is ServerState.NAMING
     platform.dns.settle()
     servers.dns_changed(follow_up(platform))
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 def test_a_batch_of_servers_is_named_with_one_change(platform: FakePlatform, servers: Servers) -> None:
@@ -245,7 +245,7 @@ def test_events_that_come_twice_or_late_change_nothing(platform: FakePlatform, s
     servers.tasks_changed([running, running])
     servers.tasks_changed([running])
     ready = record(platform)
-    assert ready.state is State.READY
+    assert ready.state is ServerState.READY
     servers.stop([STOP])
     servers.tasks_changed([running])
     assert record(platform).is_closed
@@ -594,7 +594,7 @@ def test_a_record_that_keeps_changing_is_left_to_the_queue(platform: FakePlatfor
     assert servers.tasks_changed([running]) == [running]
     platform.documents.before_write = []
     servers.tasks_changed([event(platform, "RUNNING")])
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatform, servers: Servers) -> None:
@@ -636,7 +636,7 @@ def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
     assert (first.cpu, first.memory, first.earlier) == (1, 2, ())
     servers.start(StartServer("maze", "alice", 2))
     second = record(platform)
-    assert (second.attempt, second.state) == (2, State.STARTING)
+    assert (second.attempt, second.state) == (2, ServerState.STARTING)
     (run,) = second.earlier
     assert (run.attempt, run.cpu, run.memory, run.spot, run.reason) == (1, 1, 2, True, Reason.STOPPED)
     assert (run.requested, run.running, run.closed) == (first.requested, first.running, first.closed)
@@ -653,7 +653,7 @@ def test_a_start_message_that_comes_again_stops_no_game_of_a_study_that_was_clos
 ) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "RUNNING")])
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
     platform.bus.sent.clear()
     platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
     platform.wait(seconds=11)

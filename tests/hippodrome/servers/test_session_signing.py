@@ -120,7 +120,7 @@ def test_who_is_told_to_stop_may_still_store_the_answers_of_all(world: World) ->
 
 def test_a_warm_server_that_was_given_to_a_session_is_the_sessions(world: World) -> None:
     form(world, "alice", "bob")
-    warm = world.keep(world.claim(WARM_ID, project=PAIRS, state=server.State.READY))
+    warm = world.keep(world.claim(WARM_ID, project=PAIRS, state=server.ServerState.READY))
     world.keep(server.handed_over(warm, claim(world).label, world.now()))
     world.keep(server.assigned(server.reserving(claim(world), warm), warm, world.now()))
     wishes = (get(handover_key("maze", warm.name)), get(DOCUMENT), put(answer("bob")), put(RECORDING))

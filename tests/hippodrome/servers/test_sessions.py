@@ -16,7 +16,7 @@ from hippodrome.model import ids, messages, server, sessions
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, StopUser
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Settings, Topic
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import SecretCache
@@ -143,7 +143,7 @@ def test_a_session_holds_one_slot(platform: FakePlatform) -> None:
     servers.stop([STOP])
     assert from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots).names == []
     servers.start(StartServer("maze", OTHER))
-    assert record(platform, OTHER).state is State.STARTING
+    assert record(platform, OTHER).state is ServerState.STARTING
 
 
 def test_a_start_message_of_a_participant_starts_no_server_of_their_own(
@@ -188,7 +188,7 @@ def test_a_warm_server_is_handed_over_to_a_session() -> None:
     servers.start(start)
     runs(platform, servers)
     servers.start(START)
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
     (key,) = (key for key in platform.documents.kept if key.startswith(handovers_folder("maze")))
     assert handover.parse(platform.documents.kept[key][0]) == Handover(SESSION, None, f"{LABEL}-1")
     assert (record(platform).deadline - platform.now()) == timedelta(minutes=90)
@@ -282,7 +282,7 @@ def test_it_is_stopped_when_the_last_member_reaches_the_stop_step(
     answer(platform, first, "1", "2", "3")
     answer(platform, last, "1", "2")
     assert servers.stop([StopServer("maze", first)]) == []
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
     assert servers.stop([StopServer("maze", last)]) == []
     assert record(platform).reason is Reason.STOPPED
     assert nothing_left(platform)
@@ -320,7 +320,7 @@ def test_a_stop_in_all_projects_ends_no_session_that_another_plays(platform: Fak
     answer(platform, "alice", "1", "2", "3")
     answer(platform, "bob", "1", "2")
     assert servers.stop([StopUser("alice")]) == []
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
     assert servers.stop([StopUser("bob")]) == []
     assert record(platform).reason is Reason.STOPPED
 
@@ -364,7 +364,7 @@ def test_a_member_cannot_stop_the_server_of_the_others(relays: FakePlatform, ser
     assert (topic, stop) == (Topic.STOP, StopServer("maze", "alice"))
     assert stop
     assert servers.stop([stop]) == []
-    assert record(relays).state is State.STARTING
+    assert record(relays).state is ServerState.STARTING
 
 
 def test_a_members_token_is_their_own(relays: FakePlatform, servers: Servers) -> None:
@@ -473,7 +473,7 @@ def test_one_that_all_members_have_left_is_stopped(platform: FakePlatform, serve
         servers.stop([StopServer("maze", user)])
     for user in MEMBERS:
         answer(platform, user, "3")
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
     assert Sweep(platform).run().sessions == 1
     deliver_stops(platform, servers)
     assert record(platform).reason is Reason.STOPPED
@@ -525,7 +525,7 @@ def test_one_server_is_started_ahead_for_every_two_who_are_under_way(
         deliver(platform, servers)
     found = open_sessions(platform)
     assert len(found) == wanted
-    assert all(one.is_sessions and one.state is State.READY for one in found)
+    assert all(one.is_sessions and one.state is ServerState.READY for one in found)
     assert Sweep(platform).run().sessions == 0
 
 
@@ -768,7 +768,7 @@ def test_a_server_of_their_own_that_has_ended_does_not_keep_a_members_stop_from_
     servers.start(StartServer("maze", SESSION, players=2))
     answer(platform, "bob", "1", "2", "3", "4")
     assert servers.stop([StopServer("maze", "alice", 1)]) == []
-    assert record(platform).state is State.STARTING, "that was their own server's"
+    assert record(platform).state is ServerState.STARTING, "that was their own server's"
     assert servers.stop([stop]) == []
     assert record(platform).is_closed
     assert nothing_left(platform)

@@ -240,7 +240,7 @@ def test_the_bounds_are_those_of_a_task(world: World) -> None:
 
 def test_a_server_may_ask_from_its_start_on(world: World) -> None:
     """Its certificate comes before anybody is told that it runs."""
-    assert from_json(world.documents.kept[server.key(NAME[:-2])][0], Server).state is server.State.STARTING
+    assert from_json(world.documents.kept[server.key(NAME[:-2])][0], Server).state is server.ServerState.STARTING
     assert world.ask(get(PRIVKEY), get(ANSWER))[0] == 200
 
 
@@ -302,7 +302,7 @@ WARM_ID = "~" + "0" * 20
 @pytest.fixture
 def warm_server(world: World) -> Server:
     """A warm server for a participant, ready."""
-    return world.keep(world.claim(WARM_ID, state=server.State.READY))
+    return world.keep(world.claim(WARM_ID, state=server.ServerState.READY))
 
 
 @pytest.fixture

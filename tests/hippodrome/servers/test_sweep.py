@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, TaskRequest, Topic
 from hippodrome.servers.overdue import RULES
 from hippodrome.storage.repository import Repository
@@ -313,25 +313,25 @@ def replacement_is_lost(platform: FakePlatform) -> None:
 
 
 STAYS = {
-    State.STARTING: (start_is_cut_off, running_is_not_told),
-    State.NAMING: (looks_are_lost,),
-    State.READY: (deadline_is_not_told,),
-    State.DRAINING: (stop_of_a_warm_server_is_lost,),
-    State.CLOSED: (replacement_is_lost, leftovers),
+    ServerState.STARTING: (start_is_cut_off, running_is_not_told),
+    ServerState.NAMING: (looks_are_lost,),
+    ServerState.READY: (deadline_is_not_told,),
+    ServerState.DRAINING: (stop_of_a_warm_server_is_lost,),
+    ServerState.CLOSED: (replacement_is_lost, leftovers),
 }
-UNRECORDED = {State.QUEUED}  # no record says so, and so no sweep can find it: who waits asks again by their page
+UNRECORDED = {ServerState.QUEUED}  # no record says so, and so no sweep can find it: who waits asks again by their page
 
 
 def test_there_is_a_test_for_every_state_in_which_a_server_may_stay() -> None:
-    assert STAYS.keys() | UNRECORDED == set(State)
-    assert set(RULES) == set(State)
+    assert STAYS.keys() | UNRECORDED == set(ServerState)
+    assert set(RULES) == set(ServerState)
 
 
 @pytest.mark.parametrize(
     ("state", "trouble"), [(state, trouble) for state, troubles in STAYS.items() for trouble in troubles]
 )
 def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
-    platform: FakePlatform, state: State, trouble: Callable[[FakePlatform], None]
+    platform: FakePlatform, state: ServerState, trouble: Callable[[FakePlatform], None]
 ) -> None:
     trouble(platform)
     stuck = next(
@@ -339,10 +339,10 @@ def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
     )
     assert stuck.state is state
     sweeps(platform, 10)
-    if state in (State.STARTING, State.NAMING):
-        assert (record_of(platform).state, record_of(platform).attempt) == (State.READY, 1)
+    if state in (ServerState.STARTING, ServerState.NAMING):
+        assert (record_of(platform).state, record_of(platform).attempt) == (ServerState.READY, 1)
     elif trouble is replacement_is_lost:
-        assert (record_of(platform).state, record_of(platform).attempt) == (State.READY, 2)
+        assert (record_of(platform).state, record_of(platform).attempt) == (ServerState.READY, 2)
     else:
         assert all(
             from_json(kept[0], Server).is_closed

@@ -18,7 +18,7 @@ from hippodrome.model.messages import to_message
 from hippodrome.model.participant import Participant
 from hippodrome.model.project import MasterList
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.model.warm_pool import Pool
 from protocol import handover
 
@@ -75,7 +75,7 @@ def test_a_message_is_understood(name: str) -> None:
 def test_what_the_records_say_is_what_was_meant() -> None:
     draining, taken = (from_json(document(f"server_spare_{name}"), Server) for name in ("leaving", "taken"))
     assigned, second = (from_json(document(f"server_{name}"), Server) for name in ("with_spare", "second_attempt"))
-    assert draining.state is State.DRAINING
+    assert draining.state is ServerState.DRAINING
     assert (assigned.warm_server_name, taken.assigned_to) == (taken.name, assigned.label)
     assert assigned.name == taken.name
     assert [run.warm_server_name for run in second.earlier] == [taken.name]

@@ -16,7 +16,7 @@ from hippodrome.model.messages import StartServer
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, read_list, step_key
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Server, State
+from hippodrome.model.server import Server, ServerState
 from hippodrome.ports import Address, Conflict, Topic
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, Secret, SecretCache
@@ -338,7 +338,7 @@ def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token()
     mine = server.new_attempt(study(), "alice", 1, nonce="n", settings=settings, now=now)
     given = server.assigned(server.reserving(mine, warm_server), warm_server, now)
     assert SecretCache(platform.documents).token(given) == "spares-of-old"
-    assert given.state is State.READY
+    assert given.state is ServerState.READY
 
 
 def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:

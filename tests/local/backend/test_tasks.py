@@ -23,7 +23,7 @@ from hippodrome.ports import Address, Refused, TaskRequest
 from local.backend import task_process
 from local.backend import tasks as tasks_module
 from local.backend.processes import end_everything, marked
-from local.backend.task_record import Task, TaskFolder
+from local.backend.task_record import TaskFolder, TaskRecord
 from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
 from testing.waiting import until
@@ -324,7 +324,9 @@ def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: H
     bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
     try:
         tasks = here.tasks()
-        task = Task(NAME, "hippodrome", "0" * 32, "2026-11-21T00:00:00.000Z", pid=bystander.pid, port=1, version=2)
+        task = TaskRecord(
+            NAME, "hippodrome", "0" * 32, "2026-11-21T00:00:00.000Z", pid=bystander.pid, port=1, version=2
+        )
         TaskFolder(here.state / "tasks").save(replace(task, status="RUNNING"))
         tasks = here.tasks()
         tasks.start()
@@ -464,7 +466,7 @@ def test_the_next_process_knows_whose_a_warm_server_is(here: Here) -> None:
 
 
 def test_a_warm_servers_record_names_its_handover_as_earlier_versions_did(tmp_path: Path) -> None:
-    folder, task = TaskFolder(tmp_path), Task.of(warm_server_request(), "0" * 32)
+    folder, task = TaskFolder(tmp_path), TaskRecord.of(warm_server_request(), "0" * 32)
     folder.save(task)
     assert json.loads(folder.file(NAME).read_bytes())["warm_server"] == f"study/spares/{NAME}.json"
     assert list(folder.load()) == [task]

@@ -144,7 +144,7 @@ def test_how_far_an_agent_came_is_read_from_the_last_whole_line(
 ) -> None:
     monkeypatch.setattr(agent_progress, "REPORT_BYTES", 1_000)
     report = tmp_path / "report"
-    progress = agent_progress.Progress(report, tmp_path, Outside(None))
+    progress = agent_progress.AgentProgress(report, tmp_path, Outside(None))
     sizes = []
     for step in range(50):
         progress.steps = step

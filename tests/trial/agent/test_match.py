@@ -20,7 +20,7 @@ from trial.agent.match import BadGroups
 from trial.recordings.store import FolderStore
 from trial.server import matching
 from trial.server.matching import Matching
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 QUESTION = {"id": "0" * 20, "players": 2, "waiting": [{"id": name, "answers": {"skill": name}} for name in "abcd"]}
 
@@ -95,7 +95,7 @@ def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 20, qu
         project_id, session, assigned, agent_dir = "maze", "s." + "0" * 20, False, tmp_path
 
     async def run() -> None:
-        server = Matching(store, lambda: cast(Settings, Open), function)
+        server = Matching(store, lambda: cast(TrialSettings, Open), function)
         working = asyncio.create_task(server.run())
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):

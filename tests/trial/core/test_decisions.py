@@ -15,7 +15,6 @@ from trial.core.effects import (
     Close,
     CloseRecording,
     FeedbackCall,
-    Log,
     LogAgentError,
     OpenRecording,
     RecordLine,
@@ -30,6 +29,7 @@ from trial.core.effects import (
     StepCall,
     StepTaken,
     WriteLine,
+    WriteLog,
 )
 from trial.core.ended import Episode
 from trial.core.flow_control import STALLED_SECONDS, Window
@@ -37,7 +37,7 @@ from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 ROOT = Path(__file__).parents[3]
 SPACE = ("noop", "up", "right")
@@ -51,7 +51,7 @@ class Driver:
     def __init__(self, **section):
         section = {"game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, **section}
         env = {"PROJECT_ID": "study", "USER_ID": "P1", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
-        settings = Settings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
+        settings = TrialSettings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
         self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7)
         self.now = 100.0
         self.effects = []
@@ -235,7 +235,7 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     driver.wait(STALLED_SECONDS)
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
-    assert [type(effect) for effect in driver.step()] == [WriteLine, SendPicture, Log, SendState]
+    assert [type(effect) for effect in driver.step()] == [WriteLine, SendPicture, WriteLog, SendState]
     assert driver.trial.wake_at is None
 
 

@@ -7,7 +7,7 @@ from trial.core.controls import Controls
 from trial.core.ended import Episode
 from trial.core.messages import CommandRefused
 from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState, Progress
+from trial.core.progress import PlayState, TrialProgress
 from trial.core.timing import Pacer
 from trial.settings import trial_section
 
@@ -15,7 +15,7 @@ SPACE = ("noop", "up", "left")
 
 
 def new_game(**keys):
-    return Progress(trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), alone(SPACE))
+    return TrialProgress(trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, **keys}), alone(SPACE))
 
 
 def playing(**keys):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from trial.core.ended import Break, Episode
 from trial.core.messages import CommandRefused
 from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState, Progress
+from trial.core.progress import PlayState, TrialProgress
 from trial.core.timing import Pacer
 from trial.settings import trial_section
 
@@ -15,7 +15,7 @@ SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
 
 
 def new_game(**keys):
-    return Progress(trial_section({"allowFrameRateChange": True, **keys}), alone(SPACE))
+    return TrialProgress(trial_section({"allowFrameRateChange": True, **keys}), alone(SPACE))
 
 
 EVENTS = st.one_of(

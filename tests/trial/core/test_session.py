@@ -6,7 +6,7 @@ import pytest
 
 from tests.trial.session_driver import SessionDriver
 from trial.core import messages
-from trial.core.effects import AskPolicy, Log, RecordLine, ResetCall, ResetPolicy, SendDone
+from trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SendDone, WriteLog
 from trial.core.flow_control import STALLED_SECONDS, Window
 from trial.core.message_log import MESSAGES_KEPT
 from trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
@@ -625,7 +625,7 @@ def test_an_episode_begins_with_the_latest_round_trips_and_who_is_replaced():
 def test_the_log_says_why_the_game_ends_for_all(why, goes):
     driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1)
     goes(driver)
-    assert driver.calls(Log)[0].text == f"the game ends for all without right: {why}"
+    assert driver.calls(WriteLog)[0].text == f"the game ends for all without right: {why}"
 
 
 def test_a_long_round_trip_during_the_game_changes_nothing():

@@ -17,7 +17,6 @@ from trial.core.effects import (
     Begun,
     Call,
     FeedbackCall,
-    Log,
     OpenRecording,
     RecordLine,
     Replayed,
@@ -28,6 +27,7 @@ from trial.core.effects import (
     SendState,
     StepCall,
     StepTaken,
+    WriteLog,
 )
 from trial.core.flow_control import Window
 from trial.core.messages import CommandRefused
@@ -35,7 +35,7 @@ from trial.core.players import Player, PlayersError, View, who_plays
 from trial.core.policies import AskPolicy
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.settings import Settings, trial_section
+from trial.settings import TrialSettings, trial_section
 
 SPACE = ("noop", "up", "right")
 PLAYS = {"me": "human", "it": "agent:Partner"}
@@ -48,7 +48,7 @@ class Game:
         section = {"game": "grid", "betweenEpisodes": 0, "startingFrameRate": 10, "players": plays or PLAYS, **section}
         section["ui"] = dict.fromkeys(("start", "pause", "stop", "reset", "up", "right"), True)
         env = {"PROJECT_ID": "study", "USER_ID": "P1", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
-        self.settings = Settings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
+        self.settings = TrialSettings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
         self.trial = Trial(self.settings, "3", trial_id="the-trial", new_seed=lambda: 7)
         self.now = 100.0
         self.all: list[Any] = []
@@ -432,7 +432,7 @@ def test_three_failures_in_a_row_and_it_idles_for_the_episode() -> None:
     game.stepped(seen("me", "it"))
     game.wait(0.1)
     assert len(game.asks) == asked == 3
-    told = [one.text for one in game.all if isinstance(one, Log)]
+    told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert sum("no idea" in text for text in told) == 1
     game.stepped(seen(), over=True)
     game.returns(Begun(b"reset", FRAME, seen("me", "it")))
@@ -468,7 +468,7 @@ def test_the_log_says_how_often_a_policy_was_late_in_an_episode() -> None:
     game.acts(1)
     game.wait(0.1)
     game.stepped(seen(), over=True)
-    told = [one.text for one in game.all if isinstance(one, Log)]
+    told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert "the policy of it was late at 1 of 2 steps" in told
 
 

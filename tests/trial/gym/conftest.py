@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from testing.gym_server import Client, GymServer, gym_server
+from testing.gym_server import GymServerProcess, TextClient, gym_server
 
 HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[GymServer]:
+def server() -> Iterator[GymServerProcess]:
     """A server with the environments of `odd_environments.py`, and limits that a test can reach."""
     limits = ("--seconds", "1", "--environments", "8", "--processes", "4", "--megabytes", "300")
     with gym_server("--import", "odd_environments", *limits, env={"PYTHONPATH": str(HERE)}) as found:
@@ -21,14 +21,14 @@ def server() -> Iterator[GymServer]:
 
 
 @pytest.fixture
-def client(server: GymServer) -> Iterator[Client]:
+def client(server: GymServerProcess) -> Iterator[TextClient]:
     """A client of Gymie's: no subprotocol, no form."""
-    with Client(server.url) as found:
+    with TextClient(server.url) as found:
         yield found
 
 
 @pytest.fixture
-def asking(server: GymServer) -> Iterator[Client]:
+def asking(server: GymServerProcess) -> Iterator[TextClient]:
     """A client that asks for Gymnasium's form, and whose errors are answered."""
-    with Client(server.url + "?form=gymnasium") as found:
+    with TextClient(server.url + "?form=gymnasium") as found:
         yield found

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from testing.gym_server import Client, GymServer
+from testing.gym_server import GymServerProcess, TextClient
 from trial.gym import arrays, spaces
 
 
 @pytest.fixture
-def client(server: GymServer) -> Iterator[Client]:
-    with Client(server.url, arrays=True) as found:
+def client(server: GymServerProcess) -> Iterator[TextClient]:
+    with TextClient(server.url, arrays=True) as found:
         yield found
 
 
 class Made:
     """An environment made over the subprotocol."""
 
-    def __init__(self, client: Client, env_id: str, **params: Any) -> None:
+    def __init__(self, client: TextClient, env_id: str, **params: Any) -> None:
         self.client = client
         self.said = client.ask("make", env_id=env_id, **params)
         self.handle = self.said["handle"]
@@ -35,7 +35,7 @@ class Made:
             self.client.say(arrays.reset_request(self.handle, seed, None)), self.observations
         )
 
-    def steps(self, actions: Any, kind: int = arrays.STEP_MANY) -> arrays.Steps:
+    def steps(self, actions: Any, kind: int = arrays.STEP_MANY) -> arrays.StepRows:
         count = len(actions) // self.num_envs
         request = arrays.step_request(
             kind, self.handle, count, self.actions, arrays.batch_of(self.actions, actions), num_envs=self.num_envs
@@ -43,7 +43,7 @@ class Made:
         return arrays.read_steps(self.client.say(request), self.observations)
 
 
-def test_make_describes_the_environment(client: Client) -> None:
+def test_make_describes_the_environment(client: TextClient) -> None:
     said = Made(client, "CartPole-v1").said
     assert said["spec"] == {
         "id": "CartPole-v1",
@@ -54,7 +54,7 @@ def test_make_describes_the_environment(client: Client) -> None:
     assert (said["num_envs"], said["autoreset_mode"], said["render_mode"]) == (0, "NextStep", None)
 
 
-def test_one_step(client: Client) -> None:
+def test_one_step(client: TextClient) -> None:
     made = Made(client, "Odd/Calm-v0")
     observation, infos = made.reset(seed=4)
     assert (observation.tolist(), infos) == ([[0.0, 0.5]], [(0, {"seed": 4})])
@@ -64,12 +64,12 @@ def test_one_step(client: Client) -> None:
     assert steps.infos == [(0, {"action": 2})]
 
 
-def test_the_same_steps_as_in_json(server: GymServer, client: Client) -> None:
+def test_the_same_steps_as_in_json(server: GymServerProcess, client: TextClient) -> None:
     made = Made(client, "CartPole-v1")
     actions = [np.int64(at % 3 == 0) for at in range(64)]
     first, _ = made.reset(seed=11)
     steps = made.steps(actions)
-    with Client(server.url + "?form=gymnasium") as other:
+    with TextClient(server.url + "?form=gymnasium") as other:
         same = other.make("CartPole-v1", seed=11)
         assert other.ask("reset", instance_id=same)[0] == first[0].tolist()
         columns = other.ask("step_many", instance_id=same, actions=[int(action) for action in actions])
@@ -77,7 +77,7 @@ def test_the_same_steps_as_in_json(server: GymServer, client: Client) -> None:
     assert steps.terminated.any()
 
 
-def test_a_vector(client: Client) -> None:
+def test_a_vector(client: TextClient) -> None:
     made = Made(client, "Odd/Calm-v0", num_envs=3)
     observations, _ = made.reset(seed=[1, 2, 3])
     assert observations.tolist() == [[0.0, 0.5]] * 3
@@ -88,14 +88,14 @@ def test_a_vector(client: Client) -> None:
     assert steps.infos[0][1]["action"].tolist() == [1, 1, 1]
 
 
-def test_a_vector_with_continuous_actions(client: Client) -> None:
+def test_a_vector_with_continuous_actions(client: TextClient) -> None:
     made = Made(client, "Odd/Continuous-v0", num_envs=2)
     made.reset()
     steps = made.steps([np.array([0.25, 0.5], np.float32), np.array([-1, 1], np.float32)])
     assert steps.infos[0][1]["action"].tolist() == [[0.25, 0.5], [-1.0, 1.0]]
 
 
-def test_with_disabled_the_answer_ends_with_the_episode(client: Client) -> None:
+def test_with_disabled_the_answer_ends_with_the_episode(client: TextClient) -> None:
     made = Made(client, "Odd/Calm-v0", autoreset_mode="Disabled")
     made.reset()
     assert len(made.steps([np.int64(0)] * 9).rewards) == 5
@@ -109,7 +109,9 @@ def test_with_disabled_the_answer_ends_with_the_episode(client: Client) -> None:
         (b"\x01\x00\x01\x00\x01\x00\x00\x00" + bytes(9), "9 bytes"),
     ],
 )
-def test_the_sentence_shows_the_action_or_how_long_what_is_none_is(client: Client, request_: bytes, shown: str) -> None:
+def test_the_sentence_shows_the_action_or_how_long_what_is_none_is(
+    client: TextClient, request_: bytes, shown: str
+) -> None:
     Made(client, "Odd/Calm-v0").reset()
     assert json.loads(client.say(request_))["error"]["message"].startswith(f"Action `{shown}` is wrong: The ")
 
@@ -127,7 +129,7 @@ def test_the_sentence_shows_the_action_or_how_long_what_is_none_is(client: Clien
         (b"\x02\x00\x01\x00\xff\xff\x00\x00" + bytes(8), "WrongAction"),
     ],
 )
-def test_a_wrong_request_gets_a_sentence(client: Client, request_: bytes, kind: str) -> None:
+def test_a_wrong_request_gets_a_sentence(client: TextClient, request_: bytes, kind: str) -> None:
     made = Made(client, "Odd/Calm-v0")
     assert made.handle == 1
     made.reset()

@@ -362,7 +362,7 @@ def test_the_results_of_steps_travel(space: Any, seed: int, count: int) -> None:
     rewards = np.array([np.inf, -0.5, np.nan, 1e-300][:count])
     ends = np.array([True, False, True, False][:count])
     infos = [(count - 1, {"a": np.float32(0.5), "lives": 3})]
-    sent = arrays.Steps(arrays.batch_of(layout, rows), rewards, ends, ~ends, [(0, {}), *infos])
+    sent = arrays.StepRows(arrays.batch_of(layout, rows), rewards, ends, ~ends, [(0, {}), *infos])
     found = arrays.read_steps(arrays.steps_reply(arrays.STEP_MANY, 3, layout, sent), layout)
     assert all(map(same, layout.rows(found.observations, count), rows))
     assert same(found.rewards, rewards)
@@ -386,7 +386,7 @@ def test_only_the_rows_that_were_stepped_are_sent() -> None:
     layout = arrays.layout(space)
     rows = sampled(space, 5, 4)
     flags = np.zeros(3, bool)
-    sent = arrays.Steps(arrays.batch_of(layout, rows), np.zeros(3), flags, flags, [])
+    sent = arrays.StepRows(arrays.batch_of(layout, rows), np.zeros(3), flags, flags, [])
     found = arrays.read_steps(arrays.steps_reply(arrays.STEP_MANY, 3, layout, sent), layout)
     assert all(map(same, layout.rows(found.observations, 3), rows[:3]))
 

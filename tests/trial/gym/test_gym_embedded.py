@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
-from testing.gym_server import ROOT, Client, GymServer, gym_server
+from testing.gym_server import ROOT, GymServerProcess, TextClient, gym_server
 from testing.preloaded import interruptible
 from trial.gym import override
 from trial.gym.__main__ import main
@@ -49,22 +49,22 @@ gymie.start("127.0.0.1", 0, limits=Limits(seconds=5), ready=lambda port: print(f
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GymServer]:
+def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GymServerProcess]:
     file = tmp_path_factory.mktemp("program") / "serve.py"
     file.write_text(PROGRAM)
     with gym_server(program=(str(file),)) as found:
         yield found
 
 
-def test_a_step_is_what_the_program_makes_of_it(program: GymServer) -> None:
-    with Client(program.url) as client:
+def test_a_step_is_what_the_program_makes_of_it(program: GymServerProcess) -> None:
+    with TextClient(program.url) as client:
         made = client.make("CartPole-v1")
         client.ask("reset", instance_id=made)
         assert client.ask("step", instance_id=made, action=1) == [[0, 0, 0, 0], 10.0, False, {"processed": True}]
 
 
-def test_a_program_is_told_of_the_time_limit_and_its_info_is_what_is_answered(program: GymServer) -> None:
-    with Client(program.url) as client:
+def test_a_program_is_told_of_the_time_limit_and_its_info_is_what_is_answered(program: GymServerProcess) -> None:
+    with TextClient(program.url) as client:
         made = client.make("MountainCar-v0")
         client.ask("reset", instance_id=made)
         for _ in range(200):
@@ -72,20 +72,20 @@ def test_a_program_is_told_of_the_time_limit_and_its_info_is_what_is_answered(pr
         assert (done, info) == (True, {"processed": True, "cut": True})
 
 
-def test_steps_of_one_request_are_processed_too(program: GymServer) -> None:
-    with Client(program.url + "?form=gymnasium") as client:
+def test_steps_of_one_request_are_processed_too(program: GymServerProcess) -> None:
+    with TextClient(program.url + "?form=gymnasium") as client:
         made = client.make("CartPole-v1", worker_id=2)
         client.ask("reset", instance_id=made, seed=1)
         assert client.ask("step_many", instance_id=made, actions=[1, 1])[1] == [10.0, 10.0]
 
 
-def test_the_programs_own_errors_are_told_as_gymies(program: GymServer) -> None:
-    with Client(program.url) as client, pytest.raises(ConnectionClosed, match="not found"):
+def test_the_programs_own_errors_are_told_as_gymies(program: GymServerProcess) -> None:
+    with TextClient(program.url) as client, pytest.raises(ConnectionClosed, match="not found"):
         client.make("missing")
 
 
-def test_parameters_that_the_program_does_not_take(program: GymServer) -> None:
-    with Client(program.url + "?form=gymnasium") as client:
+def test_parameters_that_the_program_does_not_take(program: GymServerProcess) -> None:
+    with TextClient(program.url + "?form=gymnasium") as client:
         said = client.ask("make", env_id="CartPole-v1", no_graphics=True)
         assert "unexpected keyword argument 'no_graphics'" in said["error"]["message"]
 
@@ -98,7 +98,7 @@ def test_the_program_of_the_documentation(tmp_path: Path) -> None:
     ]
     ready = '"127.0.0.1", 0, ready=lambda port: print(f"at :{port}/gym", flush=True)'
     (tmp_path / "serve.py").write_text(text.replace('"127.0.0.1", 5000', ready))
-    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, Client(found.url) as client:
+    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, TextClient(found.url) as client:
         made = client.make("CartPole-v1", seed=1)
         client.ask("reset", instance_id=made)
         assert client.ask("step", instance_id=made, action=1)[1:] == [1.0, False, {}]
@@ -136,7 +136,7 @@ def test_only_two_functions_can_be_replaced() -> None:
         override("reset")
 
 
-def test_a_port_that_is_taken_is_told(program: GymServer) -> None:
+def test_a_port_that_is_taken_is_told(program: GymServerProcess) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "trial.gym", "--port", str(program.port)],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
@@ -174,7 +174,7 @@ def test_a_host_that_is_none_is_told(host: str, capsys: pytest.CaptureFixture[st
 
 def test_a_program_says_where_it_serves(tmp_path: Path) -> None:
     (tmp_path / "serve.py").write_text("from trial import gym as gymie\ngymie.start('localhost', 0)\n")
-    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, Client(found.url) as client:
+    with gym_server(program=(str(tmp_path / "serve.py"),)) as found, TextClient(found.url) as client:
         assert len(client.make("CartPole-v1")) == 32
 
 

@@ -10,7 +10,7 @@ from websockets.client import ClientProtocol
 from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 
-from testing.gym_server import GymServer
+from testing.gym_server import GymServerProcess
 
 WITHIN = 15.0
 
@@ -18,7 +18,7 @@ WITHIN = 15.0
 class Raw:
     """A connection whose bytes a test chooses."""
 
-    def __init__(self, server: GymServer) -> None:
+    def __init__(self, server: GymServerProcess) -> None:
         self.socket = socket.create_connection(("127.0.0.1", server.port), WITHIN)
         self.protocol = ClientProtocol(parse_uri(server.url + "?form=gymnasium"), max_size=None)
         self.protocol.send_request(self.protocol.connect())
@@ -43,7 +43,7 @@ class Raw:
 
 
 @pytest.fixture
-def raw(server: GymServer) -> Iterator[Raw]:
+def raw(server: GymServerProcess) -> Iterator[Raw]:
     found = Raw(server)
     yield found
     found.socket.close()

@@ -12,13 +12,13 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from testing.gym_server import Client, GymServer
+from testing.gym_server import GymServerProcess, TextClient
 
 
 class GymieClient:
     """Gymie's client: JSON.stringify of `{method, params}`, and the id as the last of the parameters."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: TextClient) -> None:
         self._client = client
         self.instance_id = ""
 
@@ -34,11 +34,11 @@ class GymieClient:
 
 
 @pytest.fixture
-def gymie(client: Client) -> GymieClient:
+def gymie(client: TextClient) -> GymieClient:
     return GymieClient(client)
 
 
-def closed(client: Client, message: str) -> tuple[int, str]:
+def closed(client: TextClient, message: str) -> tuple[int, str]:
     """With which code and reason the server closes the connection after this message."""
     with pytest.raises(ConnectionClosed) as found:
         client.say(message)
@@ -92,7 +92,7 @@ def test_a_continuous_action(gymie: GymieClient) -> None:
     assert reward < 0
 
 
-def test_the_same_seed_gives_the_same_episode(client: Client) -> None:
+def test_the_same_seed_gives_the_same_episode(client: TextClient) -> None:
     ids = [client.make("CartPole-v1", seed=7) for _ in range(2)]
     first, second = (client.ask("reset", instance_id=one) for one in ids)
     assert first == second
@@ -100,7 +100,7 @@ def test_the_same_seed_gives_the_same_episode(client: Client) -> None:
 
 
 @pytest.mark.parametrize("seeds", [[None, None], [3, None], [0, None, None], [None, 0, None]])
-def test_the_seed_of_make_is_for_the_first_reset_alone(client: Client, seeds: list[int | None]) -> None:
+def test_the_seed_of_make_is_for_the_first_reset_alone(client: TextClient, seeds: list[int | None]) -> None:
     made = client.make("CartPole-v1", seed=7)
     found = [client.ask("reset", instance_id=made, seed=seed) for seed in seeds]
     with gymnasium.make("CartPole-v1") as local:
@@ -109,7 +109,7 @@ def test_the_seed_of_make_is_for_the_first_reset_alone(client: Client, seeds: li
     assert found == [observation.tolist() for observation, _ in expected]
 
 
-def test_done_says_whether_it_was_the_time_limit(client: Client) -> None:
+def test_done_says_whether_it_was_the_time_limit(client: TextClient) -> None:
     made = client.make("Odd/Calm-v0", max_episode_steps=2)
     client.ask("reset", instance_id=made)
     client.ask("step", instance_id=made, action=1)
@@ -129,12 +129,14 @@ def test_done_says_whether_it_was_the_time_limit(client: Client) -> None:
         ('{"method": "reset", "params": {"instance_id": "none"}}', 1007, "Instance `none` not found"),
     ],
 )
-def test_an_error_closes_with_gymies_code_and_sentence(client: Client, message: str, code: int, sentence: str) -> None:
+def test_an_error_closes_with_gymies_code_and_sentence(
+    client: TextClient, message: str, code: int, sentence: str
+) -> None:
     """gymie/tests/test_gymie.py, `test_message_handle`."""
     assert closed(client, message) == (code, sentence)
 
 
-def test_the_close_says_what_an_environment_lacks(client: Client) -> None:
+def test_the_close_says_what_an_environment_lacks(client: TextClient) -> None:
     """Gymie's sentence alone, "is malformed", tells nothing to do about it."""
     code, sentence = closed(client, '{"method": "make", "params": {"env_id": "Odd/Lacking-v0"}}')
     assert code == 1007
@@ -143,21 +145,21 @@ def test_the_close_says_what_an_environment_lacks(client: Client) -> None:
     )
 
 
-def test_a_wrong_action_closes_with_gymies_sentence(client: Client) -> None:
+def test_a_wrong_action_closes_with_gymies_sentence(client: TextClient) -> None:
     made = client.make("CartPole-v1")
     client.ask("reset", instance_id=made)
     step = json.dumps({"method": "step", "params": {"instance_id": made, "action": -123}})
     assert closed(client, step) == (1007, "Action `-123` is wrong")
 
 
-def test_after_close_the_environment_is_gone(client: Client) -> None:
+def test_after_close_the_environment_is_gone(client: TextClient) -> None:
     made = client.make("CartPole-v1")
     client.ask("close", instance_id=made)
     reset = json.dumps({"method": "reset", "params": {"instance_id": made}})
     assert closed(client, reset) == (1007, f"Instance `{made}` not found")
 
 
-def test_an_environment_of_gyms_old_kind(client: Client) -> None:
+def test_an_environment_of_gyms_old_kind(client: TextClient) -> None:
     made = client.make("Odd/Old-v0")
     assert client.ask("reset", instance_id=made) == [0.0, 0.5]
     for _ in range(5):
@@ -165,7 +167,7 @@ def test_an_environment_of_gyms_old_kind(client: Client) -> None:
     assert (state, reward, done, info) == ([5.0, 0.5], 5.0, True, {"action": 2})
 
 
-def test_an_environment_of_gyms_old_kind_is_seeded_by_its_own_method(client: Client) -> None:
+def test_an_environment_of_gyms_old_kind_is_seeded_by_its_own_method(client: TextClient) -> None:
     made = client.make("Odd/OldSeeded-v0", seed=7)
     expected = np.random.default_rng(7)
     for _ in range(2):
@@ -181,22 +183,22 @@ def test_a_number_that_json_has_not_is_sent_all_the_same(gymie: GymieClient) -> 
 # The other forms
 
 
-def test_the_documented_form(server: GymServer) -> None:
-    with Client(server.url + "?form=documented") as client:
+def test_the_documented_form(server: GymServerProcess) -> None:
+    with TextClient(server.url + "?form=documented") as client:
         said = client.ask("make", env_id="CartPole-v1")
         assert list(said) == ["instance_id"]
         client.ask("reset", **said)
         assert len(client.ask("step", **said, action=0)) == 4
 
 
-def test_gymnasiums_form(asking: Client) -> None:
+def test_gymnasiums_form(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", cut=2)
     assert asking.ask("reset", instance_id=made, seed=3, options={"a": 1}) == [[0.0, 0.5], {"seed": 3, "a": 1}]
     assert asking.ask("step", instance_id=made, action=1) == [[1.0, 0.5], 1.0, False, False, {"action": 1}]
     assert asking.ask("step", instance_id=made, action=1)[2:4] == [False, True]
 
 
-def test_a_form_that_is_none_is_refused(server: GymServer) -> None:
+def test_a_form_that_is_none_is_refused(server: GymServerProcess) -> None:
     with pytest.raises(InvalidStatus) as found, connect(server.url + "?form=other"):
         pass
     assert found.value.response.body == b"form must be one of gymie, documented, gymnasium.\n"
@@ -205,7 +207,7 @@ def test_a_form_that_is_none_is_refused(server: GymServer) -> None:
 # More than Gymie has
 
 
-def test_step_many_begins_the_next_episode(asking: Client) -> None:
+def test_step_many_begins_the_next_episode(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     asking.ask("reset", instance_id=made)
     observations, rewards, terminated, truncated, infos = asking.ask(
@@ -218,7 +220,7 @@ def test_step_many_begins_the_next_episode(asking: Client) -> None:
     assert infos[4:6] == [{"action": 1}, {"seed": None}]
 
 
-def test_step_many_in_the_mode_same_step(asking: Client) -> None:
+def test_step_many_in_the_mode_same_step(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", autoreset_mode="SameStep")
     asking.ask("reset", instance_id=made)
     observations, rewards, terminated, _, infos = asking.ask("step_many", instance_id=made, actions=[0] * 6)
@@ -228,13 +230,13 @@ def test_step_many_in_the_mode_same_step(asking: Client) -> None:
     assert infos[4] == {"seed": None, "final_obs": [5.0, 0.5], "final_info": {"action": 0}}
 
 
-def test_step_many_in_the_mode_disabled_stops_at_the_end(asking: Client) -> None:
+def test_step_many_in_the_mode_disabled_stops_at_the_end(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", autoreset_mode="Disabled")
     asking.ask("reset", instance_id=made)
     assert [len(column) for column in asking.ask("step_many", instance_id=made, actions=[0] * 9)] == [5] * 5
 
 
-def test_a_vector_of_environments(asking: Client) -> None:
+def test_a_vector_of_environments(asking: TextClient) -> None:
     made = asking.make("CartPole-v1", num_envs=3, seed=1)
     observations, _ = asking.ask("reset", instance_id=made)
     assert len(observations) == 3
@@ -245,12 +247,12 @@ def test_a_vector_of_environments(asking: Client) -> None:
     assert [len(column) for column in columns] == [2] * 5
 
 
-def test_a_picture(asking: Client) -> None:
+def test_a_picture(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", render_mode="rgb_array")
     asking.ask("reset", instance_id=made)
     assert asking.ask("render", instance_id=made)["shape"] == [4, 6, 3]
 
 
-def test_it_says_how_a_picture_can_be_had(asking: Client) -> None:
+def test_it_says_how_a_picture_can_be_had(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     assert "render_mode" in asking.ask("render", instance_id=made)["error"]["message"]

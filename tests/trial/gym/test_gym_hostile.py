@@ -17,33 +17,33 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
-from testing.gym_server import Client, GymServer, gym_server
+from testing.gym_server import GymServerProcess, TextClient, gym_server
 from testing.waiting import until
 
 WITHIN = 15.0
 
 
 @pytest.fixture(autouse=True)
-def nothing_stays_behind(server: GymServer) -> Iterator[None]:
+def nothing_stays_behind(server: GymServerProcess) -> Iterator[None]:
     """After each test, with all connections closed, only the server and its spawner run; and it serves others."""
     yield
     until(lambda: len(below(server)) == 1, WITHIN)
-    with Client(server.url) as other:
+    with TextClient(server.url) as other:
         assert len(other.ask("reset", instance_id=other.make("Odd/Calm-v0"))) == 2
 
 
-def patient_server() -> contextlib.AbstractContextManager[GymServer]:
+def patient_server() -> contextlib.AbstractContextManager[GymServerProcess]:
     """A server of its own, which gives environments ten minutes for each call."""
     odd = ("--import", "odd_environments", "--seconds", "600")
     return gym_server(*odd, env={"PYTHONPATH": str(Path(__file__).parent)})
 
 
-def below(server: GymServer) -> list[psutil.Process]:
+def below(server: GymServerProcess) -> list[psutil.Process]:
     """What the server has started and what that has started."""
     return psutil.Process(server.pid).children(recursive=True)
 
 
-def stepped(client: Client, env_id: str, **action: Any) -> Any:
+def stepped(client: TextClient, env_id: str, **action: Any) -> Any:
     """The answer to one step of a new environment."""
     made = client.make(env_id)
     client.ask("reset", instance_id=made)
@@ -55,7 +55,7 @@ def refused(said: Any) -> tuple[str, str]:
     return said["error"]["type"], said["error"]["message"]
 
 
-def still_serves(client: Client) -> bool:
+def still_serves(client: TextClient) -> bool:
     return len(stepped(client, "Odd/Calm-v0")) == 5
 
 
@@ -87,7 +87,7 @@ def still_serves(client: Client) -> bool:
         (b"\x00" * 8, "InvalidMessage"),
     ],
 )
-def test_what_is_no_request_gets_a_sentence(asking: Client, message: str | bytes, kind: str) -> None:
+def test_what_is_no_request_gets_a_sentence(asking: TextClient, message: str | bytes, kind: str) -> None:
     found, sentence = refused(json.loads(asking.say(message)))
     assert found == kind
     assert 10 < len(sentence) <= 300
@@ -102,7 +102,7 @@ def test_what_is_no_request_gets_a_sentence(asking: Client, message: str | bytes
         ("[]", "they must be an object"),
     ],
 )
-def test_parameters_that_a_method_does_not_take_are_named(asking: Client, params: str, reason: str) -> None:
+def test_parameters_that_a_method_does_not_take_are_named(asking: TextClient, params: str, reason: str) -> None:
     kind, sentence = refused(json.loads(asking.say(f'{{"method": "step", "params": {params}}}')))
     assert kind == "WrongParameters"
     assert sentence.endswith(f"are wrong: {reason}")
@@ -121,40 +121,40 @@ def test_parameters_that_a_method_does_not_take_are_named(asking: Client, params
         ("Odd/Continuous-v0", [[0.0], [1.0, 2.0]]),
     ],
 )
-def test_a_wrong_action_gets_a_sentence(asking: Client, env_id: str, action: Any) -> None:
+def test_a_wrong_action_gets_a_sentence(asking: TextClient, env_id: str, action: Any) -> None:
     kind, sentence = refused(stepped(asking, env_id, action=action))
     assert kind == "WrongAction"
     assert sentence.startswith("Action `")
     assert still_serves(asking)
 
 
-def test_a_step_before_reset_gets_gymnasiums_sentence(asking: Client) -> None:
+def test_a_step_before_reset_gets_gymnasiums_sentence(asking: TextClient) -> None:
     made = asking.make("CartPole-v1")
     assert "reset" in refused(asking.ask("step", instance_id=made, action=0))[1]
 
 
-def test_10_mb_in_a_message_close_the_connection(asking: Client) -> None:
+def test_10_mb_in_a_message_close_the_connection(asking: TextClient) -> None:
     with pytest.raises(ConnectionClosed) as found:
         asking.say("x" * 10_000_000)
     assert found.value.rcvd is not None
     assert (found.value.rcvd.code, "exceeds limit" in found.value.rcvd.reason) == (1009, True)
 
 
-def test_too_many_steps_for_one_reply(asking: Client) -> None:
+def test_too_many_steps_for_one_reply(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     kind, _ = refused(asking.ask("step_many", instance_id=made, actions=[0] * 70_000))
     assert kind == "LimitReached"
 
 
-def test_nothing_can_be_asked_of_anothers_environment(server: GymServer, asking: Client) -> None:
+def test_nothing_can_be_asked_of_anothers_environment(server: GymServerProcess, asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
-    with Client(server.url + "?form=gymnasium") as other:
+    with TextClient(server.url + "?form=gymnasium") as other:
         for method in ("reset", "close", "observation_space", "render"):
             assert refused(other.ask(method, instance_id=made))[0] == "InstanceNotFound"
     assert len(asking.ask("reset", instance_id=made)) == 2
 
 
-def test_a_thousand_makes(asking: Client) -> None:
+def test_a_thousand_makes(asking: TextClient) -> None:
     for _ in range(1000):
         asking.websocket.send('{"method": "make", "params": {"env_id": "Odd/Calm-v0"}}')
     said = [json.loads(asking.websocket.recv(20)) for _ in range(1000)]
@@ -164,7 +164,7 @@ def test_a_thousand_makes(asking: Client) -> None:
     }
 
 
-def test_a_closed_environment_makes_room(asking: Client) -> None:
+def test_a_closed_environment_makes_room(asking: TextClient) -> None:
     for _ in range(20):
         assert asking.ask("close", instance_id=asking.make("Odd/Calm-v0")) is True
 
@@ -181,7 +181,7 @@ def test_a_closed_environment_makes_room(asking: Client) -> None:
         ("Odd/Greedy-v0", "MemoryError"),
     ],
 )
-def test_the_connection_stays_when_an_environment(asking: Client, env_id: str, words: str) -> None:
+def test_the_connection_stays_when_an_environment(asking: TextClient, env_id: str, words: str) -> None:
     assert words in refused(stepped(asking, env_id))[1]
     assert still_serves(asking)
 
@@ -195,7 +195,7 @@ def test_the_connection_stays_when_an_environment(asking: Client, env_id: str, w
     ],
 )
 def test_the_close_says_what_became_of_an_environment_that_took_its_process_along(
-    asking: Client, env_id: str, words: str
+    asking: TextClient, env_id: str, words: str
 ) -> None:
     with pytest.raises(ConnectionClosed) as found:
         stepped(asking, env_id)
@@ -203,7 +203,7 @@ def test_the_close_says_what_became_of_an_environment_that_took_its_process_alon
     assert (found.value.rcvd.code, found.value.rcvd.reason) == (1011, words)
 
 
-def closed_within(client: Client) -> str:
+def closed_within(client: TextClient) -> str:
     """The reason with which the server closes the connection."""
     with pytest.raises(ConnectionClosed) as found:
         client.websocket.recv(WITHIN)
@@ -211,29 +211,31 @@ def closed_within(client: Client) -> str:
     return found.value.rcvd.reason
 
 
-def test_too_many_processes_of_an_environment(asking: Client) -> None:
+def test_too_many_processes_of_an_environment(asking: TextClient) -> None:
     stepped(asking, "Odd/Multiplying-v0")
     assert closed_within(asking) == "The environments started more than 4 processes; all were ended."
 
 
-def test_too_much_memory_of_several_processes(asking: Client) -> None:
+def test_too_much_memory_of_several_processes(asking: TextClient) -> None:
     stepped(asking, "Odd/GreedyTogether-v0")
     assert closed_within(asking) == "The environments used more than 300 MB; their process was ended."
 
 
-def test_a_process_that_an_environment_left_ends_with_the_connection(server: GymServer, asking: Client) -> None:
+def test_a_process_that_an_environment_left_ends_with_the_connection(
+    server: GymServerProcess, asking: TextClient
+) -> None:
     until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
     stepped(asking, "Odd/Forking-v0")
     assert len(below(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
 
 
-def test_what_an_environment_prints_disturbs_nobody(asking: Client) -> None:
+def test_what_an_environment_prints_disturbs_nobody(asking: TextClient) -> None:
     assert stepped(asking, "Odd/Printing-v0")[0] == [1.0, 0.5]
 
 
 @pytest.mark.parametrize("env_id", ["Odd/Looping-v0", "Odd/Hanging-v0", "Odd/Calm-v0"])
-def test_a_client_that_vanishes_in_mid_step(server: GymServer, env_id: str) -> None:
-    client = Client(server.url)
+def test_a_client_that_vanishes_in_mid_step(server: GymServerProcess, env_id: str) -> None:
+    client = TextClient(server.url)
     made = client.make(env_id)
     client.ask("reset", instance_id=made)
     client.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
@@ -242,8 +244,8 @@ def test_a_client_that_vanishes_in_mid_step(server: GymServer, env_id: str) -> N
 
 def test_others_play_while_an_environment_hangs() -> None:
     """Longer than an answer may take: if others waited for its end, they would get none."""
-    with patient_server() as own, Client(own.url + "?form=gymnasium") as other:
-        stuck = Client(own.url)
+    with patient_server() as own, TextClient(own.url + "?form=gymnasium") as other:
+        stuck = TextClient(own.url)
         made = stuck.make("Odd/Looping-v0")
         stuck.ask("reset", instance_id=made)
         stuck.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
@@ -251,8 +253,8 @@ def test_others_play_while_an_environment_hangs() -> None:
         stuck.websocket.socket.close()
 
 
-def test_a_client_that_reads_no_answer_keeps_nobody_from_playing(server: GymServer, asking: Client) -> None:
-    deaf = Client(server.url + "?form=gymnasium")
+def test_a_client_that_reads_no_answer_keeps_nobody_from_playing(server: GymServerProcess, asking: TextClient) -> None:
+    deaf = TextClient(server.url + "?form=gymnasium")
     made = deaf.make("Odd/Calm-v0")
     ask = json.dumps({"method": "step_many", "params": {"instance_id": made, "actions": [0] * 10_000}})
     deaf.ask("reset", instance_id=made)
@@ -265,24 +267,24 @@ def test_a_client_that_reads_no_answer_keeps_nobody_from_playing(server: GymServ
 # The server
 
 
-def test_pages_of_other_sites_may_not_connect(server: GymServer) -> None:
+def test_pages_of_other_sites_may_not_connect(server: GymServerProcess) -> None:
     with pytest.raises(InvalidStatus) as found, connect(server.url, origin="https://example.org"):
         pass
     assert found.value.response.status_code == 403
 
 
-def test_pages_of_this_machine_may(server: GymServer) -> None:
+def test_pages_of_this_machine_may(server: GymServerProcess) -> None:
     with connect(server.url, origin="http://localhost:3000"):
         pass
 
 
-def test_only_the_path_of_environments_is_served(server: GymServer) -> None:
+def test_only_the_path_of_environments_is_served(server: GymServerProcess) -> None:
     with pytest.raises(InvalidStatus) as found, connect(server.url.replace("/gym", "/other")):
         pass
     assert found.value.response.status_code == 404
 
 
-def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServer) -> None:
+def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServerProcess) -> None:
     until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
     with connect(server.url) as websocket:
         for _ in range(3):
@@ -290,7 +292,7 @@ def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServer) 
         assert len(below(server)) == 1
 
 
-def test_what_is_no_http_is_dropped(server: GymServer) -> None:
+def test_what_is_no_http_is_dropped(server: GymServerProcess) -> None:
     for said in (b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a" * 20_000):
         with socket.create_connection(("127.0.0.1", server.port)) as raw:
             raw.settimeout(WITHIN)
@@ -303,22 +305,22 @@ def test_what_is_no_http_is_dropped(server: GymServer) -> None:
 
 
 @pytest.fixture
-def small() -> Iterator[GymServer]:
+def small() -> Iterator[GymServerProcess]:
     with gym_server(*("--workers", "2", "--connections", "4", "--steps-per-second", "10")) as found:
         yield found
 
 
-def test_no_more_connections_with_environments_than_allowed(small: GymServer) -> None:
-    with Client(small.url) as first, Client(small.url) as second, Client(small.url) as third:
+def test_no_more_connections_with_environments_than_allowed(small: GymServerProcess) -> None:
+    with TextClient(small.url) as first, TextClient(small.url) as second, TextClient(small.url) as third:
         first.make("CartPole-v1")
         second.make("CartPole-v1")
         with pytest.raises(ConnectionClosed, match="2 connections use environments already"):
             third.make("CartPole-v1")
 
 
-def test_a_worker_that_has_ended_makes_room_at_once(small: GymServer) -> None:
+def test_a_worker_that_has_ended_makes_room_at_once(small: GymServerProcess) -> None:
     """Even if its end and the next connection's first request reach the spawner together."""
-    with Client(small.url) as first, Client(small.url) as second, Client(small.url) as third:
+    with TextClient(small.url) as first, TextClient(small.url) as second, TextClient(small.url) as third:
         first.make("CartPole-v1")
         second.make("CartPole-v1")
         spawner, ending, _ = below(small)
@@ -331,15 +333,15 @@ def test_a_worker_that_has_ended_makes_room_at_once(small: GymServer) -> None:
         assert "error" not in third.websocket.recv(WITHIN)
 
 
-def test_no_more_connections_than_allowed(small: GymServer) -> None:
-    with Client(small.url), Client(small.url), Client(small.url), Client(small.url):
+def test_no_more_connections_than_allowed(small: GymServerProcess) -> None:
+    with TextClient(small.url), TextClient(small.url), TextClient(small.url), TextClient(small.url):
         with pytest.raises(InvalidStatus) as found, connect(small.url):
             pass
         assert found.value.response.body == b"There are 4 connections already.\n"
 
 
-def test_no_more_steps_a_second_than_allowed(small: GymServer) -> None:
-    with Client(small.url + "?form=gymnasium") as client:
+def test_no_more_steps_a_second_than_allowed(small: GymServerProcess) -> None:
+    with TextClient(small.url + "?form=gymnasium") as client:
         made = client.make("CartPole-v1")
         client.ask("reset", instance_id=made)
         kind, sentence = refused(client.ask("step_many", instance_id=made, actions=[0] * 11))
@@ -348,7 +350,7 @@ def test_no_more_steps_a_second_than_allowed(small: GymServer) -> None:
 
 
 def test_a_connection_without_requests_is_closed() -> None:
-    with gym_server("--idle-seconds", "1") as own, Client(own.url) as client:
+    with gym_server("--idle-seconds", "1") as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
         assert closed_within(client) == "There was no request for 1 s."
 
@@ -359,7 +361,7 @@ def ended(pids: list[int]) -> bool:
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_nothing_of_a_server_that_is_ended_stays(how: signal.Signals) -> None:
-    with gym_server() as own, Client(own.url) as client:
+    with gym_server() as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
         pids = [one.pid for one in below(own)]
         assert len(pids) == 2
@@ -369,8 +371,8 @@ def test_nothing_of_a_server_that_is_ended_stays(how: signal.Signals) -> None:
         until(lambda: ended(pids), WITHIN)
 
 
-def test_workers_end_with_their_spawner(server: GymServer) -> None:
-    with gym_server() as own, Client(own.url) as client:
+def test_workers_end_with_their_spawner(server: GymServerProcess) -> None:
+    with gym_server() as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
         spawner, worker = (one.pid for one in below(own))
         os.kill(spawner, signal.SIGKILL)
@@ -379,7 +381,7 @@ def test_workers_end_with_their_spawner(server: GymServer) -> None:
 
 def test_a_worker_that_hangs_ends_with_its_spawner() -> None:
     """It reads its socket no more, so only the system can end it."""
-    with patient_server() as own, Client(own.url) as client:
+    with patient_server() as own, TextClient(own.url) as client:
         made = client.make("Odd/Hanging-v0")
         client.ask("reset", instance_id=made)
         client.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
@@ -400,9 +402,9 @@ def test_connections_that_say_nothing_are_limited_too() -> None:
         until(lambda: serves(own), WITHIN)
 
 
-def serves(server: GymServer) -> bool:
+def serves(server: GymServerProcess) -> bool:
     try:
-        with Client(server.url) as client:
+        with TextClient(server.url) as client:
             return len(client.make("CartPole-v1")) == 32
     except (InvalidStatus, OSError, EOFError, InvalidMessage, ConnectionClosed):  # by when it was refused
         return False
@@ -412,7 +414,7 @@ def test_more_connections_than_the_shell_allows_files() -> None:
     limited = ("-c", "import resource as r, runpy, sys; r.setrlimit(r.RLIMIT_NOFILE, (64, r.getrlimit(7)[1])); "
                "sys.argv[1:] = ['--port', '0']; runpy.run_module('trial.gym', run_name='__main__')")  # fmt: skip
     with gym_server(program=limited) as own:
-        opened = [Client(own.url) for _ in range(100)]
+        opened = [TextClient(own.url) for _ in range(100)]
         assert len(opened[-1].make("CartPole-v1")) == 32
         for one in opened:
             one.close()
@@ -422,7 +424,7 @@ def test_hundreds_of_first_requests_at_once_are_all_answered() -> None:
     """More than the pipe between server and spawner can hold, in both directions."""
     made = json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}})
     with gym_server("--workers", "2") as own, contextlib.ExitStack() as stack:
-        clients = [Client(own.url) for _ in range(700)]
+        clients = [TextClient(own.url) for _ in range(700)]
         for client in clients:
             stack.callback(client.websocket.socket.close)
         for client in clients:
@@ -432,7 +434,7 @@ def test_hundreds_of_first_requests_at_once_are_all_answered() -> None:
         assert answered.count("made") == 2
 
 
-def _first_answer(client: Client) -> int | str:
+def _first_answer(client: TextClient) -> int | str:
     try:
         return "made" if len(client.websocket.recv(WITHIN)) == 32 else "another"
     except ConnectionClosed as error:

@@ -17,7 +17,7 @@ import pytest
 
 from console.problem import Exit
 from deploy.__main__ import main
-from testing.gym_server import ROOT, Client, gym_server
+from testing.gym_server import ROOT, TextClient, gym_server
 from testing.waiting import until
 from trial.recordings import recording
 
@@ -30,7 +30,7 @@ def recorded(folder: Path) -> list[list[dict[str, Any]]]:
 
 
 def test_what_was_played_loads_in_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with gym_server("--record", str(tmp_path / "data")) as server, Client(server.url + "?form=gymnasium") as client:
+    with gym_server("--record", str(tmp_path / "data")) as server, TextClient(server.url + "?form=gymnasium") as client:
         made = client.make("CartPole-v1", seed=5)
         first, _ = client.ask("reset", instance_id=made)
         observations, rewards, terminated, *_ = client.ask("step_many", instance_id=made, actions=[1] * 30)
@@ -60,7 +60,7 @@ def test_the_command_of_the_documentation_converts_the_recordings() -> None:
 def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) -> None:
     with (
         gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
-        Client(server.url + "?form=gymnasium") as client,
+        TextClient(server.url + "?form=gymnasium") as client,
     ):
         made = client.make("Odd/Continuous-v0", num_envs=2)
         client.ask("reset", instance_id=made)
@@ -75,7 +75,7 @@ def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) ->
 def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
     with (
         gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
-        Client(server.url) as client,
+        TextClient(server.url) as client,
     ):
         made = client.make("Odd/Old-v0")
         client.ask("reset", instance_id=made)
@@ -90,11 +90,11 @@ def test_a_client_that_goes_leaves_a_whole_recording_and_one_that_is_killed_all_
     tmp_path: Path,
 ) -> None:
     with gym_server("--record", str(tmp_path)) as server:
-        with Client(server.url) as client:
+        with TextClient(server.url) as client:
             made = client.make("CartPole-v1")
             client.ask("reset", instance_id=made)
             client.ask("step", instance_id=made, action=1)
-        worker = Client(server.url)
+        worker = TextClient(server.url)
         made = worker.make("CartPole-v1")
         worker.ask("reset", instance_id=made)
         time.sleep(1.1)
@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         gym_server("--record", str(tmp_path / "file")) as server,
-        Client(server.url + "?form=gymnasium") as client,
+        TextClient(server.url + "?form=gymnasium") as client,
     ):
         said = client.ask("make", env_id="CartPole-v1")
         assert said["error"]["message"] == "The recording cannot be written: Not a directory."

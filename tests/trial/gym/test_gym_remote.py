@@ -21,7 +21,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from websockets.sync.server import serve
 
-from testing.gym_server import Client
+from testing.gym_server import TextClient
 from tests.trial.gym import remote_environments as odd
 from tests.trial.gym.served import serving
 from tests.trial.gym.space_strategies import same
@@ -83,7 +83,7 @@ def test_every_kind_of_space_travels_as_json_too(url: str) -> None:
     space = odd.EVERYTHING
     read = values.decoder(space)
     space.seed(5)
-    with Client(f"{url}gym?form=gymnasium") as client:
+    with TextClient(f"{url}gym?form=gymnasium") as client:
         made = client.ask("make", env_id="Everything-v0", length=100)["instance_id"]
         assert spaces.build(client.ask("action_space", instance_id=made)) == space
         client.ask("reset", instance_id=made)

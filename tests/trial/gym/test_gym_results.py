@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from testing.gym_server import Client
+from testing.gym_server import TextClient
 from tests.trial.gym.odd_results import PICTURES, RESULTS
 from tests.trial.gym.served import serving
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError
@@ -52,13 +52,13 @@ def env(url: str) -> Iterator[RemoteEnv]:
 
 
 @pytest.fixture(scope="module")
-def asking(url: str) -> Iterator[Client]:
-    with Client(f"{url}gym?form=gymnasium") as found:
+def asking(url: str) -> Iterator[TextClient]:
+    with TextClient(f"{url}gym?form=gymnasium") as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def instance_id(asking: Client) -> Any:
+def instance_id(asking: TextClient) -> Any:
     made = asking.ask("make", env_id="Odd/Results-v0")["instance_id"]
     asking.ask("reset", instance_id=made)
     return made
@@ -79,7 +79,7 @@ def test_what_cannot_be_sent_is_a_sentence(env: RemoteEnv, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_sent_is_a_sentence_in_json(asking: Client, instance_id: str, name: str) -> None:
+def test_what_cannot_be_sent_is_a_sentence_in_json(asking: TextClient, instance_id: str, name: str) -> None:
     answer = asking.ask("step", instance_id=instance_id, action=number(name))
     assert REFUSED[name] in answer["error"]["message"]
     assert asking.ask("step", instance_id=instance_id, action=number("calm"))[1] == 1.0
@@ -99,7 +99,7 @@ def test_what_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in ARRIVES if name != "array that is no list"])
-def test_what_can_be_sent_arrives_in_json(asking: Client, instance_id: str, name: str) -> None:
+def test_what_can_be_sent_arrives_in_json(asking: TextClient, instance_id: str, name: str) -> None:
     observation, reward, terminated, truncated, info = asking.ask("step", instance_id=instance_id, action=number(name))
     assert (observation, reward, terminated, truncated, info) == (
         [0, 0],
@@ -110,7 +110,7 @@ def test_what_can_be_sent_arrives_in_json(asking: Client, instance_id: str, name
     )
 
 
-def test_an_array_that_cannot_become_a_list_is_a_sentence_in_json(asking: Client, instance_id: str) -> None:
+def test_an_array_that_cannot_become_a_list_is_a_sentence_in_json(asking: TextClient, instance_id: str) -> None:
     answer = asking.ask("step", instance_id=instance_id, action=number("array that is no list"))
     assert "RuntimeError: no list" in answer["error"]["message"]
 

@@ -85,7 +85,7 @@ def test_an_error_as_the_answer_to_make() -> None:
 def steps(rows: int, *, kind: int = arrays.STEP, handle: int = 1, infos: Any = ()) -> bytes:
     layout = arrays.layout(SPACE)
     flags = np.zeros(rows, bool)
-    found = arrays.Steps(layout.empty(rows), np.zeros(rows), flags, flags, list(infos))
+    found = arrays.StepRows(layout.empty(rows), np.zeros(rows), flags, flags, list(infos))
     return arrays.steps_reply(kind, handle, layout, found)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.raster import Raster

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from testing.exploration import examples
 from trial.pictures.assets import Assets
 from trial.pictures.raster import Raster

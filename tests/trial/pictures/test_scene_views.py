@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.trial_sections import Scene as SceneSection
+from protocol.trial_sections import SceneSection
 from trial.agent.agent import AgentAdapter
 from trial.agent.joint import JointAdapter
 from trial.agent.starting import start

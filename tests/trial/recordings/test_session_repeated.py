@@ -17,7 +17,7 @@ from tests.trial import repeated
 from tests.trial.repeated import repeat
 from trial.core.flow_control import Window
 from trial.core.unfinished import RecordedTrial
-from trial.settings import Settings
+from trial.settings import TrialSettings
 
 PLACES = {"P1": "me", "P2": "it"}
 
@@ -31,7 +31,7 @@ class Game(repeated.Game):
         "absent": 0.5, "countdown": 0.2, "ui": dict.fromkeys(("start", "pause", "reset", "up", "right", "good"), True),
     }  # fmt: skip
 
-    def told(self, section: Mapping[str, Any]) -> Settings:
+    def told(self, section: Mapping[str, Any]) -> TrialSettings:
         members = tuple(Member(human, None, seat) for seat, human in enumerate(PLACES))
         return replace(repeated.settings_of(section, SESSION="s." + "0" * 20), members=members, players=2)
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 
-class Stage(NamedTuple):
+class SimulatedStage(NamedTuple):
     """A stage that is measured, and its seconds in the simulation: usually (from, to), and at most."""
 
     what: str
@@ -17,9 +17,9 @@ class Stage(NamedTuple):
     most: float
 
 
-STAGES: Mapping[str, Stage] = {
-    "start": Stage("from RunTask until the task runs", (11.0, 56.0), 90.0),  # 95 % of a log-normal, median 25
-    "told": Stage("from then until task_changed has heard of it", (0.0, 2.0), 21.0),
-    "name": Stage("from then until its name is known everywhere", (20.0, 60.0), 120.0),
-    "gone": Stage("from the end of the container until the task has stopped", (10.0, 35.0), 35.0),
+STAGES: Mapping[str, SimulatedStage] = {
+    "start": SimulatedStage("from RunTask until the task runs", (11.0, 56.0), 90.0),  # 95 % of a log-normal, median 25
+    "told": SimulatedStage("from then until task_changed has heard of it", (0.0, 2.0), 21.0),
+    "name": SimulatedStage("from then until its name is known everywhere", (20.0, 60.0), 120.0),
+    "gone": SimulatedStage("from the end of the container until the task has stopped", (10.0, 35.0), 35.0),
 }

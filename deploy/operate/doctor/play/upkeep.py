@@ -20,7 +20,7 @@ from deploy.operate.doctor.play.walk import left
 from deploy.operate.doctor.rehearsal import write_session
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, StopServer, to_message
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, Topic
 from protocol.session import Member, Session
 
@@ -97,7 +97,7 @@ class Timer:
 
     def _ready(self) -> Server | None:
         record = self._scene.server(self.user)
-        return record if record and record.state is State.READY else None
+        return record if record and record.state is ServerState.READY else None
 
     def _closed(self) -> Server | None:
         record = self._scene.server(self.user)

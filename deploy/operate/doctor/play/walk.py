@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from bots import verification
-from bots.account import Account
+from bots.account import BotReport
 from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
@@ -20,7 +20,7 @@ from deploy.operate.doctor.play.transcript import shown
 from export import run as data
 from export.source import Bucket
 from hippodrome.model.messages import StopServer, to_message
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Topic
 from hippodrome.servers import resources
 
@@ -113,7 +113,7 @@ class Walk:
         finally:
             striking.cancel()
 
-    def _watch(self, accounts: Sequence[Account]) -> None:
+    def _watch(self, accounts: Sequence[BotReport]) -> None:
         stages = [account.stage for account in accounts]
         self._scene.told("bots: " + ", ".join(f"{stages.count(stage)} {stage}" for stage in dict.fromkeys(stages)))
 
@@ -291,7 +291,7 @@ def left(scene: RehearsalContext, user: str) -> list[str]:
     record = scene.server(user)
     if record is None:
         return []
-    if record.state is not State.CLOSED:
+    if record.state is not ServerState.CLOSED:
         return ["a record that is not closed"]
     found = resources.list_resources(scene.platform).only(lambda name: name == record.name)
     return [f"a {kind}" for kind in found.kinds()]

@@ -13,7 +13,7 @@ from hippodrome.model import messages, server, warm_pool
 from hippodrome.model.messages import StartServer, StopServer
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import to_json
-from hippodrome.model.server import State
+from hippodrome.model.server import ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Topic
 from hippodrome.servers.sweep import Sweep
@@ -67,7 +67,7 @@ def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
     request = platform.tasks.running.get(mine.task or "")
     named = platform.dns.records.get(mine.dns) == mine.host
     told = SecretCache(platform.documents).token(mine)
-    return mine.state is State.READY and request is not None and request.environment["TOKEN"] == told and named
+    return mine.state is ServerState.READY and request is not None and request.environment["TOKEN"] == told and named
 
 
 def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one_that_goes() -> None:

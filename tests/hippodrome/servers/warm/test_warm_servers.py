@@ -15,7 +15,7 @@ from hippodrome.model import ids, messages, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, State
+from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.sweep import Sweep
@@ -144,7 +144,7 @@ def test_a_participant_takes_a_waiting_server_and_is_ready_at_once() -> None:
     tasks = dict(platform.tasks.running)
     Servers(platform).start(START)
     mine = record(platform)
-    assert mine.state is State.READY
+    assert mine.state is ServerState.READY
     assert platform.tasks.running == tasks
     assert tasks[str(mine.task)].environment["TOKEN"] == token(platform, mine)
     assert mine.dns_record
@@ -189,7 +189,7 @@ def test_the_one_that_has_waited_longest_goes_first() -> None:
 def test_when_none_is_ready_a_server_is_started_as_always() -> None:
     platform = installed(warm(2))
     Servers(platform).start(START)
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
     (request,) = platform.tasks.running.values()
     assert request.environment["USER_ID"] == "alice"
 
@@ -266,7 +266,7 @@ def test_cut_off_at_any_write_the_next_delivery_finishes(number: int) -> None:
     with pytest.raises(ConnectionError):
         Servers(platform).start(START)
     Servers(platform).start(START)
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
     assert len(handovers(platform)) == 1
     assert len(platform.tasks.running) == 2
     deliver(platform)
@@ -315,12 +315,12 @@ def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
     platform.documents.before_write = [*[lambda: None] * 3, go]
     Servers(platform).start(START)
     mine = record(platform)
-    assert (mine.state, mine.warm_server_name) == (State.STARTING, None)
+    assert (mine.state, mine.warm_server_name) == (ServerState.STARTING, None)
     (request,) = platform.tasks.running.values()
     assert request.environment["USER_ID"] == "alice"
     assert request.environment["TOKEN"] == token(platform, mine) != token(platform, warm_server)
     deliver(platform)
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 # Ending
@@ -346,7 +346,7 @@ def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> Non
     servers.tasks_changed([gone])
     deliver(platform)
     mine = record(platform)
-    assert (mine.attempt, mine.state) == (2, State.READY)
+    assert (mine.attempt, mine.state) == (2, ServerState.READY)
     assert mine.warm_server_name
     assert mine.name != name
     assert [run.warm_server_name for run in mine.earlier] == [name]
@@ -369,7 +369,7 @@ def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() 
     Servers(platform).dns_changed(messages.DnsChanged("", [messages.ServerAttempt(warm_server.label, 1)]))
     Servers(platform).tasks_changed(events(platform, "RUNNING"))
     assert list(platform.dns.records) == [record(platform).dns]
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 def test_a_warm_servers_own_timer_does_not_end_who_plays_there() -> None:
@@ -380,7 +380,7 @@ def test_a_warm_servers_own_timer_does_not_end_who_plays_there() -> None:
     assert late
     assert Servers(platform).stop([late]) == []
     assert len(platform.tasks.running) == 1
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 def test_a_warm_server_that_has_waited_long_enough_is_replaced() -> None:
@@ -483,7 +483,7 @@ def test_the_sweep_ends_a_warm_server_that_no_pool_knows_and_leaves_alone_who_pl
     platform.bus.sent = [(topic, m) for topic, m in platform.bus.sent if topic is Topic.STOP]
     deliver(platform)
     assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
-    assert record(platform).state is State.READY
+    assert record(platform).state is ServerState.READY
 
 
 def test_the_sweep_removes_what_a_given_server_left_behind() -> None:
@@ -557,7 +557,7 @@ def test_those_that_wait_keep_no_participant_out() -> None:
     assert warm_server
     Servers(platform).start(warm_server)  # it holds the only place, and is not ready
     Servers(platform).start(START)
-    assert record(platform).state is State.STARTING
+    assert record(platform).state is ServerState.STARTING
     assert len(platform.tasks.running) == 2
     platform.bus.sent = [(Topic.START, messages.to_message(KEEP))]
     deliver(platform)
@@ -627,7 +627,7 @@ def test_a_participant_who_is_stopped_while_a_warm_server_is_refused_gets_no_ser
 
     def leave() -> None:
         going = from_json(platform.documents.kept[key][0], Server)
-        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=State.DRAINING)))
+        platform.documents.put(key, to_json(msgspec.structs.replace(going, state=ServerState.DRAINING)))
 
     # The participant's record, the pool, the warm server's name in the record; then the warm server's record and the participant's.
     waiting_writes(platform, None, None, None, leave, lambda: Servers(platform).stop([STOP]))
