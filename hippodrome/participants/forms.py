@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from hippodrome.http import Request
-from hippodrome.model.texts import ENGLISH
+from hippodrome.model.texts import ENGLISH, Texts
 
 MAX_BODY = 256 * 1024  # bytes
 MAX_FIELDS = 2_000
@@ -28,13 +28,21 @@ class BadForm(Exception):
         super().__init__(text)
         self.status, self.text = status, text
 
+    def reason(self, texts: Texts) -> str:
+        """The reason in a study's own words, or in English if it has none for it."""
+        return self.text
+
 
 class BadPageForm(BadForm):
-    """The same of a form that one of our pages can send. A study has words of its own for the text called `name`."""
+    """The same of a form that one of our pages can send. `name` is that of a text; a study may have its own for it."""
 
     def __init__(self, status: int, name: str) -> None:
         super().__init__(status, ENGLISH[name])
-        self.name = name
+        self._name = name
+
+    def reason(self, texts: Texts) -> str:
+        """The study's text of this name."""
+        return texts[self._name]
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,7 @@ class Journey:
                 said = f"{bad.text} Please answer the page again."
                 raise PageError(bad.status, ENGLISH["notSaved"], said) from None
             texts = Texts(project.texts)
-            why = texts[bad.name] if isinstance(bad, forms.BadPageForm) else bad.text
-            raise PageError.of(texts, bad.status, "notSaved", why=why) from None
+            raise PageError.of(texts, bad.status, "notSaved", why=bad.reason(texts)) from None
         if form.action == LEAVE and project.has_sessions:
             return self._leave(project, user_id, form)
         step = self._step_of(form, project, user_id)

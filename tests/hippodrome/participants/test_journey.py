@@ -490,6 +490,26 @@ def test_answers_that_cannot_be_kept_are_refused_and_nobody_moves(
     assert platform.documents.kept == before
 
 
+@pytest.mark.parametrize(
+    ("body", "kind", "why"),
+    [
+        ("a=" + "x" * 300_000, FORM, "Zu lang."),
+        ("a=1", "text/plain", "Answers are accepted from a form or as JSON"),  # no page of ours sends it
+    ],
+)
+def test_a_form_is_refused_in_the_words_of_the_study(body: str, kind: str, why: str) -> None:
+    words = {
+        "language": "de",
+        "notSaved": "Nicht gespeichert",
+        "notSavedText": "{why} Bitte zurück.",
+        "formTooLong": "Zu lang.",
+    }
+    response = Browser(installed(study(texts=words))).send("POST", body, content_type=kind)
+    assert "Nicht gespeichert" in response["body"]
+    assert why in response["body"]
+    assert "Bitte zurück." in response["body"]
+
+
 @settings(max_examples=examples(60))
 @given(st.text(max_size=80), st.binary(max_size=80), st.sampled_from(["GET", "POST", "PUT", "HEAD", "OPTIONS", "X"]))
 def test_no_request_makes_the_function_fail(query: str, body: bytes, method: str) -> None:
