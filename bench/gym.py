@@ -350,9 +350,18 @@ def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[FrameConnectio
 
 
 def memory(pid: int) -> int:
-    """Bytes of a process and of all that it has started, with shared pages counted once (PSS)."""
+    """Bytes of a process and of all that it has started, with pages that they share counted once.
+
+    Pages of files are left out (`Pss_Anon`, proc_pid_smaps(5)): the share of a library's pages that counts as theirs
+    changes whenever another process on the machine that uses it comes or goes.
+    """
     parent = psutil.Process(pid)
-    return sum(int(one.memory_full_info().pss) for one in (parent, *parent.children(recursive=True)))
+    return sum(_anonymous(one.pid) for one in (parent, *parent.children(recursive=True)))
+
+
+def _anonymous(pid: int) -> int:
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss_Anon:"))
 
 
 def rows() -> Iterator[Row]:
