@@ -14,6 +14,7 @@ import ssl
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,10 +26,14 @@ from bench.moto_server import moto_server
 from bench.study_on_moto import ANSWERS, ROOT, MeasuredBrowser, http_event, on_moto, travel, warm
 from bench.table import Row, each, row
 from bench.trial_server import trial_server
+from hippodrome.certificates.rules import location
 from hippodrome.config import read_project
+from hippodrome.model import server
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.servers import dns
 from testing.simulation import hippo
+from testing.strict_s3 import BUCKET, StrictS3
+from testing.studies import study
 from testing.visitors import hidden
 
 RUNS = 11  # fresh processes of each kind
@@ -270,30 +275,38 @@ def judged_start(taken: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator
 
 
 def calls_of_the_trial() -> Iterator[Row]:
-    """S3 calls of a trial server itself: a real one, over TLS, from its certificate to the end of its first game."""
-    with moto_server() as server:
-        chain, private = _certificate()
-        server.put("SSL/fullchain.pem", chain)
-        server.put("SSL/privkey.pem", private)
-        before = len(server.requests())
+    """Requests of a trial server itself: a real one, over TLS, from its certificate to the end of its first game."""
+    with StrictS3().serving() as bucket, tempfile.TemporaryDirectory() as spool:
+        project, now = study(id="bench"), bucket.now()
+        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="bench", nonce="bench")
+        files = location(record.domain, bucket.settings.root_domain)
+        for key, pem in zip((files.fullchain, files.privkey), _certificate(), strict=True):
+            bucket.documents.put(key, pem)
+        told = bucket.told(bucket.keep(record))
         trial = {"game": "ALE/MsPacman-v5", "maxEpisodes": 1, "ui": {"start": True, "stop": True}}
-        variables = {
-            "USER_ID": "P1",
-            "GAME_STEPS": "3",
-            "SSL_BUCKET": "hippodrome",
-            "SSL_FULLCHAIN": "SSL/fullchain.pem",
-            "SSL_PRIVKEY": "SSL/privkey.pem",
-            "TLS": "on",
-        }
-        with trial_server(ROOT, "s3://hippodrome", trial, inherited=server.env, **variables) as (port, process):
-            asyncio.run(asyncio.wait_for(_play(port), 60))
+        serving = trial_server(
+            ROOT,
+            told["STORE"],
+            trial,
+            SERVER=told["SERVER"],
+            CREDENTIAL=told["CREDENTIAL"],
+            USER_ID="P1",
+            GAME_STEPS=",".join(project.game_steps),
+            SSL_FULLCHAIN=files.fullchain,
+            SSL_PRIVKEY=files.privkey,
+            TLS="on",
+            SPOOL=spool,
+        )
+        with serving as (port, process):
+            asyncio.run(asyncio.wait_for(_play(port, project.game_steps[0]), 60))
             process.wait(60)
-        requests = [request.replace("/hippodrome/", "") for request in server.requests()[before:]]
-    detail = {"each": ", ".join(requests), "more": "1 for each further recording; 2 an hour to renew the certificate"}
-    yield row("S3 calls of the trial server, one episode", len(requests), "calls", detail=detail)
+        requests = [f"{method} {path.removeprefix(f'/{BUCKET}')}" for method, path, _ in bucket.seen]
+    more = "2 for each further recording, and for each thing read of an earlier server; 4 an hour for the certificate"
+    detail = {"each": ", ".join(requests), "more": more}
+    yield row("requests of the trial server, one episode", len(requests), "requests", detail=detail)
 
 
-async def _play(port: int) -> None:
+async def _play(port: int, step: str) -> None:
     """Begin a game, end it after a second, and stay until the trial is over."""
     from websockets.asyncio.client import connect
     from websockets.exceptions import ConnectionClosed
@@ -302,7 +315,7 @@ async def _play(port: int) -> None:
     trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE  # its name is another's, on loopback
     options: dict[str, Any] = {"subprotocols": ["hippodrome.1"], "compression": None, "max_size": None, "proxy": None}
     async with connect(f"wss://127.0.0.1:{port}/", ssl=trusting, **options) as ws:
-        await ws.send(json.dumps({"userId": "P1", "token": "bench", "step": "3"}))
+        await ws.send(json.dumps({"userId": "P1", "token": "bench", "step": step}))
         await ws.send('{"command": "start"}')
         end, stopped = time.monotonic() + 1, False
         with contextlib.suppress(ConnectionClosed):

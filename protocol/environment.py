@@ -17,8 +17,7 @@ TOKEN = "TOKEN"  # noqa: S105 - a variable's name
 GAME_STEPS = "GAME_STEPS"
 """Keys of the game steps, separated by commas: `3` or `2,4`."""
 STORE = "STORE"
-"""Where documents are stored: the address that signs requests (trial/recordings/presigned.py), `s3://bucket`,
-a folder."""
+"""Where documents are stored: the address that signs requests (trial/recordings/presigned.py), or a folder."""
 
 # The participant. A warm server reads both in its handover.
 
@@ -44,10 +43,9 @@ DEADLINE = "DEADLINE"
 """When the server ends in any case: seconds since the epoch."""
 PLAIN_ORIGINS = "PLAIN_ORIGINS"
 """The origins of the project's front end, separated by spaces. Their pages need no token (plainClients)."""
-SSL_BUCKET = "SSL_BUCKET"
-"""The bucket or folder of the certificate's files, if that is not STORE."""
 SSL_FULLCHAIN = "SSL_FULLCHAIN"
 SSL_PRIVKEY = "SSL_PRIVKEY"
+"""The keys of the certificate and of its private key in STORE."""
 TLS = "TLS"
 """`on` or `off`; on by default, and then SSL_FULLCHAIN and SSL_PRIVKEY are required."""
 HOST = "HOST"

@@ -21,8 +21,13 @@ from botocore.awsrequest import AWSRequest
 from botocore.credentials import ReadOnlyCredentials
 
 from hippodrome.aws.signer import S3Signer
+from hippodrome.model import server
+from hippodrome.model.records import to_json
+from hippodrome.model.server import Server
 from hippodrome.ports import Conflict
+from hippodrome.storage.secret import SecretCache
 from lambdas import installed, sign_requests
+from protocol import environment
 from testing import aws_events
 from testing import template as cfn
 from testing.fake_platform import FakePlatform
@@ -42,7 +47,9 @@ class StrictS3(FakePlatform):
         self.lock = threading.RLock()
         self.seen: list[tuple[str, str, int]] = []  # method, path and status of all that came
         self.failing: list[int] = []  # what the next requests to the bucket get instead of an answer
-        self.judge = Judge(cfn.ReferenceValues(known={"Bucket": BUCKET})) if evaluator() else None
+        domain = {"RootDomain": self.settings.root_domain, "ServersHost": self.settings.servers_host}
+        values = cfn.ReferenceValues(parameters=domain, known={"Bucket": BUCKET})
+        self.judge = Judge(values) if evaluator() else None
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
         self.endpoint = f"http://127.0.0.1:{self._server.server_port}"
         self.url = f"{self.endpoint}/sign"
@@ -64,6 +71,18 @@ class StrictS3(FakePlatform):
 
     def now(self) -> datetime:
         return datetime.now(UTC)
+
+    def keep(self, record: Server) -> Server:
+        """Write a server's record; the record."""
+        with self.lock:
+            self.documents.put(server.key(record.label), to_json(record))
+        return record
+
+    def told(self, record: Server) -> dict[str, str]:
+        """The variables with which the server of this record asks for requests."""
+        with self.lock:
+            credential = SecretCache(self.documents).get_or_create().credential(record.name, record.nonce)
+        return {environment.STORE: self.url, environment.SERVER: record.name, environment.CREDENTIAL: credential}
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], body: bytes) -> tuple[int, bytes]:
         path = urlsplit(target).path

@@ -65,7 +65,6 @@ class TrialSettings:
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
-    ssl_bucket: str = ""
     ssl_fullchain: str = ""
     ssl_privkey: str = ""
     deadline: float | None = None
@@ -127,6 +126,8 @@ class TrialSettings:
             raise SettingsError("SESSION is not the id of a session")
         origins = env.get(variables.PLAIN_ORIGINS, "").split()
         agent_dir, store = Path(env.get(variables.AGENT_DIR) or ".").resolve(), _required(env, variables.STORE)
+        if "://" in store and not store.startswith(("https://", "http://")):
+            raise SettingsError("STORE must be a folder, or the address that signs requests (https://…)")
         return cls(
             project_id=_name(env, variables.PROJECT_ID, NAME),
             user_id="" if warm_server or session else _name(env, variables.USER_ID, NAME),
@@ -142,7 +143,6 @@ class TrialSettings:
             host=env.get(variables.HOST) or "0.0.0.0",  # noqa: S104
             port=int(port),
             tls=tls,
-            ssl_bucket=env.get(variables.SSL_BUCKET, ""),
             ssl_fullchain=env.get(variables.SSL_FULLCHAIN, ""),
             ssl_privkey=env.get(variables.SSL_PRIVKEY, ""),
             deadline=_number(env, variables.DEADLINE, 0.0) or None,
@@ -158,7 +158,7 @@ class TrialSettings:
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
             warm_server_seconds=_number(env, variables.WARM_SERVER_SECONDS, 20.0),
             plain_origins=frozenset() if warm_server or session else frozenset(origins),
-            credential=_required(env, variables.CREDENTIAL) if "://" in store and not store.startswith("s3://") else "",
+            credential=_required(env, variables.CREDENTIAL) if "://" in store else "",
         )
 
 

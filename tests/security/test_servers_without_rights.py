@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from hippodrome.model import ids, server
-from hippodrome.model.records import to_json
 from hippodrome.model.server import Server
-from hippodrome.storage.secret import KEY, SecretCache
+from hippodrome.storage.secret import KEY
 from protocol.keys import handover_key
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
@@ -107,15 +106,14 @@ class Site(StrictS3):
 
     def __init__(self) -> None:
         super().__init__()
-        secret = SecretCache(self.documents).get_or_create()
         self.mallory = self._claim("maze", MALLORY)
         self.alice = self._claim("maze", ALICE)
         self.other = self._claim("other", ALICE)
         self.warm_server = self._claim("maze", "~" + "0" * 20)
-        self.credential = secret.credential(self.mallory.name, self.mallory.nonce)
-        put = self.documents.put
         for record in (self.mallory, self.alice, self.other, self.warm_server):
-            put(server.key(record.label), to_json(record))
+            self.keep(record)
+        self.credential = self.told(self.mallory)["CREDENTIAL"]
+        put = self.documents.put
         put("project_master_list.json", b"the master list")
         put("maze/users/alice/answers/1.json", b"alice's answer")
         put("other/users/alice/answers/1.json", b"the other project's answer")

@@ -47,6 +47,8 @@ def test_trial_section_of_config_yml(tmp_path, monkeypatch):
     "change",
     [
         {"PROJECT_ID": "../x"},
+        {"STORE": "s3://bucket"},
+        {"STORE": "https://sign.example.org"},  # without a credential
         {"USER_ID": ""},
         {"SERVER": "a/b"},
         {"TOKEN": ""},

@@ -1,7 +1,6 @@
 """How a trial server ends: asked to, killed, left alone, out of time; and what is kept."""
 
 import asyncio
-import json
 import time
 
 from tests.trial.client_messages import play_to_the_end
@@ -206,49 +205,6 @@ def test_nobody_connected_costs_nothing(launch, open_client):
     before = server.cpu_seconds()
     time.sleep(2)
     assert server.cpu_seconds() - before <= 0.05
-
-
-def test_s3(launch, open_client, grid, monkeypatch):
-    import boto3
-    from moto.server import ThreadedMotoServer
-
-    moto = ThreadedMotoServer("127.0.0.1", port=0)
-    moto.start()
-    try:
-        host, port = moto.get_host_and_port()
-        keys = {
-            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-            "AWS_ACCESS_KEY_ID": "test",
-            "AWS_SECRET_ACCESS_KEY": "test",
-            "AWS_DEFAULT_REGION": "us-east-1",
-        }
-        for name, value in keys.items():
-            monkeypatch.setenv(name, value)
-        s3 = boto3.client("s3")
-        s3.create_bucket(Bucket="data")
-        server = launch(grid(10), {"maxEpisodes": 2, "startingFrameRate": 60}, STORE="s3://data", **keys)
-
-        play_to_the_end(server, open_client)
-        assert server.wait() == 0, server.said()
-        found = {entry["Key"] for entry in s3.list_objects_v2(Bucket="data")["Contents"]}
-        assert found == {
-            "study/users/P1/answers/3.json",
-            "study/users/P1/trials/a1/3-episode-0001.jsonl.gz",
-            "study/users/P1/trials/a1/3-episode-0002.jsonl.gz",
-        }
-        answer = json.loads(s3.get_object(Bucket="data", Key="study/users/P1/answers/3.json")["Body"].read())
-        assert answer["answers"]["episodes"] == 2
-        body = s3.get_object(Bucket="data", Key="study/users/P1/trials/a1/3-episode-0002.jsonl.gz")["Body"].read()
-        assert len(steps_of(recording.read(body))) == 10
-        # The same server's name again: nothing is overwritten.
-        from trial.recordings.store import open_store
-
-        store = open_store("s3://data")
-        assert store.create("study/users/P1/answers/3.json", b"{}") is False
-        assert store.get("study/users/P1/answers/3.json") != b"{}"
-        assert store.get("nothing") is None
-    finally:
-        moto.stop()
 
 
 def test_wrong_settings_are_named(tmp_path):

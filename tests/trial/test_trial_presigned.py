@@ -5,19 +5,21 @@ import contextlib
 import json
 import os
 import socket
+import ssl
 import threading
 import time
 
 import pytest
+from cryptography import x509
 
+from hippodrome.certificates.rules import location
 from hippodrome.model import ids, server
-from hippodrome.model.records import to_json
 from hippodrome.model.server import Reason
-from hippodrome.storage.secret import SecretCache
 from protocol.handover import Handover
 from protocol.keys import handover_key, waiting_key
 from testing.strict_s3 import StrictS3
 from testing.studies import study
+from tests.trial.test_trial_tls import certificate
 from trial.recordings import presigned, recording
 from trial.recordings.presigned import PresignedStore, StoreError
 
@@ -30,10 +32,6 @@ ANSWER = f"{FOLDER}/answers/3.json"
 
 class Town(StrictS3):
     """The bucket with the records of our participant's servers."""
-
-    def __init__(self):
-        super().__init__()
-        self.secret = SecretCache(self.documents).get_or_create()
 
     def start(self, user=USER, attempt=1, before=None, **change):
         """Write the record of a server that starts; what it is told."""
@@ -59,20 +57,11 @@ class Town(StrictS3):
     def _new(self, user, attempt=1, **secrets):
         return server.new_attempt(study(id="study"), user, attempt, settings=self.settings, now=self.now(), **secrets)
 
-    def keep(self, record):
-        with self.lock:
-            self.documents.put(server.key(record.label), to_json(record))
-        return record
-
     def close(self, record, reason=Reason.STOPPED):
         return self.keep(server.close(record, reason, self.now()))
 
-    def env(self, record):
-        credential = self.secret.credential(record.name, record.nonce)
-        return {"STORE": self.url, "SERVER": record.name, "CREDENTIAL": credential}
-
     def store(self, record):
-        told = self.env(record)
+        told = self.told(record)
         return PresignedStore(told["STORE"], told["SERVER"], told["CREDENTIAL"], pause=lambda _: None)
 
     def body(self, key):
@@ -106,7 +95,7 @@ def played(launched, open_client, *, frames=10, stop=True):
 
 def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
     record = town.start()
-    running = launch(trial={"ui": UI}, **town.env(record))
+    running = launch(trial={"ui": UI}, **town.told(record))
     played(running, open_client)
     assert running.wait() == 0
     assert json.loads(town.body(ANSWER))["answers"]["outcome"] == "stopped"
@@ -119,32 +108,49 @@ def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client)
     assert not running.store.exists()
 
 
+def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_client):
+    record = town.start()
+    files = location(record.domain, town.settings.root_domain)
+    chain, private = certificate(7)
+    with town.lock:
+        town.documents.put(files.fullchain, chain)
+        town.documents.put(files.privkey, private)
+    keys = {"SSL_FULLCHAIN": files.fullchain, "SSL_PRIVKEY": files.privkey, "TLS": "on"}
+    running = launch(trial={"ui": UI}, **town.told(record), **keys)
+    shown = ssl.get_server_certificate(("127.0.0.1", running.port))
+    assert x509.load_pem_x509_certificate(shown.encode()).serial_number == 7
+    assert {path.rpartition("/")[2] for method, path, status in town.seen if (method, status) == ("GET", 200)} == {
+        "fullchain.pem",
+        "privkey.pem",
+    }
+
+
 def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
     record = town.start()
     spy = "\nimport os, sys\nprint(sorted(os.environ), file=sys.stderr, flush=True)\n"
     from tests.trial.conftest import grid_agent
 
-    running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.env(record))
+    running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.told(record))
     town.failing = [500, 403]
     played(running, open_client)
     assert running.wait() == 0
     said = running.said()
     assert "CREDENTIAL" not in said
     assert "TOKEN" not in said
-    for secret in (town.env(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):
+    for secret in (town.told(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):
         assert secret not in said
 
 
 def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
     first = town.start()
-    running = launch(trial={"ui": UI}, **town.env(first))
+    running = launch(trial={"ui": UI}, **town.told(first))
     played(running, open_client, frames=30, stop=False)
     lost = town.close(first, Reason.LOST)  # its end is known before it has stored what it recorded
     running.terminate()
     assert running.wait() == 0
     (before,) = town.recordings(first.name).values()
     second = town.start(attempt=2, before=lost)
-    after = launch(trial={"ui": UI}, **town.env(second))
+    after = launch(trial={"ui": UI}, **town.told(second))
     client = played(after, open_client)
     assert after.wait() == 0
     assert client.errors == []
@@ -155,7 +161,7 @@ def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client)
 
 def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(town, launch, open_client):
     record = town.start()
-    running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.env(record))
+    running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.told(record))
 
     async def run():
         async with open_client(running.address) as client:
@@ -178,7 +184,7 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
 
 def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
     warm_server = town.start_warm("the-secret-token")
-    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.env(warm_server))
+    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.told(warm_server))
     time.sleep(0.5)
     own = town.hand_over(warm_server, USER)
     played(running, open_client)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import ssl
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from trial.recordings.store import Store, open_store
+from trial.recordings.store import Store
 from trial.settings import SettingsError, TrialSettings
 
 RELOAD_SECONDS = 3600.0
@@ -32,7 +33,7 @@ class Certificate:
     def __init__(self, settings: TrialSettings, store: Store) -> None:
         self._chain_key = settings.ssl_fullchain
         self._private_key = settings.ssl_privkey
-        self._store = store if not settings.ssl_bucket else open_store(_place(settings.ssl_bucket))
+        self._store = store
         self._files: tuple[bytes | None, bytes] | None = None
         self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -49,7 +50,8 @@ class Certificate:
 
         Raises SettingsError if a file is missing, ssl.SSLError if they do not fit, and the store's own errors.
         """
-        chain, key = self._store.get(self._chain_key), self._store.get(self._private_key)
+        with ThreadPoolExecutor(2) as both:  # each takes two round trips, and participants wait for the server
+            chain, key = both.map(self._store.get, (self._chain_key, self._private_key))
         alone = key is not None and b"-----BEGIN CERTIFICATE" in key
         if key is None or (chain is None and not alone):
             raise SettingsError("the certificate's files are not where SSL_FULLCHAIN and SSL_PRIVKEY say")
@@ -84,7 +86,3 @@ def _load(context: ssl.SSLContext, chain: bytes, key: bytes) -> None:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as out:
                 out.write(data)
         context.load_cert_chain(*map(str, paths))
-
-
-def _place(bucket: str) -> str:
-    return bucket if bucket.startswith(("s3://", "/", ".")) else f"s3://{bucket}"

@@ -132,8 +132,8 @@ def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "import gymnasium, ale_py, numpy, PIL.Image, yaml, boto3, websockets, isal",
-        "import cloudpickle, botocore  # what those bring",
+        "import gymnasium, ale_py, numpy, PIL.Image, yaml, websockets, isal",
+        "import cloudpickle, typing_extensions  # what those bring",
         "import os.path, json, __future__, typing",
         "try:\n    import psutil\nexcept ImportError:\n    psutil = None",
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import psutil",
@@ -143,6 +143,14 @@ def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
 def test_imports_that_are_fine(folder: Path, text: str) -> None:
     begin(folder, text)
     assert found(folder) == []
+
+
+def test_what_is_here_for_other_commands_alone_is_not_in_the_image(folder: Path) -> None:
+    begin(folder, "import boto3")
+    wanted = f"boto3=={version('boto3')}"
+    assert found(folder) == [
+        f"agent.py:1: boto3 is not in the servers' image; write {wanted} into requirements.txt beside agent.py"
+    ]
 
 
 def test_nothing_is_said_of_a_study_without_aws_or_without_a_game(folder: Path) -> None:

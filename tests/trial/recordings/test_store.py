@@ -1,46 +1,64 @@
-"""The stores' contract, on a folder and on (moto's) S3."""
+"""The stores' contract: a folder, and the bucket behind presigned requests."""
+
+from __future__ import annotations
 
 import gzip
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
 
-import boto3
 import pytest
-from moto import mock_aws
 
-from trial.recordings.store import open_store
+from hippodrome.model import server
+from testing.strict_s3 import StrictS3
+from testing.studies import study
+from trial.recordings.store import Store, open_store
 
-
-@pytest.fixture(params=["folder", "s3", "s3 with a prefix"])
-def store(request, tmp_path, monkeypatch):
-    if request.param == "folder":
-        yield open_store(str(tmp_path / "store"))
-        return
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "test")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    monkeypatch.delenv("AWS_ENDPOINT_URL", raising=False)
-    with mock_aws():
-        boto3.client("s3").create_bucket(Bucket="data")
-        yield open_store("s3://data" if request.param == "s3" else "s3://data/some/where/")
+FOLDER = "study/users/P1"
+ANSWER = f"{FOLDER}/answers/3.json"
 
 
-def test_what_is_created_can_be_read(store, tmp_path):
-    assert store.get("a/b/c.json") is None
-    assert store.create("a/b/c.json", b"one") is True
-    assert store.get("a/b/c.json") == b"one"
-    path = tmp_path / "recording"
-    path.write_bytes(gzip.compress(b"lines"))
-    assert store.create("a/b/d.gz", path) is True
-    assert gzip.decompress(store.get("a/b/d.gz")) == b"lines"
+class Opened(NamedTuple):
+    """A store, a recording's key, and what lies in the place itself: a server may not read what it has recorded."""
+
+    store: Store
+    recording: str
+    kept: Callable[[str], bytes]
 
 
-def test_nothing_is_overwritten(store):
-    assert store.create("a/x.json", b"first") is True
-    assert store.create("a/x.json", b"second") is False
-    assert store.get("a/x.json") == b"first"
+@pytest.fixture(params=["folder", "presigned"])
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Opened]:
+    with StrictS3().serving() as bucket:
+        project, now = study(id="study"), bucket.now()
+        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="t", nonce="n")
+        recording = f"{FOLDER}/trials/{record.name}/3-episode-0001.jsonl.gz"
+        if request.param == "folder":
+            yield Opened(open_store(str(tmp_path)), recording, lambda key: (tmp_path / key).read_bytes())
+            return
+        told = bucket.told(bucket.keep(record))
+        store = open_store(told["STORE"], told["SERVER"], told["CREDENTIAL"])
+        yield Opened(store, recording, lambda key: bucket.documents.kept[key][0])
 
 
-def test_of_many_writers_one_wins(tmp_path):
+def test_what_is_created_can_be_read(opened: Opened, tmp_path: Path) -> None:
+    store = opened.store
+    assert store.get(ANSWER) is None
+    assert store.create(ANSWER, b"{}") is True
+    assert store.get(ANSWER) == store.look(ANSWER) == b"{}"
+    lines = tmp_path / "lines"
+    lines.write_bytes(gzip.compress(b"lines"))
+    assert store.create(opened.recording, lines) is True
+    assert gzip.decompress(opened.kept(opened.recording)) == b"lines"
+
+
+def test_nothing_is_overwritten(opened: Opened) -> None:
+    assert opened.store.create(ANSWER, b"first") is True
+    assert opened.store.create(ANSWER, b"second") is False
+    assert opened.store.get(ANSWER) == b"first"
+
+
+def test_of_many_writers_one_wins(tmp_path: Path) -> None:
     store = open_store(str(tmp_path))
     with ThreadPoolExecutor(8) as pool:
         won = list(pool.map(lambda n: store.create("k/x.json", str(n).encode()), range(50)))
