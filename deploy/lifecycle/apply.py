@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from botocore.exceptions import ClientError
 
@@ -17,7 +17,6 @@ from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
 from deploy.core import options, register_function
 from deploy.core.finding import Finding
-from deploy.core.project_folder import ProjectFolder
 from deploy.core.stages import Executor
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
@@ -27,6 +26,9 @@ from deploy.stack.deletion import StackDeletion
 from deploy.stack.settings import StackSettings, taking_settings
 from deploy.stack.stack import GOOD, Stack
 from hippodrome.aws import errors
+
+if TYPE_CHECKING:
+    from deploy.core.project_folder import ProjectFolder
 
 ROLE_PAUSE = 10  # seconds until a role that was just made is known
 ROLE_TRIES = 3

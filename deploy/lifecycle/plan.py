@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
@@ -16,12 +16,14 @@ from deploy.code.template import Template
 from deploy.core import options
 from deploy.core.finding import Finding
 from deploy.core.finding import show as show_findings
-from deploy.core.project_folder import ProjectFolder
 from deploy.lifecycle import preflight
 from deploy.stack import states
 from deploy.stack.changes import Prepared, change_set, prepare
 from deploy.stack.settings import StackSettings, taking_settings
 from deploy.stack.states import StackAction
+
+if TYPE_CHECKING:
+    from deploy.core.project_folder import ProjectFolder
 
 STATEFUL = {  # what holds something that no new one would have, and what that is
     "AWS::S3::Bucket": "participants' data",

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 from botocore.exceptions import ClientError
 
@@ -20,12 +21,13 @@ from deploy.aws.account import Account, parameters_of
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
 from deploy.aws.resource_names import TAG
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
-from deploy.core.project_folder import ProjectFolder
 from deploy.stack import domain_change, inventory
 from deploy.stack.changes import Prepared
-from deploy.study.image import docker
 from hippodrome.aws import errors
 from hippodrome.certificates.rules import names_of
+
+if TYPE_CHECKING:
+    from deploy.core.project_folder import ProjectFolder
 
 FEW = 20  # servers at once; with fewer than that it is worth asking AWS for more before a study
 USUAL = 1.0  # vCPU of a server, while no study says
@@ -98,7 +100,7 @@ def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
 
 # -- the account ------------------------------------------------------------------------------------------------------
 
-Newcomer = tuple[Account, ProjectFolder | None]  # an account without an installation, and what is to be put there
+Newcomer = tuple[Account, "ProjectFolder | None"]  # an account without an installation, and what is to be put there
 
 
 def _region(newcomer: Newcomer) -> Iterator[Finding]:
@@ -148,6 +150,8 @@ def _servers(newcomer: Newcomer) -> Iterator[Finding]:
 
 def _builds(newcomer: Newcomer) -> Iterator[Finding]:
     """Whether the image of a study with a game can be built: by Docker here, or by CodeBuild."""
+    from deploy.study.image import docker  # noqa: PLC0415 - pydantic, only looked at before a first installation
+
     account, study = newcomer
     if (study and not study.plays) or docker.available():
         return

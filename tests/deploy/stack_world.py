@@ -20,6 +20,7 @@ from deploy.code.packages import ZipMember
 from deploy.code.template import Template
 from deploy.lifecycle import preflight
 from deploy.stack import changes, stack
+from deploy.study.image import docker
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 
 REGION = "ca-central-1"
@@ -176,7 +177,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         monkeypatch.setattr(build, "functions", lambda target: world.functions)
         monkeypatch.setattr(preflight, "delegation", lambda zone: world.delegated)
         monkeypatch.setattr(preflight.caa, "find", lambda name, *_: world.caa.get(name, caa.Caa()))
-        monkeypatch.setattr(preflight.docker, "available", lambda: world.docker)
+        monkeypatch.setattr(docker, "available", lambda: world.docker)
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
         # Gap: moto judges bucket policies without their conditions, so the one against plain HTTP refuses everybody.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -430,3 +432,9 @@ def test_an_installation_that_was_made_by_hand_is_ours(world: World) -> None:
     world.cloud.stack["Tags"] = []
     world.cloud.operations.append(happy("UPDATE"))
     assert apply(world.account, "hippodrome", AGAIN).changed
+
+
+def test_without_a_study_neither_loads_what_reads_one() -> None:
+    """It takes a fifth of a second, in which nothing would be shown."""
+    code = "import sys, deploy.__main__, deploy.lifecycle.apply; sys.exit('pydantic' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
