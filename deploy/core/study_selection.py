@@ -63,14 +63,18 @@ def local_data(study: StudySelection) -> Path | None:
     if not place.is_dir():
         if may_use_aws(study.folder):
             return None
-        tried = sorted((study.folder / TRIED).glob("try-*"))
-        raise Problem(
-            f"There are no data of {study.id} on this machine: there is no folder {place}.",
-            "`make run` makes it. If the data are in another folder, name that with --from (with make: DATA=). "
-            "If they are on AWS, --aws fetches them (with make: ARGS=--aws).",
-            [f"The last rehearsal's data are in {tried[-1]}."] if tried else [],
-        )
+        raise none_here(study.id, study.folder, "If they are on AWS, --aws fetches them (with make: ARGS=--aws).")
     return place
+
+
+def none_here(study: str, folder: Path, on_aws: str) -> Problem:
+    """What is said of a study in this folder without data on this machine; `on_aws` is the advice for data on AWS."""
+    tried = sorted((folder / TRIED).glob("try-*"))
+    return Problem(
+        f"There are no data of {study} on this machine: there is no folder {folder / DATA}.",
+        f"`make run` makes it. If the data are in another folder, name that with --from (with make: DATA=). {on_aws}",
+        [f"The last rehearsal's data are in {tried[-1]}."] if tried else [],
+    )
 
 
 def folder_for(study: str, source: Path | None) -> Path:

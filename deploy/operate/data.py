@@ -111,7 +111,12 @@ def command(
     local = from_ if from_ is not None or aws or bucket is not None else _local(study)
     where = folder or folder_for(name, local)
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
-    source = Folder(local) if local else _bucket(account.open_account(profile, region), stack, bucket, name)
+    source: Source
+    if local:
+        source = Folder(local)
+    else:
+        undecided = from_ is None and not aws and bucket is None
+        source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
     if dry_run:
         return _dry_run(work.look(source, name, where, wishes), where, as_json)
     made = work.run(source, name, where, wishes)
@@ -146,6 +151,24 @@ def _local(study: StudySelection) -> Path | None:
         here = study.folder / DATA
         screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
     return found
+
+
+def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:
+    """The account to fetch from. Raises `Problem`.
+
+    `undecided` is a study that may have its data on this machine as well. If no account can be opened, the sentence is
+    about this machine first: who has never used AWS looks for a folder.
+    """
+    from deploy.core.project_folder import uses_aws
+    from deploy.core.study_selection import none_here
+
+    try:
+        return account.open_account(profile, region)
+    except Problem as problem:
+        if undecided is None or undecided.folder is None or uses_aws(undecided.folder):
+            raise
+        on_aws = f"If they are on AWS: {problem} {problem.advice}"
+        raise none_here(undecided.id, undecided.folder, on_aws) from None
 
 
 def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:

@@ -59,6 +59,25 @@ def test_a_study_of_this_machine_that_nobody_has_begun(tmp_path: Path, capsys: A
     assert "try-20260101-000000" in told(capsys, "--project", f"{folder}/").err
 
 
+def test_a_study_that_leaves_open_where_it_runs_and_has_no_data_on_a_machine_without_aws(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    for name in ("AWS_REGION", "AWS_DEFAULT_REGION", "AWS_PROFILE", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    folder = project_folder(tmp_path, LOCAL + "  awsSetup: {cpu: 1, memory: 2}\n")
+    ran = told(capsys, "--project", f"{folder}/")
+    assert ran.code == Exit.FAILED
+    first, _, advice = ran.err.partition("→")
+    assert "There are no data of maze on this machine" in first
+    assert "region" not in first
+    assert "`make run` makes it" in advice
+    assert "If they are on AWS: No AWS region is set." in " ".join(advice.split())
+    assert "no data" not in told(capsys, "--project", f"{folder}/", "--aws").err  # who asks for AWS hears of AWS
+
+
 def test_a_study_on_aws_is_fetched_from_there_and_data_here_are_named(
     world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
