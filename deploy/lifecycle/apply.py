@@ -130,6 +130,7 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
         screen.success(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
         _hint(prepared.functions[0].python)
     _discard_old(prepared)
+    cooldown.wait(account, stack)  # CloudFormation refuses names that are taken already when it makes the change set
     with change_set(prepared, keep=True) as made:
         if not made.changes:
             return _nothing(account, stack, began)
@@ -138,6 +139,8 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
         changed = prepared.changed_parameters() if prepared.existing else {}
         plan = plans.Plan(stack, account.region, kind, changes, changed, site=plans.new_site(prepared))
         plans.show(plan)
+        for warning in made.warnings:
+            screen.warning(f"CloudFormation warns of {warning}")
         if plan.dangers:
             screen.confirm("Something would be lost, as said in red. Go on?", request.yes)
         domain_change.certify(prepared)
@@ -193,7 +196,6 @@ def _discard_old(prepared: Prepared) -> None:
 
 def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     stack = prepared.stack
-    cooldown.wait(prepared.account, stack.name)
     after = stack.last_event(stack_id)
     # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
     prepared.account.client("cloudformation").execute_change_set(

@@ -14,7 +14,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, open_account
 from deploy.code.template import Template
 from deploy.core import options
-from deploy.core.finding import Finding
+from deploy.core.finding import Finding, look
 from deploy.core.finding import show as show_findings
 from deploy.lifecycle import preflight
 from deploy.stack import states
@@ -264,7 +264,8 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
         changes = of_change_set(made.changes, prepared.template)
     if not changes:
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
-    findings = preflight.look_at(preflight.InstallationCheck(prepared, study))
+    findings = [look("CloudFormation", warning) for warning in made.warnings]
+    findings += preflight.look_at(preflight.InstallationCheck(prepared, study))
     changed, seconds = prepared.changed_parameters(), time.monotonic() - began
     return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
 

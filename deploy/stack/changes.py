@@ -110,6 +110,7 @@ class ChangeSet:
     arn: str
     stack_id: str
     changes: list[dict[str, Any]] = field(default_factory=list)  # none: there is nothing to do
+    warnings: list[str] = field(default_factory=list)  # what may make it fail, such as a quota that is used up
 
 
 @contextlib.contextmanager
@@ -141,6 +142,7 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
     kept = False
     try:
         made.changes = _wait(client, made, sleep)
+        made.warnings = _findings(client, made, "WARN")
         yield made
         kept = keep and bool(made.changes)
     finally:
@@ -160,7 +162,7 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
                 return []
             raise Problem(
                 f"CloudFormation cannot make a plan of this: {reason or answer['Status']}",
-                details=_findings(client, made),
+                details=_findings(client, made, "FAIL"),
             )
         sleep(pause)
         pause = min(3.0, pause * 1.5)
@@ -173,17 +175,23 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
     return changes
 
 
-def _findings(client: Any, made: ChangeSet) -> list[str]:
-    """What CloudFormation's validation before deployment found wrong with a change set; best effort."""
+def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
+    """What CloudFormation's validation before deployment found wrong with a change set; best effort.
+
+    `mode`: FAIL for what has made it fail, WARN for what it is made in spite of, such as a quota that is used up
+    (CloudFormation User Guide, "Validate stack deployments"; API Reference, OperationEvent).
+    """
+    found: list[str] = []
     with contextlib.suppress(ClientError):
-        events = client.describe_events(ChangeSetName=made.arn)["OperationEvents"]
-        found = [
-            f"{event.get('LogicalResourceId', '')}: {event.get('ValidationStatusReason', '')}"
-            for event in events
-            if event.get("EventType") == "VALIDATION_ERROR"
-        ]
-        return found[:5]
-    return []
+        for page in client.get_paginator("describe_events").paginate(ChangeSetName=made.arn):
+            found += [
+                f"{event.get('LogicalResourceId', '')}: {event.get('ValidationStatusReason', '')}"
+                for event in page["OperationEvents"]
+                if event.get("EventType") == "VALIDATION_ERROR"
+                and event.get("ValidationFailureMode", "FAIL") == mode
+                and event.get("ValidationStatus", "FAILED") == "FAILED"  # and not SKIPPED
+            ]
+    return found[:5]
 
 
 def _discard(client: Any, made: ChangeSet, prepared: Prepared) -> None:

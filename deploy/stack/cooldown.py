@@ -7,6 +7,9 @@ the last minute is waited for before anything is made.
 
 EventBridge Scheduler: a group that is deleted is in the state DELETING until its schedules are (user guide, "Deleting a
 schedule group"), and its name is taken.
+
+CloudFormation looks for taken names when a change set is made, and refuses it (user guide, "Validate stack
+deployments": resource name conflict detection). So the wait comes before that.
 """
 
 from __future__ import annotations

@@ -32,6 +32,10 @@ UPDATABLE = {  # by a change set
 }
 
 NOTHING = "The submitted information didn't contain changes. Submit different information to create a change set."
+INVALID = (
+    "The following hook(s)/validation failed: [AWS::EarlyValidation::ResourceExistenceCheck]. To troubleshoot Early "
+    "Validation errors, use the DescribeEvents API for detailed failure information."
+)
 
 
 def refusal(operation: str, code: str, message: str) -> ClientError:
@@ -49,6 +53,8 @@ class FakeCloudFormation:
         self.change_set: dict[str, Any] | None = None
         self.change_sets: dict[str, str] = {}  # ours that were neither executed nor deleted: names by ids
         self.failing = ""  # why the next change set fails
+        self.validation: Callable[[], list[dict[str, str]]] = list  # what is found wrong when a change set is made
+        self.found: list[dict[str, str]] = []  # what was found wrong with the last one
         self.operations: list[list[Step]] = []
         self.making: Callable[[dict[str, Any]], str] | None = None
         self.deleting: Callable[[dict[str, Any]], str] | None = None
@@ -154,11 +160,14 @@ class FakeCloudFormation:
             "Url": arguments["TemplateURL"],
         }
         self.change_sets[self.change_set["ChangeSetId"]] = arguments["ChangeSetName"]
+        self.found = self.validation()
         return {"Id": self.change_set["ChangeSetId"], "StackId": self.stack["StackId"]}
 
     def describe_change_set(self, ChangeSetName: str, StackName: str, NextToken: str = "") -> Any:
         if self.failing:
             return {"Status": "FAILED", "StatusReason": self.failing}
+        if any(one["ValidationFailureMode"] == "FAIL" for one in self.found):
+            return {"Status": "FAILED", "StatusReason": INVALID}
         added = [added_resource("Bucket", "AWS::S3::Bucket"), added_resource("Sweep", "AWS::Lambda::Function")]
         changes = added if self.changes is None else self.changes
         if not NextToken and len(changes) > 1:
@@ -166,15 +175,7 @@ class FakeCloudFormation:
         return {"Status": "CREATE_COMPLETE", "Changes": changes[1:] if NextToken else changes}
 
     def describe_events(self, ChangeSetName: str) -> Any:
-        return {
-            "OperationEvents": [
-                {
-                    "EventType": "VALIDATION_ERROR",
-                    "LogicalResourceId": "Bucket",
-                    "ValidationStatusReason": "it is taken",
-                }
-            ]
-        }
+        return {"OperationEvents": self.found}
 
     def execute_change_set(self, **arguments: Any) -> Any:
         self.calls.append(("execute_change_set", arguments))
@@ -314,6 +315,17 @@ def happy(kind: str) -> list[Step]:
         (f"{kind}_IN_PROGRESS", [(*bucket, f"{kind}_COMPLETE", "")]),
         (f"{kind}_COMPLETE", []),
     ]
+
+
+def invalid(name: str, reason: str, mode: str = "FAIL", status: str = "FAILED") -> dict[str, str]:
+    """What validation before deployment says of a resource (API Reference, OperationEvent)."""
+    return {
+        "EventType": "VALIDATION_ERROR",
+        "LogicalResourceId": name,
+        "ValidationFailureMode": mode,
+        "ValidationStatus": status,
+        "ValidationStatusReason": reason,
+    }
 
 
 def added_resource(name: str, kind: str) -> dict[str, Any]:

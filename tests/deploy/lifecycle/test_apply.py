@@ -17,7 +17,7 @@ from deploy.lifecycle.apply import ApplyRequest, apply
 from deploy.lifecycle.plan import plan
 from deploy.stack.changes import Prepared
 from deploy.stack.settings import StackSettings
-from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, refusal
+from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, invalid, refusal
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
 
 __all__ = ["world"]
@@ -135,11 +135,26 @@ def test_change_sets_of_interrupted_runs_are_removed_and_others_left(world: Worl
 
 
 def test_a_change_set_that_fails(world: World) -> None:
-    world.cloud.failing = "Validation failed: see DescribeEvents"
-    with pytest.raises(Problem, match="Validation failed") as caught:
+    world.cloud.validation = lambda: [
+        invalid("Sweep", "may be looked at by nobody", status="SKIPPED"),
+        invalid("Vpc", "the quota is used up", "WARN"),
+        invalid("Bucket", "it is taken"),
+    ]
+    with pytest.raises(Problem, match="EarlyValidation") as caught:
         apply(world.account, "hippodrome", FIRST)
     assert caught.value.details == ("Bucket: it is taken",)
     assert world.cloud.stack is None  # no empty stack is left
+
+
+def test_what_validation_warns_of_is_told_and_stops_nothing(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.cloud.validation = lambda: [
+        invalid("Sweep", "may be looked at by nobody", "WARN", "SKIPPED"),
+        invalid("Vpc", "the quota is used up", "WARN"),
+    ]
+    assert apply(world.account, "hippodrome", FIRST).created
+    said = capsys.readouterr().err
+    assert "CloudFormation warns of Vpc: the quota is used up" in said
+    assert "nobody" not in said
 
 
 def test_a_template_that_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,8 +336,10 @@ def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
         changed_resource("NextStep", "AWS::Lambda::Function", "Code", "Timeout"),
         changed_resource("Vpc", "AWS::EC2::VPC", "CidrBlock", Replacement="True"),
     ]
+    world.cloud.validation = lambda: [invalid("Vpc", "the quota is used up", "WARN")]
     found = plan(world.account, "hippodrome", StackSettings(max_runtime=30))
     assert found.kind == "update"
+    assert [(one.check, one.text) for one in found.findings] == [("CloudFormation", "Vpc: the quota is used up")]
     assert [(change.name, change.action, change.properties) for change in found.changes] == [
         ("sweep", "change", ("Code",)),
         ("next_step", "change", ("Code", "Timeout")),

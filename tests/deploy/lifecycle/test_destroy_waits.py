@@ -20,7 +20,7 @@ from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.settings import StackSettings
 from hippodrome.model import ids
 from testing.exploration import sample
-from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
+from tests.deploy.fake_cloudformation import FakeCloudFormation, invalid, refusal
 from tests.deploy.lifecycle.test_destroy import DATA, buckets, families, installed, run
 from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
@@ -229,6 +229,12 @@ def test_made_again_within_a_minute(
     removal = Removal(stack.world.account, "hippodrome")
     removal.run(removal.look(), data=False)
     gone = stack.clock.time
+
+    def taken() -> list[dict[str, str]]:
+        kept = (stack.clock.time - gone).total_seconds() < 60
+        return [invalid("StartQueue", "hippodrome-start already exists")] if kept else []
+
+    stack.cloud.validation = taken  # CloudFormation looks when it makes the change set
     outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
     assert outcome.created
     assert 60 <= (stack.clock.time - gone).total_seconds() <= 80
@@ -241,6 +247,8 @@ def test_timers_that_are_still_being_deleted_are_waited_for(
     def get(Name: str) -> dict[str, str]:
         return {"Name": Name, "State": "DELETING" if clock.slept < 30 else "ACTIVE"}
 
+    taken = invalid("ScheduleGroup", "hippodrome already exists")
+    world.cloud.validation = lambda: [taken] if clock.slept < 30 else []
     monkeypatch.setattr(world.account.client("scheduler"), "get_schedule_group", get, raising=False)
     assert apply(world.account, "hippodrome", StackSettings(domain=DOMAIN)).created
     assert clock.slept == 30
