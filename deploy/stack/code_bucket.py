@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -26,6 +26,10 @@ PAUSE = 10  # seconds between two tries to make the bucket
 LONGEST_DELETION = 600
 """Seconds. CreateBucket answers OperationAborted while S3 deletes a bucket of that name: minutes, in rare cases up to
 an hour (aws/aws-cli issues 2411 and 2593)."""
+SETTLING = 180
+"""Seconds. A new bucket may answer OperationAborted to any change of its settings, although no other is under way;
+mostly for less than a minute (hashicorp/terraform-provider-aws issue 7628, ansible/ansible pull request 66778)."""
+SETTLING_PAUSE = 5  # seconds
 
 
 class CodeBucket:
@@ -56,19 +60,19 @@ class CodeBucket:
             self._create()
         block = {"BlockPublicAcls": True, "IgnorePublicAcls": True}
         block |= {"BlockPublicPolicy": True, "RestrictPublicBuckets": True}
-        self._s3.put_public_access_block(**self._owner, PublicAccessBlockConfiguration=block)
+        self._set(self._s3.put_public_access_block, PublicAccessBlockConfiguration=block)
         rule = {"ApplyServerSideEncryptionByDefault": {"SSEAlgorithm": "AES256"}}
-        self._s3.put_bucket_encryption(**self._owner, ServerSideEncryptionConfiguration={"Rules": [rule]})
-        self._s3.put_bucket_policy(**self._owner, Policy=json.dumps(self._tls_only()))
+        self._set(self._s3.put_bucket_encryption, ServerSideEncryptionConfiguration={"Rules": [rule]})
+        self._set(self._s3.put_bucket_policy, Policy=json.dumps(self._tls_only()))
         unfinished = {
             "ID": "unfinished uploads",
             "Status": "Enabled",
             "Filter": {"Prefix": ""},
             "AbortIncompleteMultipartUpload": {"DaysAfterInitiation": 1},
         }
-        self._s3.put_bucket_lifecycle_configuration(**self._owner, LifecycleConfiguration={"Rules": [unfinished]})
+        self._set(self._s3.put_bucket_lifecycle_configuration, LifecycleConfiguration={"Rules": [unfinished]})
         tags = [{"Key": TAG, "Value": self._stack}]
-        self._s3.put_bucket_tagging(**self._owner, Tagging={"TagSet": tags})
+        self._set(self._s3.put_bucket_tagging, Tagging={"TagSet": tags})
         return True
 
     def upload(self, functions: Sequence[Function]) -> int:
@@ -152,6 +156,20 @@ class CodeBucket:
         else:
             raise Problem(f"S3 is still deleting the bucket {self.name} of before.", "Run the same command later.")
         self._s3.get_waiter("bucket_exists").wait(**self._owner, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
+
+    def _set(self, call: Callable[..., Any], **setting: Any) -> None:
+        """Make a setting of the bucket; while S3 is at work on the new bucket, try again. Raises `Problem`."""
+        for waited in range(0, SETTLING, SETTLING_PAUSE):
+            try:
+                call(**self._owner, **setting)
+                return
+            except ClientError as error:
+                if errors.code(error) != "OperationAborted":
+                    raise
+            if not waited:
+                screen.info(f"S3 is still at work on the new bucket {self.name}: waiting for that …")
+            time.sleep(SETTLING_PAUSE)
+        raise Problem(f"S3 is still at work on the new bucket {self.name}.", "Run the same command again in a while.")
 
     def _not_ours(self) -> Problem:
         return Problem(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from botocore.client import BaseClient
 
-from console.problem import Exit
+from console.problem import Exit, Problem
 from deploy.lifecycle.apply import apply
 from deploy.lifecycle.removal import Removal
 from deploy.stack import cooldown, inventory
@@ -279,6 +279,46 @@ def test_a_code_bucket_that_s3_is_still_deleting_is_waited_for(
     assert clock.slept == 90
     assert "S3 is still deleting the bucket" in capsys.readouterr().err
     assert buckets(world) == {bucket.name}
+
+
+SETTINGS = (
+    "put_public_access_block",
+    "put_bucket_encryption",
+    "put_bucket_policy",
+    "put_bucket_lifecycle_configuration",
+    "put_bucket_tagging",
+)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_a_new_code_bucket_that_s3_is_still_at_work_on_is_waited_for(
+    world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], setting: str
+) -> None:
+    bucket = CodeBucket(world.account, "hippodrome")
+    s3 = world.account.client("s3")
+    settle = getattr(s3, setting)
+
+    def refusing(**arguments: Any) -> Any:
+        if clock.slept < 60:
+            raise refusal(setting, "OperationAborted", "A conflicting conditional operation is currently in progress")
+        return settle(**arguments)
+
+    monkeypatch.setattr(s3, setting, refusing, raising=False)
+    assert bucket.make()
+    assert clock.slept == 60
+    assert "S3 is still at work on the new bucket" in capsys.readouterr().err
+    assert not bucket.make()  # nothing is left to be set
+
+
+def test_a_code_bucket_that_s3_does_not_finish_is_told(
+    world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusing(**_: Any) -> Any:
+        raise refusal("PutBucketPolicy", "OperationAborted", "A conflicting conditional operation is in progress")
+
+    monkeypatch.setattr(world.account.client("s3"), "put_bucket_policy", refusing, raising=False)
+    with pytest.raises(Problem, match="still at work"):
+        CodeBucket(world.account, "hippodrome").make()
 
 
 def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
