@@ -6,9 +6,10 @@ Everything is read from the state a row at a time, so that memory does not grow 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from export import scrub
 from export.recording_columns import when
@@ -22,6 +23,7 @@ MAX_FIELDS = (
     1_000  # columns of answers; of more fields (every participant can send some) the rarest share the column `other`
 )
 MAX_LINK = 50  # columns of what links carried
+_MAX_PAGES = 100  # pages that are counted at one step
 _MAX_COUNTED = 50_000  # fields that are counted at once
 
 
@@ -48,6 +50,14 @@ class Field:
         return next(iter(kinds)) if len(kinds) == 1 else "text"
 
 
+class Moved(NamedTuple):
+    """A step with answers from another page than it has now: the study's steps were changed while people took part."""
+
+    step: str
+    page: str  # the one that it has now
+    others: Mapping[str, int]  # of each other page, how many answers came from it
+
+
 class StudyAnswers:
     """All answers of a study. Made by one pass that finds the columns; the tables are further passes."""
 
@@ -55,16 +65,19 @@ class StudyAnswers:
         self._state = state
         self._project = project
         self._apart = apart
+        self._now = {step.key: step.page for step in project.steps} if project else {}
         self.scrubbed = 0
         self.finished = 0
         self.in_sessions = False
         fields: dict[tuple[str, str], Field] = {}
         links: dict[str, int] = {}
         steps: set[str] = set()
+        pages: dict[str, Counter[str]] = {}
         for participant, found in self._participants():
             self.in_sessions = self.in_sessions or bool(participant.membership)
             for step, answers in found.items():
                 steps.add(step)
+                self._count_page(pages.setdefault(step, Counter()), step, answers)
                 for name, value in _fields(answers).items():
                     seen = fields.setdefault((step, name), Field(len(fields)))
                     seen.count += 1
@@ -73,6 +86,11 @@ class StudyAnswers:
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
+        self.moved = [
+            Moved(step, page, others)
+            for step, page in self._now.items()
+            if (others := {name: count for name, count in pages.get(step, Counter()).items() if name != page})
+        ]
         widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
         self.fields = {
             key: fields[key] for key in sorted(widest, key=lambda key: (self.steps.index(key[0]), fields[key].place))
@@ -89,6 +107,19 @@ class StudyAnswers:
             hide = scrub.Scrub(scrub.identities(participant))
             yield participant, {step: hide.value(answers) for step, answers in found.items()}
             self.scrubbed += hide.found
+
+    def _count_page(self, seen: Counter[str], step: str, answers: Mapping[str, Any]) -> None:
+        page = self._page(step, answers)
+        if page is not None and (page in seen or len(seen) < _MAX_PAGES):
+            seen[page] += 1
+
+    def _page(self, step: str, answers: Mapping[str, Any]) -> str | None:
+        """The page that a step's answer came from; the versions for groups of the page that it has now count as one."""
+        page = answers.get("page")
+        if not isinstance(page, str):
+            return None
+        now = self._now.get(step, "")
+        return now if now and now in (page, _VERSION.sub("", page)) else clean(page)
 
     def _in_order(self, steps: set[str]) -> list[str]:
         """In the study's order; steps that it does not have (any more) come last."""
@@ -113,6 +144,7 @@ class StudyAnswers:
             *([] if self._apart else [Column("completionCode")]),
             *([] if self._apart else [Column(f"link.{clean(name)}") for name in self.links]),
             *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
+            *(Column(f"page.{moved.step}") for moved in self.moved),
             *(Column(f"answered.{step}", "time") for step in shown),
             *([Column("other")] if self.crowded else []),
         )
@@ -140,6 +172,7 @@ class StudyAnswers:
                 fit(fields[step][name], column.type) if name in fields.get(step, ()) else None
                 for (step, name), column in self.fields.items()
             ]
+            row += [self._page(step, found[step]) if step in found else None for step, _, _ in self.moved]
             row += [when(found[step].get("answered")) if step in found else None for step in shown]
             if self.crowded:
                 row.append(self._rest(fields, {} if self._apart else link))
@@ -228,6 +261,7 @@ def _group(document: Mapping[str, Any]) -> int | None:
 
 _SENT_NUMBERS = ("whole as text", "number as text")
 _EMPTY = "empty text"
+_VERSION = re.compile(r"-[0-9]+\Z", re.ASCII)  # of a page for a group
 _WHOLE = re.compile(r"-?[1-9][0-9]{0,15}|0", re.ASCII)
 _DECIMAL = re.compile(r"-?[0-9]{1,16}\.[0-9]{1,17}", re.ASCII)
 

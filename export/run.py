@@ -206,6 +206,7 @@ def _run(
         "identitiesReplacedInAnswers": scrubbed,
         "counts": counts,
         "columns": [column.name for column in columns],
+        "moved": [moved._asdict() for moved in answers.moved],
         "minari": datasets,
     }
     shown = [*(manifest.kept(folder, path) for path in written), *_tree(folder, "minari")]

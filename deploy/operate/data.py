@@ -224,6 +224,17 @@ def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
     return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
 
 
+def _tell_moved(moved: list[dict[str, Any]]) -> None:
+    """Steps with answers from other pages than they have now."""
+    for step in moved:
+        name, page = step["step"], step["page"]
+        for other, count in step["others"].items():
+            answers = formatting.count(count, "answer")
+            screen.warning(f"Step {name} is {page} now, and has {answers} from {other}: column page.{name} says which.")
+    if moved:
+        screen.info("  `finished` is by the steps as they are now.")
+
+
 def _tell(made: dict[str, Any], where: Path) -> None:
     counts, run = made["counts"], made["run"]
     if run["damaged"]:
@@ -239,6 +250,7 @@ def _tell(made: dict[str, Any], where: Path) -> None:
         screen.info(
             "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
         )
+    _tell_moved(made["moved"])
     if counts["problems"]:
         screen.warning(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
     if where.stat().st_mode & 0o077:

@@ -20,6 +20,7 @@ from trial.recordings.recording import Recording
 
 PROJECT = study()
 Put = Callable[[str, bytes], None]
+PAGES = {step.key: (step.files or [step.page])[-1] for step in PROJECT.steps}
 TIME = "2026-11-21T14:46:40.123456Z"
 
 
@@ -55,7 +56,7 @@ def participant(user: str, **changes: Any) -> dict[str, Any]:
 def answer(step: str, answers: Any, **changes: Any) -> dict[str, Any]:
     return {
         "step": step,
-        "page": f"page-{step}",
+        "page": PAGES.get(step, f"page-{step}"),
         "group": 1,
         "answered": TIME,
         "answers": answers,

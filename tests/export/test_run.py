@@ -24,7 +24,7 @@ from hippodrome.model.records import to_json
 from protocol.handover import Handover
 from protocol.keys import handover_key
 from tests.export import data_world as made_of
-from tests.export.data_world import GAME, arrive, crowd, key, record, recording_key, server
+from tests.export.data_world import GAME, answer, arrive, crowd, key, record, recording_key, server
 from tests.export.place import Place, rows
 
 # What there is
@@ -55,6 +55,20 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     on_disk = {p.relative_to(place.out).as_posix() for p in place.out.rglob("*") if p.is_file()}
     assert set(place.listed()) == {n for n in on_disk if not n.startswith("private/")} - {"manifest.json"}
     assert not [name for name in on_disk if name.endswith(".part")]
+
+
+def test_answers_from_another_page_than_their_step_has_now_are_told_apart(place: Place) -> None:
+    users = crowd(place.put, place.tmp, 3)
+    assert place.done()["moved"] == []  # the versions of a page for groups are one page
+    assert not [column for column in place.rows()[0] if column.startswith("page.")]
+    for user, page in zip(users, ("about", "consent", "questionnaire"), strict=True):
+        place.put(key(user, "answers/2.json"), json.dumps(answer("2", {"age": "20"}, page=page)).encode())
+    assert place.done()["moved"] == [{"step": "2", "page": "questionnaire", "others": {"about": 1, "consent": 1}}]
+    assert [row["page.2"] for row in place.rows()] == ["about", "consent", "questionnaire"]
+    assert list(place.rows()[0]).index("page.2") < list(place.rows()[0]).index("answered.1")
+    told = place.run().err
+    assert "Step 2 is questionnaire now, and has 1 answer from about: column page.2 says which." in told
+    assert "`finished` is by the steps as they are now." in told
 
 
 def test_what_callbacks_recorded_is_a_table(place: Place) -> None:
@@ -150,7 +164,7 @@ def test_long_has_a_row_for_each_text(place: Place) -> None:
     place.done("--long")
     pets = [row["value"] for row in place.rows("answers-long") if row["field"] == "pet"]
     assert pets == ["cat", "dog"]
-    assert place.rows("answers-long")[0]["page"] == "page-1"
+    assert place.rows("answers-long")[0]["page"] == "consent-1"
 
 
 def test_a_study_that_is_not_registered_any_more_still_has_its_answers(place: Place) -> None:
