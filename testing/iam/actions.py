@@ -86,12 +86,17 @@ def _get_object(params: Params, facts: Facts) -> list[Ask]:
 
 
 def _put_object(params: Params, facts: Facts) -> list[Ask]:
+    """A write with If-Match tells something of what is there, so it must be allowed to read it, too.
+
+    (S3 User Guide, "How to prevent object overwrites with conditional writes": s3:PutObject and s3:GetObject.)
+    """
     context = {}
     if "IfNoneMatch" in params:
         context["s3:if-none-match"] = params["IfNoneMatch"]
     if "IfMatch" in params:
         context["s3:if-match"] = params["IfMatch"]
-    return [_object("s3:PutObject", params, context)]
+    reads = [_object("s3:GetObject", params)] if "IfMatch" in params else []
+    return [_object("s3:PutObject", params, context), *reads]
 
 
 def _list_objects(params: Params, facts: Facts) -> list[Ask]:

@@ -42,6 +42,7 @@ from tests.hippodrome.test_moto_journey import run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}
+CONDITIONS = ("IfNoneMatch", "IfMatch")
 HASHED = "sabcdefghijklmnopqrst-1.servers.example.org"
 
 
@@ -509,6 +510,13 @@ def test_answers_are_never_written_over(judge: Judge) -> None:
             assert judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{key}", context)) == frozenset()
         for action in ("s3:DeleteObject", "s3:DeleteObjectVersion", "s3:GetObjectVersion"):
             assert judge.who_may(Ask(action, f"{BUCKET}/{key}")) == frozenset()
+
+
+def test_a_write_with_if_match_reads_as_well() -> None:
+    params = {"Bucket": "the-bucket", "Key": f"_lobbies/{PROJECT}.json"}
+    wanted = {condition: asks("s3", "PutObject", params | {condition: "x"}, Facts()) for condition in CONDITIONS}
+    actions = {condition: [ask.action for ask in asked] for condition, asked in wanted.items()}
+    assert actions == {"IfNoneMatch": ["s3:PutObject"], "IfMatch": ["s3:PutObject", "s3:GetObject"]}
 
 
 def test_who_is_a_member_is_written_once_by_the_control_plane(judge: Judge) -> None:

@@ -98,6 +98,22 @@ def _untrusting(one: Resource, there: Installation) -> Iterator[str]:
                     yield f"{service} comes with {key} {sent.get(key)!r}, and {wanted!r} is trusted"
 
 
+def _blind(one: Resource, there: Installation) -> Iterator[str]:
+    """Who may only compare and swap has to be allowed to read as well: S3 tells the writer whether the ETag is the same."""
+    allowed = [
+        statement
+        for policy in one.properties.get("Policies", [])
+        for statement in policy["PolicyDocument"]["Statement"]
+        if statement["Effect"] == "Allow"
+    ]
+    read = [arn for found in allowed if "s3:GetObject" in listed(found["Action"]) for arn in listed(found["Resource"])]
+    for statement in allowed:
+        if statement.get("Condition", {}).get("Null", {}).get("s3:if-match") == "false":
+            for arn in listed(statement["Resource"]):
+                if not any(fnmatchcase(arn, pattern) for pattern in read):
+                    yield f"it may compare and swap {arn}, and not read it"
+
+
 def _edited(there: Installation) -> Iterator[str]:
     found = there.everything["ResearcherPolicy"].properties.get("Description")
     if found != DESCRIPTION:
@@ -132,6 +148,12 @@ def _sid(template: Template) -> None:
     first(template, ROLE)["Policies"][0]["PolicyDocument"]["Statement"][0]["Sid"] = "image-and-log"
 
 
+def _blinded(template: Template) -> None:
+    for statement in template["Resources"]["SweepRole"]["Properties"]["Policies"][0]["PolicyDocument"]["Statement"]:
+        if statement["Action"] == "s3:GetObject":
+            statement["Resource"].remove({"Fn::Sub": "${Bucket.Arn}/_lobbies/*"})
+
+
 RULES = (
     each(
         ROLE,
@@ -146,6 +168,14 @@ RULES = (
             "Condition.ArnEquals.aws:SourceArn",
             {"Fn::GetAtt": ["Cluster", "Arn"]},
         ),
+    ),
+    each(
+        ROLE,
+        "Policies",
+        "who may write to S3 with If-Match alone may read the same objects",
+        "S3 User Guide, How to prevent object overwrites with conditional writes: If-Match needs s3:PutObject and s3:GetObject",
+        _blind,
+        _blinded,
     ),
     each(ROLE, "Policies", "at most 10,240 characters in all", QUOTAS, _inline, _wide),
     each(ROLE, "AssumeRolePolicyDocument", "at most 2,048 characters", QUOTAS, _trust, _trusting),
