@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, ConfigErrors, layout, read_project
+from hippodrome.config.step_order import changed_pages
+from hippodrome.model.project import MASTER_LIST, read_list
 from hippodrome.ports import Conflict, Documents
 from lambdas import update_project_master_list
+
+CHANGED = (
+    "The steps changed, and people have begun: {steps}. Answers keep the number of their step, and each participant "
+    "goes on at the first step without an answer, so some may see a page twice or not at all. To begin anew, give the "
+    "study another id"
+)
 
 
 class NotPublished(Exception):
@@ -18,10 +27,12 @@ class NotPublished(Exception):
         self.problems = problems
 
 
-def publish(folder: Path, documents: Documents, subdomain: str | None = None) -> Config:
+def publish(
+    folder: Path, documents: Documents, subdomain: str | None = None, say: Callable[[str], None] = lambda _: None
+) -> Config:
     """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`.
 
-    `subdomain` is taken instead of the project's.
+    `subdomain` is taken instead of the project's. `say` hears what the change means for those who take part already.
     """
     try:
         config = read_project(folder)
@@ -33,10 +44,29 @@ def publish(folder: Path, documents: Documents, subdomain: str | None = None) ->
     registration = {**config.registration(), "useAWS": False}
     if subdomain is not None:
         registration["subdomain"] = subdomain
+    changed = _changed(documents, config)
     answer: dict[str, Any] = update_project_master_list.handler({"project": registration}, None)
     if answer.get("problems"):
         raise NotPublished(list(answer["problems"]))
+    if changed:
+        say(CHANGED.format(steps=changed))
     return config
+
+
+def _changed(documents: Documents, config: Config) -> str:
+    """Which steps have another page than they had for participants who have begun, in words; empty if none has."""
+    found = documents.get(MASTER_LIST)
+    try:
+        before = read_list(found.body).find(config.project.id) if found else None
+    except (ValueError, RecursionError):  # the registration says so
+        return ""
+    if before is None:
+        return ""
+    changed = changed_pages(
+        {step.key: step.page for step in before.steps}, {step.key: step.page for step in config.steps}
+    )
+    begun = changed and any(True for _ in documents.list(f"{config.project.id}/users/"))
+    return changed if begun else ""
 
 
 def step_files(folder: Path) -> list[Path]:

@@ -26,6 +26,7 @@ from deploy.cost.prices import REGION, Prices
 from deploy.study import definition, image, pages
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import agent_imports, parse_registration, remarks
+from hippodrome.config.step_order import changed_pages
 from hippodrome.model.project import LEGACY_PORT, Project, UnreadableEntry
 from hippodrome.model.records import from_data
 
@@ -255,8 +256,8 @@ def _confirm(account: Account, installation: Installation, doing: RegisterPlan, 
         return
     was, name = before.name or before.id, after.registration["name"]
     steps = [(step["key"], step["page"], step["variants"]) for step in after.registration["steps"]]
-    same = steps == [(step.key, step.page, step.variants) for step in before.steps]
-    under_way = not same and before.live and after.registration["live"]
+    had = [(step.key, step.page, step.variants) for step in before.steps]
+    under_way = steps != had and before.live and after.registration["live"]
     if was == name and not under_way:
         return
     found = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
@@ -269,7 +270,10 @@ def _confirm(account: Account, installation: Installation, doing: RegisterPlan, 
         )
         screen.confirm(question, request.yes)
     if under_way:
-        screen.confirm("The study is open and has participants, and its steps change for them too. Go on?", request.yes)
+        pages = changed_pages(*({key: page for key, page, _ in found} for found in (had, steps)))
+        which = f": {pages}" if pages else ""
+        question = f"The study is open and has participants, and its steps change for them too{which}. Go on?"
+        screen.confirm(question, request.yes)
 
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:

@@ -30,6 +30,28 @@ def step_range(keys: list[str]) -> str:
     return words if numbered == keys else f"{words} and {FINAL}"
 
 
+def changed_pages(before: Mapping[str, str], after: Mapping[str, str]) -> str:
+    """Which steps have another page than before, in words: "step 3 is sleep (was rules), step 4 is rules (new)".
+
+    Both map keys of steps to pages. Empty if no answer can come from another page: a final step has other words only.
+    """
+    words = [
+        f"{step_name(key)} is {page} {_was(before.get(key))}"
+        for key, page in after.items()
+        if _moved(key, page, before)
+    ]
+    words += [f"{step_name(key)} is gone (was {page})" for key, page in before.items() if key not in after]
+    return ", ".join(words)
+
+
+def _moved(key: str, page: str, before: Mapping[str, str]) -> bool:
+    return before.get(key) != page and not (key == FINAL and key in before)
+
+
+def _was(page: str | None) -> str:
+    return "(new)" if page is None else f"(was {page})"
+
+
 def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]) -> EventsKeys:
     """The events with defaults, as keys of steps. The events have been checked."""
     start, stop = (position(key, keys) for key in (events.start_server_step, events.stop_server_step))

@@ -109,7 +109,7 @@ class LocalPlatform:
 
     def publish(self) -> Config:
         """Register the project, and copy its pages. Raises NotPublished."""
-        return publish(self._project, self.documents, self._subdomain)
+        return publish(self._project, self.documents, self._subdomain, self._say)
 
     def port_of(self, name: str) -> int | None:
         """The port of the server with this DNS name; None if no server has it."""

@@ -86,6 +86,23 @@ def test_a_project_made_for_aws_can_be_held_here(folder: Path, platform: LocalPl
     assert publish.publish(folder, platform.documents).project.use_aws
 
 
+def test_steps_that_get_other_pages_are_told_once_people_have_begun(folder: Path, platform: LocalPlatform) -> None:
+    config, said = folder / "config.yml", list[str]()
+    with_two = config.read_text()
+    with_three = with_two.replace("{1: hello, 2: game, 3: bye,", "{1: hello, 2: bye, 3: game, 4: bye,")
+    with_three = with_three.replace("stopServerStep: 3", "stopServerStep: 4")
+    for begun in (False, True):
+        for text in (with_three, with_two, with_two + "\n"):
+            config.write_text(text)
+            publish.publish(folder, platform.documents, say=said.append)
+        if not begun:
+            assert said == []
+            platform.documents.create("quick/users/5f2a/participant.json", b"{}")
+    assert len(said) == 2, "a change that moves no page is no news"
+    assert ": step 2 is bye (was game), step 3 is game (was bye), step 4 is bye (new). " in said[0]
+    assert ": step 2 is game (was bye), step 3 is bye (was game), step 4 is gone (was bye). " in said[1]
+
+
 def test_all_mistakes_are_told(folder: Path, platform: LocalPlatform) -> None:
     config = folder / "config.yml"
     config.write_text(config.read_text().replace("1: hello", "1: nowhere").replace("maxEpisodes: 1", "maxEpisodes: no"))

@@ -322,6 +322,7 @@ def test_steps_of_a_study_under_way_change_only_after_a_yes(town: Town, folder: 
     before = town.project()
     ran = town.run(capsys, "register", str(folder))
     assert ran.code == Exit.DECLINED
+    assert "step 3 is survey (was thanks), step 4 is thanks (new)" in " ".join((ran.out + ran.err).split())
     assert town.project() == before
     assert "maze/steps/survey.html" not in town.keys("maze/steps/")
     assert town.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
