@@ -53,6 +53,7 @@ ELSEWHERE = {
     "AWS has not activated this account yet.": "deploy/operate/test_doctor.py",
     "These credentials may not …": "deploy/operate/test_doctor.py",
     "The AWS credentials have expired.": "deploy/operate/test_doctor.py",
+    "The profile … is of `aws login`, whose credentials cannot be read here.": "deploy/aws/test_account.py",
     "This AWS account may not run another build now.": "deploy/study/test_codebuild.py",
     "The installation stands, but has no certificate. …": "deploy/lifecycle/test_up.py",
     "… wants no further orders …": "certificate/test_command.py",

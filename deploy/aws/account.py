@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -92,6 +93,8 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
         found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
         credentials = core.get_credentials()
+    except botocore.exceptions.MissingDependencyException:  # botocore's only one here: the package awscrt
+        raise _of_aws_login(profile or os.environ.get("AWS_PROFILE") or "default") from None
     except botocore.exceptions.ProfileNotFound as error:  # of --profile or of AWS_PROFILE
         known = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
         raise Problem(
@@ -103,6 +106,25 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
     if wrong or not found:
         raise Problem(" ".join(what for what, _ in wrong), " ".join(advice for _, advice in wrong))
     return Account(core, found)
+
+
+def _of_aws_login(profile: str) -> Problem:
+    """Why the credentials of `aws login` are not usable as they are, and how they become so.
+
+    botocore reads them only with a package in C. AWS's command line hands them on, and renews them: those that it has
+    fetched are valid for 15 minutes, a login for 12 hours (AWS SDKs and Tools Reference Guide, "Login credentials
+    provider" and "Process credentials").
+    """
+    hand_on = f"aws configure export-credentials --profile {shlex.quote(profile)} --format process"
+    return Problem(
+        f"The profile {profile} is of `aws login`, whose credentials cannot be read here.",
+        "With these two lines, AWS's command line hands them on; the second is for each new terminal. Then run the "
+        "same command again.",
+        [
+            f"aws configure set credential_process {shlex.quote(hand_on)} --profile hippodrome",
+            "export AWS_PROFILE=hippodrome",
+        ],
+    )
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,8 @@ def problem_from(error: BaseException) -> Problem | None:
     if isinstance(error, (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError)):
         return Problem(
             "There are no usable AWS credentials on this machine.",
-            "Run `aws configure` or `aws sso login`, or set both AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY.",
+            "Run `aws configure`, `aws sso login` or `aws login`, or set both AWS_ACCESS_KEY_ID and "
+            "AWS_SECRET_ACCESS_KEY.",
         )
     if isinstance(error, (boto.SSOTokenLoadError, boto.UnauthorizedSSOTokenError, boto.TokenRetrievalError)):
         return Problem("The AWS login has expired.", "Run `aws sso login` and try again.")

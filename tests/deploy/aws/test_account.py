@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shlex
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import botocore.credentials
 import botocore.session
 import pytest
 from moto import mock_aws
@@ -19,6 +23,13 @@ OUTPUTS = (
     "Bucket HostedZoneId RootDomain MaxRuntime Cluster Subnets SecurityGroup StartServerTopic StopServerTopic "
     "ScheduleGroup ScheduleRole"
 )
+HANDED_ON = {
+    "Version": 1,
+    "AccessKeyId": "ASIAEXAMPLE",
+    "SecretAccessKey": "secret",
+    "SessionToken": "token",
+    "Expiration": "2999-01-01T00:00:00Z",
+}
 SERVICES = ("s3", "ecs", "sqs", "sns", "logs", "lambda")
 
 
@@ -41,6 +52,36 @@ def test_credentials_and_a_region_that_are_missing_are_told_at_once(monkeypatch:
     assert str(caught.value) == "No AWS region is set. There are no AWS credentials on this machine."
     assert "--region" in caught.value.advice
     assert "aws sso login" in caught.value.advice
+
+
+@pytest.mark.parametrize(("chosen", "profile"), [(None, "default"), ("lab", "lab")])
+def test_credentials_of_aws_login_are_handed_on_by_a_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, chosen: str | None, profile: str
+) -> None:
+    """What is advised works: here with a command that prints credentials as AWS's command line does."""
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(botocore.credentials, "EC", None)  # without the package awscrt
+    config = tmp_path / "config"
+    section = "default" if profile == "default" else f"profile {profile}"
+    config.write_text(f"[{section}]\nregion = ca-central-1\nlogin_session = arn:aws:iam::123456789012:user/ada\n")
+    monkeypatch.setenv("AWS_CONFIG_FILE", str(config))
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    with pytest.raises(Problem, match=f"The profile {profile} is of `aws login`, whose") as caught:
+        open_account(chosen)
+    advised, export = map(shlex.split, caught.value.details)
+    *begins, key, command, _, name = advised
+    assert (begins, name, export) == (["aws", "configure", "set"], "hippodrome", ["export", "AWS_PROFILE=hippodrome"])
+    assert command == f"aws configure export-credentials --profile {profile} --format process"
+    config.write_text(f"{config.read_text()}[profile hippodrome]\nregion = ca-central-1\n{key} = {command}\n")
+    aws = tmp_path / "aws"
+    aws.write_text(f"#!/bin/sh\ntest \"$4\" = {profile} || exit 1\necho '{json.dumps(HANDED_ON)}'\n")
+    aws.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("AWS_PROFILE", "hippodrome")
+    found = open_account()._core.get_credentials()
+    assert found is not None
+    assert found.get_frozen_credentials().access_key == HANDED_ON["AccessKeyId"]
 
 
 def test_clients_are_made_one_after_the_other_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
