@@ -247,6 +247,13 @@ def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
         yield of_problem("servers' names", problem)
 
 
+def _servers_that_store(checked: InstallationCheck) -> Iterator[Finding]:
+    try:
+        domain_change.check_site(checked.prepared)
+    except Problem as problem:
+        yield of_problem("servers", problem)
+
+
 def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
     """Two installations may share a domain as long as they never hold the same study: servers would share names."""
     name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
@@ -265,6 +272,7 @@ _OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = 
     "domain": _delegation,
     "CAA": _authorities,
     "site": _site,
+    "servers": _servers_that_store,
     "other stacks": _other_stacks,
 }
 

@@ -1,4 +1,4 @@
-"""Moving the servers' names of an existing installation to another domain: what must hold, and what comes first.
+"""Moving the servers' names, or the site, of an existing installation: what must hold, and what comes first.
 
 Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
 that run keep their names and the certificate for those (`hippodrome.certificates.rules.location`). Servers get new
@@ -43,6 +43,25 @@ def check(prepared: Prepared) -> None:
         raise Problem(
             f"Servers run below {before.servers_domain} whose names the installation could not remove any more.",
             "Wait until they have ended, or end them with `python -m deploy stop`; then apply again.",
+            [f"{len(left)} of them"],
+        )
+
+
+def check_site(prepared: Prepared) -> None:
+    """Check that no server runs that was told the site's present address, if that changes. Raises `Problem`.
+
+    A server asks there for each document that it stores (`hippodrome/servers/signing.py`). API Gateway's name of the
+    site can only be replaced, so CloudFormation deletes the old one.
+    """
+    before = _before(prepared)
+    sites = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
+    if before is None or sites[0] == sites[1]:
+        return
+    if left := _running(prepared.account, before):
+        raise Problem(
+            f"Servers run that store their answers and recordings by way of {sites[0]}, which would be gone.",
+            "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end "
+            "for good when their study is closed (`python -m deploy register --no-live`).",
             [f"{len(left)} of them"],
         )
 

@@ -10,6 +10,8 @@ from moto.route53.models import HostedZoneIdentifier
 
 from console.problem import Problem
 from deploy.aws.account import Account, open_account
+from deploy.core.finding import Mark
+from deploy.lifecycle import preflight
 from deploy.stack import domain_change
 from deploy.stack.changes import Prepared
 from deploy.stack.stack import Stack
@@ -63,6 +65,27 @@ def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> 
     world.record("alice", dns=f"{label}-1.example.org")
     with pytest.raises(Problem, match="could not remove"):
         domain_change.check(prepared(world, RootDomain="pilot.example.org"))
+
+
+@pytest.mark.parametrize("state", [ServerState.STARTING, ServerState.READY, ServerState.DRAINING])
+def test_no_server_may_run_while_the_site_that_it_stores_through_changes(world: Installed, state: ServerState) -> None:
+    world.record("alice", state)
+    for changed in ({"SiteHost": "lab"}, {"RootDomain": "pilot.example.org"}):
+        with pytest.raises(Problem, match=r"by way of study\.example\.org, which would be gone") as caught:
+            domain_change.check_site(prepared(world, **changed))
+        assert "deploy stop" in caught.value.advice
+        assert caught.value.details == ("1 of them",)
+    with world.recording() as calls:
+        domain_change.check_site(prepared(world))
+    assert calls == []  # the site stays
+    world.record("alice", ServerState.CLOSED)
+    domain_change.check_site(prepared(world, SiteHost="lab"))
+
+
+def test_an_apply_that_moves_the_site_looks_for_such_servers(world: Installed) -> None:
+    world.record("alice")
+    found = preflight.look_at(preflight.InstallationCheck(prepared(world, ServersHost="", SiteHost="lab", VpcId="")))
+    assert [one.mark for one in found if one.check == "servers"] == [Mark.BAD]
 
 
 def test_nothing_is_looked_at_where_names_stay(world: Installed) -> None:
