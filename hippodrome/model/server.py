@@ -139,6 +139,13 @@ class Server(Record, frozen=True):
     def is_closed(self) -> bool:
         return self.state is ServerState.CLOSED
 
+    def lacks(self, step_key: str) -> bool:
+        """Whether it can never play this game step: the steps were registered anew since it was started.
+
+        Not known of records of earlier versions, and not asked of a session's server, where others play.
+        """
+        return bool(self.game_steps) and not self.is_sessions and step_key not in self.game_steps
+
     def is_open(self, attempt: int) -> bool:
         """Whether the record is at this attempt and not closed."""
         return self.attempt == attempt and not self.is_closed

@@ -48,6 +48,8 @@ class ServerStates:
             state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
             if record.is_closed:
                 state.update(_closed(record))
+            elif step is not None and step.type.on_server and record.lacks(step.key):
+                state["state"] = ServerState.QUEUED  # it is being stopped, see `GameStep`
             elif record.state is ServerState.READY and record.dns_record:
                 self._remember(record)
                 host = dns.browser_host(record.dns_record)

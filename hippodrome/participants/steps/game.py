@@ -10,7 +10,7 @@ from typing import Any
 from hippodrome import http
 from hippodrome.http import Response
 from hippodrome.model import ids, participant, server
-from hippodrome.model.messages import StartServer, to_message
+from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Server, ServerState, next_attempt, requestable_attempt
 from hippodrome.participants import frame, pages
@@ -94,6 +94,9 @@ class GameStep:
         """The state of the participant's own server."""
         record = self._services.repository.server_of(visit.project.id, visit.user_id)
         self._request_if_overdue(visit, visit.user_id, record)
+        if record is not None and not record.is_closed and record.lacks(visit.step.key):
+            stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # then they may ask for one that fits
+            self._services.platform.bus.publish(Topic.STOP, to_message(stop))
         since = visit.progress.reached_at(visit.project, visit.step)
         return self._services.state(visit.project, visit.user_id, visit.step, record, since)
 

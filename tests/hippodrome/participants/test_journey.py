@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome.model import ids, server
-from hippodrome.model.messages import StartServer, TaskChanged
+from hippodrome.model.messages import StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
 from hippodrome.model.records import to_json
 from hippodrome.model.server import MAX_ATTEMPTS
@@ -262,6 +262,30 @@ def test_a_server_that_has_not_begun_to_run_for_long_is_asked_for_again(platform
     assert len(platform.tasks.running) == 1
 
 
+def test_a_server_of_before_the_steps_were_numbered_anew_is_stopped_and_another_may_be_asked_for(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    to_game(alice)
+    serve(platform)
+    first, second, *_, last = study().steps
+    steps = [first, second, Step("3", "survey"), Step("4", "game"), last]
+    platform.documents.put(MASTER_LIST, to_json(MasterList([study(steps=steps, events=Events("2", "finalStep"))])))
+    platform.wait(minutes=1)
+    alice.answer(alice.get(), words="a page that was put before the game")
+    platform.bus.sent.clear()
+    alice.get()
+    assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice", "attempt": 1})]
+    state = poll(alice, "4")
+    assert (state["state"], "url" in state) == ("queued", False), "no page connects to a server that would refuse it"
+    assert poll(alice, "3")["state"] == "ready", "an old tab plays on"
+    Servers(platform).stop([StopServer("maze", "alice", 1)])
+    state = poll(alice, "4")
+    assert (state["state"], state["again"]) == ("ended", True)
+    platform.bus.sent.clear()
+    alice.answer(alice.get())
+    assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
 def test_a_message_is_out_before_the_answer_that_calls_for_it(platform: FakePlatform, alice: Browser) -> None:
     page = alice.get()
 
@@ -276,8 +300,8 @@ def test_a_message_is_out_before_the_answer_that_calls_for_it(platform: FakePlat
     assert stored(platform, "answers/1.json")
 
 
-def poll(alice: Browser) -> Any:
-    response = Browser(alice.platform, f"{alice.query}&poll=3").send(accept="application/json")
+def poll(alice: Browser, step: str = "3") -> Any:
+    response = Browser(alice.platform, f"{alice.query}&poll={step}").send(accept="application/json")
     assert response["statusCode"] == 200
     return json.loads(response["body"])
 
