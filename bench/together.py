@@ -29,7 +29,7 @@ from bench.interpreter import interpreter
 from bench.table import Row, each, row
 from bench.trial_server import trial_server
 from protocol.keys import session_key
-from protocol.session import Member, Session, member_token
+from protocol.session import Member, SessionDocument, member_token
 from testing.browser import chromium, game_page
 
 RATE = load.RATE  # ticks a second
@@ -124,7 +124,7 @@ def server(players: int) -> Iterator[tuple[str, int]]:
             "gather": 3600,  # while dozens of servers start, clients of one game may come far apart
             "maxEpisodes": 1000,
         }
-        document = Session(
+        document = SessionDocument(
             SESSION, players, tuple(Member(one, None, seat) for seat, one in enumerate(members(players)))
         )
         path = Path(store, session_key("bench", SESSION))

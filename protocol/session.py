@@ -45,7 +45,7 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class SessionDocument:
     """The document. `players` is how many seats there are; `formed` is a time in UTC, as in all records."""
 
     id: str
@@ -89,7 +89,7 @@ def member_token(token: str, user_id: str) -> str:
     return hmac.new(token.encode(), f"member\0{user_id}".encode(), hashlib.sha256).hexdigest()[:48]
 
 
-def parse(body: bytes) -> Session:
+def parse(body: bytes) -> SessionDocument:
     """Read the document. Raises BadSession, never anything else."""
     try:
         found = json.loads(body)
@@ -102,7 +102,7 @@ def parse(body: bytes) -> Session:
         raise BadSession("its document names no session")
     if not (_is_number(players) and 1 <= players <= MOST_PLAYERS and isinstance(members, list)):
         raise BadSession("its document does not say who plays")
-    session = Session(
+    session = SessionDocument(
         found["id"], players, tuple(_member(each) for each in members), _group(found.get("group")), _text(found)
     )
     seats = [member.seat for member in session.members]

@@ -18,7 +18,7 @@ from export import without_member
 from hippodrome.model import memberships
 from protocol import session as sessions
 from protocol.keys import membership_key, session_folder, session_key, sessions_folder
-from protocol.session import BadSession, Session, is_session_id
+from protocol.session import BadSession, SessionDocument, is_session_id
 
 _RECORDING = ".jsonl.gz"
 
@@ -131,7 +131,7 @@ class SessionEraser:
             return
         self._storage.delete(older(self._storage, key), note)
 
-    def _without(self, parsed: Session) -> bytes:
+    def _without(self, parsed: SessionDocument) -> bytes:
         members = (replace(each, user_id="") if each.user_id == self._user else each for each in parsed.members)
         return replace(parsed, members=tuple(members)).to_json()
 

@@ -23,7 +23,7 @@ from hippodrome.storage.compare_and_swap import SharedDocuments
 from hippodrome.storage.repository import Repository
 from protocol import answer, session
 from protocol.keys import answer_key, membership_key, session_key, sessions_folder
-from protocol.session import BadSession, Session
+from protocol.session import BadSession, SessionDocument
 from protocol.times import time_text
 
 FORMED_LATELY = timedelta(hours=1)
@@ -117,7 +117,7 @@ class LobbyStore:
             if found is not None:
                 self._finish_session(project, found)
 
-    def _finish_session(self, project: Project, found: Session) -> None:
+    def _finish_session(self, project: Project, found: SessionDocument) -> None:
         missing = [each for each in found.members if each.user_id]
         missing = [each for each in missing if self._repository.membership(project.id, each.user_id) is None]
         if missing and self._repository.server_of(project.id, found.id) is None:
@@ -145,7 +145,7 @@ class LobbyStore:
 
     def _write_session(self, project: Project, formed: Formed) -> Mapping[str, Membership]:
         members = tuple(session.Member(each.user_id, each.group, seat) for seat, each in enumerate(formed.members))
-        made = Session(
+        made = SessionDocument(
             formed.id,
             max(formed.players or project.players, len(members)),
             members,

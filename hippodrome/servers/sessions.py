@@ -14,13 +14,13 @@ from hippodrome.model import participant
 from hippodrome.model.messages import StopServer
 from hippodrome.model.project import Project
 from hippodrome.storage.repository import Repository
-from protocol.session import BadSession, Session
+from protocol.session import BadSession, SessionDocument
 
 if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds what it imports
     from hippodrome.servers.services import ServerServices
 
 
-def readable_session(repository: Repository, project_id: str, session_id: str) -> Session | None:
+def readable_session(repository: Repository, project_id: str, session_id: str) -> SessionDocument | None:
     """The session's document; None if there is none yet, or if it cannot be read, which is logged. One read."""
     try:
         return repository.session(project_id, session_id)
@@ -63,7 +63,7 @@ class Sessions:
             return None
         return StopServer(project.id, session.id, None, message.reason)
 
-    def is_over(self, project: Project, session: Session, leaves: str = "") -> bool:
+    def is_over(self, project: Project, session: SessionDocument, leaves: str = "") -> bool:
         """Whether all members have reached the stop step. One listing for each member but `leaves`, who has.
 
         False in a project without a stop step: there the trial ends by itself.

@@ -16,7 +16,7 @@ from hippodrome.ports import Conflict, Documents
 from hippodrome.storage.errors import RetryLater
 from protocol import session
 from protocol.keys import membership_key, participant_folder, session_key
-from protocol.session import Session
+from protocol.session import SessionDocument
 
 TRIES = 8  # for a change; then the queue delivers the message again
 
@@ -77,7 +77,7 @@ class Repository:
         membership = self.membership(project.id, user_id) if project.has_sessions else None
         return membership.session if membership else None
 
-    def session(self, project_id: str, session_id: str) -> Session | None:
+    def session(self, project_id: str, session_id: str) -> SessionDocument | None:
         """The session's document; None if there is none. Raises `BadSession` if it cannot be read."""
         found = self._documents.get(session_key(project_id, session_id))
         return session.parse(found.body) if found else None

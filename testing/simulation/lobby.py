@@ -10,7 +10,7 @@ from hippodrome.lobby import decisions, entries
 from hippodrome.model.project import Project
 from protocol import session as sessions
 from protocol.keys import sessions_folder
-from protocol.session import Session
+from protocol.session import SessionDocument
 
 Kept = Mapping[str, tuple[bytes, str, datetime]]  # what S3 holds
 
@@ -26,7 +26,7 @@ def left_over(kept: Kept, project: Project) -> list[str]:
     return found
 
 
-def formed(kept: Kept, project: Project) -> Iterator[Session]:
+def formed(kept: Kept, project: Project) -> Iterator[SessionDocument]:
     """All sessions that were formed."""
     for key in sorted(kept):
         if key.startswith(sessions_folder(project.id)) and key.endswith("/session.json"):

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from hippodrome.ports import Conflict
 from protocol import session as sessions
 from protocol.keys import answer_key, session_key
-from protocol.session import Session, member_token
+from protocol.session import SessionDocument, member_token
 from testing.simulation.ports import SimPlatform
 from testing.simulation.tasks import TimedTask
 from testing.tasks import Life
@@ -45,7 +45,7 @@ class SimTrial:
         self._clock.spawn(self._run)
 
     @property
-    def session(self) -> Session | None:
+    def session(self) -> SessionDocument | None:
         """The session's document, which the trial reads until it is there."""
         found = self._documents.kept.get(session_key(self._trials.project_id, self.session_id))
         return _parsed(found[0]) if found else None
@@ -83,7 +83,7 @@ class SimTrial:
             alone = 0.0
             self._go_on(session, here)
 
-    def _go_on(self, session: Session, here: set[str]) -> None:
+    def _go_on(self, session: SessionDocument, here: set[str]) -> None:
         """One look of the trial while some members are here."""
         members = {member.user_id for member in session.members}
         if members <= here:
@@ -107,7 +107,7 @@ class SimTrial:
             self.began = self._clock.seconds
         self._trials.played[self.session_id] += TICK  # it is recorded
 
-    def _store(self, session: Session, outcomes: Mapping[str, str]) -> None:
+    def _store(self, session: SessionDocument, outcomes: Mapping[str, str]) -> None:
         """An answer for each member. What is there stays: an earlier server may have written it."""
         for member in session.members:
             answers = {"score": 10, "outcome": outcomes[member.user_id], "session": session.id}

@@ -13,7 +13,7 @@ from hippodrome.model import ids
 from hippodrome.model.memberships import Membership
 from hippodrome.model.records import to_json
 from protocol.keys import membership_key, session_key, session_recordings_folder
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 from tests.export.data_world import GAME, PROJECT, TIME, Put, arrive, register
 from trial.recordings import recording
 from trial.recordings.recording import Recording
@@ -34,10 +34,10 @@ def recording_key(session: str = SID, name: str = "3-episode-0001", attempt: int
     return f"{folder}{server(session, attempt)}/{name}.jsonl.gz"
 
 
-def session(*members: str, session_id: str = SID, players: int = 2) -> Session:
+def session(*members: str, session_id: str = SID, players: int = 2) -> SessionDocument:
     """The document of a session of these members; an empty id is that of an erased one."""
     seated = tuple(Member(user, 1, seat) for seat, user in enumerate(members))
-    return Session(session_id, players, seated, 1, TIME)
+    return SessionDocument(session_id, players, seated, 1, TIME)
 
 
 def said(user: str) -> str:

@@ -14,7 +14,7 @@ from local.activity.server_logs import WatchedServer
 from local.backend.task_record import TaskRecord, folder_of
 from local.backend.tasks import ProcessTasks
 from protocol.keys import answer_key, session_key
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 
 SID = "s.0123456789abcdef0123"
 
@@ -50,7 +50,7 @@ def test_answers_that_a_sessions_server_writes_are_its_members(tmp_path: Path) -
     document.write_bytes(b"half a document")
     assert server.answers() == [], "it is not formed yet"
     document.write_bytes(
-        Session(SID, 3, (Member("anna", None, 0), Member("bert", None, 1), Member("", 0, 2))).to_json()
+        SessionDocument(SID, 3, (Member("anna", None, 0), Member("bert", None, 1), Member("", 0, 2))).to_json()
     )
     assert server.answers() == [], "what was answered before"
     for each in ("bert", "anna"):
@@ -65,7 +65,7 @@ def test_the_terminal_names_who_has_played(tmp_path: Path, owner: str) -> None:
     log = ActivityLog(Console(file=text, width=200))
     document = tmp_path / session_key("study", SID)
     document.parent.mkdir(parents=True)
-    document.write_bytes(Session(SID, 2, (Member("P1", None, 0), Member("P2", None, 1))).to_json())
+    document.write_bytes(SessionDocument(SID, 2, (Member("P1", None, 0), Member("P2", None, 1))).to_json())
     server = watched(tmp_path, owner)
     log._tell(server)
     answer(tmp_path, "P1", "3")
@@ -107,11 +107,11 @@ def test_a_game_on_a_warm_server_that_is_over_by_the_next_look_is_told(tmp_path:
 def test_the_terminal_says_who_plays_with_whom_and_who_found_no_others(tmp_path: Path) -> None:
     text = io.StringIO()
     log = ActivityLog(Console(file=text, width=200))
-    both = Session(SID, 2, (Member("bert", None, 1), Member("anna", None, 0)))
+    both = SessionDocument(SID, 2, (Member("bert", None, 1), Member("anna", None, 0)))
     for _ in range(2):
         log.wrote(session_key("study", SID), both.to_json())
     other = SID.replace("0", "f")
-    log.wrote(session_key("study", other), Session(other, 3, (Member("cleo", None, 0),)).to_json())
+    log.wrote(session_key("study", other), SessionDocument(other, 3, (Member("cleo", None, 0),)).to_json())
     log.wrote("study/users/anna/session.json", json.dumps({"session": SID, "unmatched": False}).encode())
     log.wrote("study/users/dora/session.json", json.dumps({"session": None, "unmatched": True}).encode())
     said = [line[10:].split("  ", 1) for line in text.getvalue().splitlines()]

@@ -11,10 +11,19 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from protocol.keys import NAME
-from protocol.session import MOST_PLAYERS, BadSession, Member, Session, is_session_id, member_token, owner_folder, parse
+from protocol.session import (
+    MOST_PLAYERS,
+    BadSession,
+    Member,
+    SessionDocument,
+    is_session_id,
+    member_token,
+    owner_folder,
+    parse,
+)
 
 SID = "s.0123456789abcdef0123"
-PAIR = Session(SID, 2, (Member("anna", None, 0), Member("bert", None, 1)), None, "2026-11-22T22:00:00.000000Z")
+PAIR = SessionDocument(SID, 2, (Member("anna", None, 0), Member("bert", None, 1)), None, "2026-11-22T22:00:00.000000Z")
 GOOD: dict[str, Any] = json.loads(PAIR.to_json())
 IDS = st.from_regex(NAME, fullmatch=True)
 
@@ -76,12 +85,12 @@ HOSTILE = {
 def test_what_is_written_is_what_is_read(
     seats: tuple[int, list[tuple[str, int | None, int]]], group: int | None
 ) -> None:
-    written = Session(SID, seats[0], tuple(Member(*each) for each in seats[1]), group, "now")
+    written = SessionDocument(SID, seats[0], tuple(Member(*each) for each in seats[1]), group, "now")
     assert parse(written.to_json()) == written
 
 
 def test_the_document_is_as_its_module_says() -> None:
-    member = Session(SID, 2, (Member("anna", 1, 0),), 1, "now")
+    member = SessionDocument(SID, 2, (Member("anna", 1, 0),), 1, "now")
     assert member.to_json().decode().splitlines() == [
         "{",
         ' "schema": 1,',
@@ -103,7 +112,7 @@ def test_the_document_is_as_its_module_says() -> None:
 @pytest.mark.parametrize("formed", [{}, {"formed": None}, {"formed": 1}])
 def test_a_document_that_does_not_say_when_it_was_formed_is_read(formed: dict[str, Any]) -> None:
     without = {key: value for key, value in GOOD.items() if key != "formed"}
-    assert parse(json.dumps({**without, **formed}).encode()) == Session(SID, 2, PAIR.members)
+    assert parse(json.dumps({**without, **formed}).encode()) == SessionDocument(SID, 2, PAIR.members)
     assert parse(json.dumps({**without, **formed}).encode()).formed == ""
 
 

@@ -18,7 +18,7 @@ from hippodrome.lobby import decisions
 from hippodrome.model.project import MASTER_LIST
 from protocol.keys import answer_key, membership_key, session_key
 from protocol.session import Member as Seated
-from protocol.session import Session
+from protocol.session import SessionDocument
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.conditions import Conditions
 from testing.simulation.members import POLL, PROPOSED_POLL, Habits, SimulatedMember
@@ -209,7 +209,7 @@ def test_a_member_who_was_not_told_is_seen_as_split():
 
 def test_a_member_of_two_sessions_is_seen_as_merged():
     judged = Judged()
-    other = Session("s." + 20 * "1", 2, judged.session.members, formed=judged.session.formed)
+    other = SessionDocument("s." + 20 * "1", 2, judged.session.members, formed=judged.session.formed)
     judged.write(session_key("study", other.id), other.to_json())
     assert judged.wrong.count("merged") == 2
 
@@ -217,14 +217,14 @@ def test_a_member_of_two_sessions_is_seen_as_merged():
 def test_a_session_of_too_many_is_seen_as_merged():
     judged = Judged()
     members = (*judged.session.members, Seated("p00002", None, 2))
-    larger = Session(judged.session.id, 3, members, formed=judged.session.formed)
+    larger = SessionDocument(judged.session.id, 3, members, formed=judged.session.formed)
     judged.write(session_key("study", larger.id), larger.to_json())
     assert "merged" in judged.wrong
 
 
 def test_a_session_of_too_few_is_seen_as_split():
     judged = Judged()
-    smaller = Session(judged.session.id, 2, judged.session.members[:1], formed=judged.session.formed)
+    smaller = SessionDocument(judged.session.id, 2, judged.session.members[:1], formed=judged.session.formed)
     judged.write(session_key("study", smaller.id), smaller.to_json())
     assert "split" in judged.wrong
 

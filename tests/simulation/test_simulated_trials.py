@@ -9,7 +9,7 @@ import pytest
 
 from hippodrome.ports import TaskRequest
 from protocol.keys import answer_key, session_key
-from protocol.session import Member, Session, member_token
+from protocol.session import Member, SessionDocument, member_token
 from testing.clock import EPOCH
 from testing.simulation.conditions import Conditions
 from testing.simulation.trials import ABSENT, COUNTDOWN
@@ -42,7 +42,7 @@ class Played:
         return made[0]
 
     def form(self, *members):
-        document = Session(SESSION, 2, tuple(Member(user, None, seat) for seat, user in enumerate(members)))
+        document = SessionDocument(SESSION, 2, tuple(Member(user, None, seat) for seat, user in enumerate(members)))
         self.documents.keep(session_key("study", SESSION), document.to_json())
 
     def trial(self, task=None):

@@ -21,7 +21,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
 from hippodrome.model.server import MAX_ATTEMPTS, Server
 from protocol.keys import answer_key, membership_key, sessions_folder
-from protocol.session import Session, member_token, parse
+from protocol.session import SessionDocument, member_token, parse
 from testing.port_faults import FaultAt
 from testing.studies import study
 from testing.tasks import Task
@@ -59,7 +59,7 @@ class SessionWorld(World):
         kept = self.account.kept
         return {key: kept[key][0] for key in kept if key.endswith("/session.json")}
 
-    def sessions(self) -> list[Session]:
+    def sessions(self) -> list[SessionDocument]:
         """All sessions that were formed."""
         folder = sessions_folder(self.project.id)
         return [parse(body) for key, body in self.documents().items() if key.startswith(folder)]
@@ -83,7 +83,7 @@ class SessionWorld(World):
         except ValueError:  # it was spoilt
             return Decisions()
 
-    def session_of(self, task: Task) -> Session | None:
+    def session_of(self, task: Task) -> SessionDocument | None:
         """The session that plays on the task, if it was formed."""
         told = self.handovers().get(task.name)
         session_id = task.session or (told.user_id if told else "")

@@ -12,7 +12,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 
 from protocol.keys import session_key
-from protocol.session import Member, Session, member_token
+from protocol.session import Member, SessionDocument, member_token
 from tests.trial.conftest import Client, client_of
 from tests.trial.two_players import TRIAL as ONE_HUMAN
 from tests.trial.two_players import two_players
@@ -42,13 +42,13 @@ ENV = {
 
 def document(
     members: Iterable[str] = MEMBERS, *, players: int = 2, group: int | None = None, sid: str = SID
-) -> Session:
+) -> SessionDocument:
     """A session whose members have the seats 0, 1 and so on."""
     found = tuple(Member(user_id, group, seat) for seat, user_id in enumerate(members))
-    return Session(sid, players, found, group, "2026-11-22T22:00:00.000000Z")
+    return SessionDocument(sid, players, found, group, "2026-11-22T22:00:00.000000Z")
 
 
-def form(store: Path, session: Session | None = None) -> None:
+def form(store: Path, session: SessionDocument | None = None) -> None:
     """What the lobby does when the session is formed."""
     found = session or document()
     put(store, session_key("study", SID), found.to_json())

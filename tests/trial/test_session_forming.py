@@ -10,7 +10,7 @@ from websockets.asyncio.client import connect
 
 from protocol.handover import Handover
 from protocol.keys import handover_key
-from protocol.session import Session
+from protocol.session import SessionDocument
 from testing.waiting import until
 from tests.trial.sessions import (
     ENV,
@@ -159,7 +159,7 @@ BAD = {
     "no JSON": b"{",
     "another session": document(sid="s.aaaaaaaaaaaaaaaaaaaa").to_json(),
     "a later version": json.dumps({**json.loads(document().to_json()), "schema": 2}).encode(),
-    "nobody": Session(SID, 2, ()).to_json(),
+    "nobody": SessionDocument(SID, 2, ()).to_json(),
     "one seat twice": document().to_json().replace(b'"seat": 1', b'"seat": 0'),
     "a seat that is none": document().to_json().replace(b'"seat": 1', b'"seat": 2'),
     "one member twice": document(("anna", "anna")).to_json(),

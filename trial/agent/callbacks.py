@@ -41,7 +41,7 @@ Record = Callable[[str, Any], None]
 
 
 @dataclass(frozen=True, slots=True)
-class SessionView:
+class Session:
     """How the session stands when a callback is called. Mappings are by player.
 
     `env` is the environment itself: it is at rest for `callbackSeconds`, and then the game goes on with it.
@@ -234,9 +234,9 @@ class Callbacks:
         if not returned and self.first_late is None:
             self.first_late = name
 
-    def _session(self, call: _Call) -> SessionView:
+    def _session(self, call: _Call) -> Session:
         about, now = self.about, self._now
-        return SessionView(
+        return Session(
             trial=about.trial,
             step=about.step,
             group=about.group,
@@ -309,7 +309,7 @@ class _Call:
         self._left = recording.MAX_EXTRA_BYTES
         self._values = 0
 
-    def run(self, method: Callable[..., Any], session: SessionView, arguments: tuple[Any, ...]) -> None:
+    def run(self, method: Callable[..., Any], session: Session, arguments: tuple[Any, ...]) -> None:
         notes, name = self._notes, self._name
         try:
             value = method(session, *arguments)

@@ -16,13 +16,13 @@ from protocol import environment as variables
 from protocol import handover, session
 from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key, session_key
-from protocol.session import BadSession, Session, is_session_id
+from protocol.session import BadSession, SessionDocument, is_session_id
 from trial.recordings.store import Store, short_error
 from trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
 
-Found = Handover | Session
+Found = Handover | SessionDocument
 
 
 def assigned(settings: TrialSettings, found: Handover) -> TrialSettings:
@@ -32,7 +32,7 @@ def assigned(settings: TrialSettings, found: Handover) -> TrialSettings:
     return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
 
 
-def formed(settings: TrialSettings, found: Session) -> TrialSettings:
+def formed(settings: TrialSettings, found: SessionDocument) -> TrialSettings:
     """The settings of a session's server once its members are known. Raises BadSession."""
     if found.id != settings.session:
         raise BadSession("its document is that of another session")
@@ -46,7 +46,7 @@ def set_environment(environment: MutableMapping[str, str], found: Found | None) 
     """
     for name in (*variables.PARTICIPANT, variables.SESSION):
         environment.pop(name, None)
-    if isinstance(found, Session):
+    if isinstance(found, SessionDocument):
         environment[variables.SESSION] = found.id
         environment[variables.GROUP] = variables.group_text(found.group)
     elif found is not None and not is_session_id(found.user_id):

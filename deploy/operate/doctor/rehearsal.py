@@ -20,7 +20,7 @@ from hippodrome.ports import Documents, Platform, Topic
 from hippodrome.servers import causes, resources
 from hippodrome.storage.repository import Repository
 from protocol.keys import session_key
-from protocol.session import Member, Session, owner_folder
+from protocol.session import Member, SessionDocument, owner_folder
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
 CLAIM = 60.0  # seconds until start_server should have acted
@@ -89,7 +89,7 @@ class Rehearsal:
         try:
             started = self._clock()
             if self._project.has_sessions:
-                session = Session(self.user_id, self._project.players, (Member(self._name, None, 0),))
+                session = SessionDocument(self.user_id, self._project.players, (Member(self._name, None, 0),))
                 write_session(self._platform.documents, self._project.id, session)
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
@@ -234,7 +234,7 @@ class Rehearsal:
             documents.delete(server.key(record.label))
 
 
-def write_session(documents: Documents, project_id: str, session: Session) -> None:
+def write_session(documents: Documents, project_id: str, session: SessionDocument) -> None:
     """Write the document of a session that is to have a server, which the sweep would stop without it."""
     documents.create(session_key(project_id, session.id), session.to_json())
 

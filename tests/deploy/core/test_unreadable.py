@@ -19,7 +19,7 @@ from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, Project, step_key
 from hippodrome.storage.secret import SecretCache
 from protocol.keys import session_key
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 from testing.studies import PAGES, study
 from tests.deploy.installation import Installed, installed  # noqa: F401
 from tests.deploy.operate.test_doctor import account, context  # noqa: F401
@@ -106,7 +106,7 @@ def test_doctor_names_a_lobbys_document_and_counts_those_of_sessions(installed: 
     pairs = study(players=2)
     prepare(installed, pairs)
     SecretCache(installed.platform.documents).get_or_create()
-    good = Session("s." + "0" * 20, 2, (Member(USER, None, 0),))
+    good = SessionDocument("s." + "0" * 20, 2, (Member(USER, None, 0),))
     installed.put(session_key("maze", good.id), good.to_json())
     assert found(account) == []
     installed.put("_lobbies/maze.json", b"{")

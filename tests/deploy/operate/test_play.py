@@ -32,7 +32,7 @@ from hippodrome.model.records import to_json
 from hippodrome.model.server import ServerState
 from hippodrome.storage.project_cache import FRESH
 from protocol.keys import session_key
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 from testing.aws_events import ACCOUNT
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
@@ -224,7 +224,7 @@ def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningIn
     copy.make(registered_projects(platform.documents)[0])
     walked, sid, ahead = copy.user("1"), f"s.{1:020x}", f"s.{2:020x}"
     running.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
-    running.put(session_key(copy.id, sid), Session(sid, 2, (Member(walked, None, 0),)).to_json())
+    running.put(session_key(copy.id, sid), SessionDocument(sid, 2, (Member(walked, None, 0),)).to_json())
     running.record(sid, ServerState.CLOSED, copy.project)
     running.record(ahead, ServerState.READY, copy.project)
     running.put(f"_lobby/{copy.id}/slabel.way", b"{}")

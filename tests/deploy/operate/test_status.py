@@ -18,7 +18,7 @@ from hippodrome.model import server
 from hippodrome.model.server import Reason, ServerState
 from hippodrome.servers.causes import Cause
 from protocol.keys import session_key
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 from testing.studies import study
 from tests.deploy.certificates import chain
 from tests.deploy.installation import Installed, installed, process  # noqa: F401
@@ -173,7 +173,7 @@ def test_servers_of_sessions_are_told_with_the_number_of_their_members(world: In
     for session in (formed, ahead):
         world.record(session, project=pairs)
     members = (Member("person-1", None, 0), Member("person-2", None, 1))
-    world.put(session_key("maze", formed), Session(formed, 2, members).to_json())
+    world.put(session_key("maze", formed), SessionDocument(formed, 2, members).to_json())
     found = look(world, capsys)["servers"]["open"]
     assert sorted((one["session"], one["members"]) for one in found) == [(True, 0), (True, 2)]
     text = world.run(capsys, "status").out

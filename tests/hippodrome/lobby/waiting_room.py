@@ -23,7 +23,7 @@ from hippodrome.model.server import ServerState, new_attempt
 from hippodrome.model.server import key as server_key
 from hippodrome.ports import Topic
 from hippodrome.storage.repository import Repository
-from protocol.session import Session
+from protocol.session import SessionDocument
 from testing.fake_platform import FakePlatform
 from testing.studies import study
 
@@ -78,7 +78,7 @@ class WaitingRoom:
     def membership(self, user: str) -> Membership | None:
         return self.repository.membership(self.project.id, user)
 
-    def session(self, user: str) -> Session:
+    def session(self, user: str) -> SessionDocument:
         """The session in which the participant is."""
         membership = self.membership(user)
         assert membership is not None

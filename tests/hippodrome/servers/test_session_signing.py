@@ -11,7 +11,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.server import Reason, Server
 from hippodrome.servers.signing import STORE_AFTER_CLOSE
 from protocol.keys import handover_key, session_key, session_recordings_folder
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 from testing.studies import study
 from tests.hippodrome.servers.test_signing import PRIVKEY, WARM_ID, World, get, put
 
@@ -40,7 +40,7 @@ def claim(world: World, session: str = SESSION, attempt: int = 1) -> Server:
 
 def form(world: World, *users: str) -> None:
     members = tuple(Member(user, None, seat) for seat, user in enumerate(users))
-    world.documents.keep(DOCUMENT, Session(SESSION, 2, members).to_json())
+    world.documents.keep(DOCUMENT, SessionDocument(SESSION, 2, members).to_json())
 
 
 def ask(world: World, *wishes: dict[str, Any], record: Server | None = None, name: str = "") -> int:

@@ -25,7 +25,7 @@ from lambdas import send_start_server_message, send_stop_server_message
 from protocol import handover
 from protocol.handover import Handover
 from protocol.keys import answer_key, handovers_folder, membership_key, session_key
-from protocol.session import Member, Session, member_token
+from protocol.session import Member, SessionDocument, member_token
 from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
@@ -56,7 +56,7 @@ def servers(platform: FakePlatform) -> Servers:
 def form(platform: FakePlatform, session: str = SESSION, users: tuple[str, ...] = MEMBERS) -> None:
     """What the lobby writes when a session is formed."""
     members = tuple(Member(user, None, seat) for seat, user in enumerate(users))
-    platform.documents.put(session_key("maze", session), Session(session, 2, members).to_json())
+    platform.documents.put(session_key("maze", session), SessionDocument(session, 2, members).to_json())
     for seat, user in enumerate(users):
         seated = {"session": session, "seat": seat, "unmatched": False}
         platform.documents.put(membership_key("maze", user), json.dumps(seated).encode())
@@ -244,7 +244,7 @@ def test_a_server_that_was_started_ahead_is_replaced_too(platform: FakePlatform,
 
 def test_a_member_whose_data_were_erased_is_waited_for_no_longer(platform: FakePlatform, servers: Servers) -> None:
     form(platform)
-    one = Session(SESSION, 2, (Member("", None, 0), Member("bob", None, 1)))
+    one = SessionDocument(SESSION, 2, (Member("", None, 0), Member("bob", None, 1)))
     platform.documents.put(session_key("maze", SESSION), one.to_json())
     servers.start(START)
     answer(platform, "bob", "1", "2", "3")

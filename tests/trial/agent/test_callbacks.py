@@ -17,7 +17,7 @@ from tests.trial.client_messages import play_to_the_end
 from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
-from trial.agent.callbacks import MOST_VALUES, About, Callbacks, SessionView, listening
+from trial.agent.callbacks import MOST_VALUES, About, Callbacks, Session, listening
 from trial.recordings import recording
 
 ABOUT = About("trial-1", "3", 1)
@@ -483,6 +483,6 @@ def test_the_callbacks_of_the_documentation_run(tmp_path):
     assert [line["name"] for line in lines(callbacks)] == ["furthest", "on_episode_end"]
     for name in NAMES:
         assert f"`{name}(session" in text
-    for field in dataclasses.fields(SessionView):
+    for field in dataclasses.fields(Session):
         assert f"`{field.name}" in text
     callbacks.close()

@@ -22,7 +22,7 @@ from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, Topic
-from protocol.session import Member, Session
+from protocol.session import Member, SessionDocument
 
 READY = 420.0  # seconds until a server must be ready, a lost attempt included
 SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
@@ -54,7 +54,7 @@ class Timer:
         if self.user != self._bot:
             copy = self._scene.copy
             copy.users.append(self.user)
-            session = Session(self.user, copy.players, (Member(self._bot, None, 0),))
+            session = SessionDocument(self.user, copy.players, (Member(self._bot, None, 0),))
             write_session(self._scene.platform.documents, copy.id, session)
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
