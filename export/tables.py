@@ -24,7 +24,7 @@ from protocol.session import is_session_id
 
 EPISODES = (
     Column("participant"),
-    Column("step"),
+    Column("studyStep"),
     Column("attempt", "whole"),
     Column("trial"),
     Column("episode", "whole"),

@@ -50,6 +50,9 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     assert table["3.score"].to_pylist() == [12.5, 12.5, 12.5, None]
     episodes = place.rows("episodes")
     assert [row["participant"] for row in episodes] == users[:3]
+    joined = {"participant", "studyStep", "attempt", "trial", "episode"}
+    assert joined <= set(episodes[0]) & set(pq.read_schema(place.out / episodes[0]["file"]).names)
+    assert (episodes[0]["studyStep"], "step" in episodes[0]) == ("3", False), "a recording's step is another thing"
     assert (episodes[0]["frames"], episodes[0]["score"], episodes[0]["seed"]) == ("5", "7.5", "41")
     assert pq.read_metadata(place.out / episodes[0]["file"]).num_rows == 7
     on_disk = {p.relative_to(place.out).as_posix() for p in place.out.rglob("*") if p.is_file()}
