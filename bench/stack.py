@@ -40,7 +40,7 @@ def applies() -> Iterator[Row]:
 
 def _apply(world: MinistackWorld, *options: str) -> float:
     begun = time.monotonic()
-    ran = world.deploy("apply", *options, "--yes")
+    ran = world.deploy("apply", *options, "--yes", anew=True)
     if ran.code:
         raise RuntimeError(f"apply ended with {ran.code}: {ran.err[-500:]}")
     return time.monotonic() - begun

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import hashlib
 import importlib
 import io
 import json
@@ -30,7 +31,11 @@ ROOT = Path(__file__).resolve().parents[1]
 LOADED = ("trial.__main__", "gymnasium", "local.__main__", "local.check.__main__", "local.rehearsal.__main__")
 AGENT = "local.check.agent_process"
 EXPERIMENT = "experiment.py"
-_COMMANDS = ("operate.doctor", "operate.status", "operate.logs", "operate.stop", "operate.data", "cost.cost")
+_COMMANDS = (
+    *("operate.doctor", "operate.status", "operate.logs", "operate.stop", "operate.data", "cost.cost"),
+    *("lifecycle.up", "lifecycle.destroy"),  # and with `up` all that it does: plan, apply, certificate, register
+)
+_SIZE = ("COLUMNS", "TERM")  # variables that consoles read when they are made
 OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     AGENT: ((AGENT,), {"PYTHONDONTWRITEBYTECODE": "1"}),  # nothing else: it reports what an agent has loaded
     "deploy": (
@@ -114,16 +119,18 @@ def start(
     start_new_session: bool = False,
     safe_path: bool = False,
     starts: bool = False,
+    copied: bool = False,
 ) -> Forked | subprocess.Popen[str]:
     """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's, and `safe_path` is Python's -P.
 
     A process that `starts` others by this function has them forked by the process that forked it.
+    Where the project in `cwd` is `copied`, its own modules are loaded; if its code has changed since, they are loaded again.
 
     A `module` that ends with `.py` is a script in `cwd`: `python SCRIPT ARGUMENTS`.
     `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
     """
     kind = module if module in OTHERS else ""
-    if not hasattr(os, "pidfd_open") or _of_python(env) != _of_python(_environment(kind)):
+    if not hasattr(os, "pidfd_open") or not (copied or _of_python(env) == _of_python(_environment(kind))):
         return subprocess.Popen(
             [
                 sys.executable,
@@ -164,7 +171,8 @@ def start(
             "safe_path": safe_path,
             "starts": starts,
         }
-        socket.send_fds(_forker(kind), [json.dumps(request).encode()], [theirs.fileno(), *fds])
+        forker = _forker_of_copy(kind, cwd, env) if copied else _forker(kind)
+        socket.send_fds(forker, [json.dumps(request).encode()], [theirs.fileno(), *fds])
     return Forked(ours, reading)
 
 
@@ -197,13 +205,38 @@ def _forker(kind: str) -> socket.socket:
     """The process that forks these (one of `OTHERS`, or empty); it ends with the tests."""
     if _asks_at and not kind:
         return socket.socket(fileno=int(_asks_at))
+    return _new_forker(kind, ROOT, _environment(kind))
+
+
+def _forker_of_copy(kind: str, root: Path, env: Mapping[str, str]) -> socket.socket:
+    """The same for the copy of the project in `root`, as its code is now."""
+    read = _of_python(env) | {name: env[name] for name in _SIZE if name in env}
+    return _forker_of_code(kind, root, tuple(sorted(read.items())), _state_of_code(root))
+
+
+@functools.cache
+def _forker_of_code(kind: str, root: Path, read: tuple[tuple[str, str], ...], _code: str) -> socket.socket:
+    others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON") and name not in _SIZE}
+    return _new_forker(kind, root, {**others, **dict(read)})
+
+
+def _state_of_code(root: Path) -> str:
+    """Another one whenever a module below `root` has changed."""
+    files = ((str(path), path.stat()) for path in sorted(root.rglob("*.py")))
+    return hashlib.sha256(repr([(path, s.st_mtime_ns, s.st_size) for path, s in files]).encode()).hexdigest()
+
+
+def _new_forker(kind: str, root: Path, env: Mapping[str, str]) -> socket.socket:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     with theirs:
         subprocess.Popen(
-            [sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), *(OTHERS[kind][0] if kind else LOADED)],
+            [
+                *(sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), str(root)),
+                *(OTHERS[kind][0] if kind else LOADED),
+            ],
             cwd=ROOT,
-            env=_environment(kind),
+            env=env,
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
         )
@@ -288,8 +321,9 @@ def _text(number: int, errors: str) -> io.TextIOWrapper:
 def _main() -> dict[str, Any] | None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests'; they end this process
     before = dict(os.environ)
+    sys.path[0] = sys.argv[2]
     with socket.socket(fileno=int(sys.argv[1])) as requests:
-        for name in sys.argv[2:]:
+        for name in sys.argv[3:]:
             importlib.import_module(name)
             if name == AGENT or name.endswith(".__main__"):
                 del sys.modules[name]  # it runs as the main module

@@ -168,6 +168,31 @@ def test_one_that_starts_another_has_it_forked_by_the_same(tmp_path: Path) -> No
     assert json.loads(again.communicate(timeout=20)[0])[1] == own, "who asked has gone, and the next one asks too"
 
 
+PART = "import os; WORD, PID, WIDTH = {word!r}, os.getpid(), os.environ['COLUMNS']"
+WHOLE = "import os, part, sys; print(part.WORD, part.WIDTH, part.PID, part.PID == os.getpid(), sys.argv[1:])"
+
+
+def test_of_a_copy_of_the_project_the_code_is_loaded_as_it_is_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(preloaded.OTHERS, "whole", (("part",), {}))
+    (tmp_path / "whole.py").write_text(WHOLE)
+    loaded_by = []
+    for word, width in [("first", "80"), ("", "80"), ("", "160"), ("changed", "80")]:
+        if word:
+            (tmp_path / "part.py").write_text(PART.format(word=word))
+        env = {"PATH": os.environ["PATH"], "COLUMNS": width, "PYTHONDONTWRITEBYTECODE": ""}
+        process = preloaded.start(
+            "whole", ["x"], cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, copied=True
+        )
+        assert isinstance(process, preloaded.Forked)
+        said = process.communicate(timeout=20)[0].split()
+        assert (said[:2], said[3:]) == ([word or "first", width], ["False", "['x']"])
+        loaded_by.append(said[2])
+    assert loaded_by[0] == loaded_by[1], "it is loaded once"
+    assert len({*loaded_by}) == 3, "and again for other code, or for a console of another size"
+
+
 AGENT_TELLS = """
 import json, os, sys
 class Agent:

@@ -89,7 +89,8 @@ def applied(world: MinistackWorld) -> Applied:
     before = world.inventory()
     # Gap: the emulator has no name servers, so wherever the tests can ask DNS the domain is not delegated.
     return Applied(
-        before, world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes", "--anyway")
+        before,
+        world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes", "--anyway", anew=True),
     )
 
 
