@@ -132,6 +132,7 @@ class _Tree:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._read: dict[Path, bytes] = {}
+        self._sources: dict[str, SourceModule | None] = {}  # functions share most modules
 
     def handlers(self) -> list[str]:
         found = []
@@ -142,8 +143,11 @@ class _Tree:
         return found
 
     def sources(self, module: str) -> SourceModule | None:
-        path = self._path(module)
-        return SourceModule(self._body(path).decode(), path.name == "__init__.py") if path else None
+        if module not in self._sources:
+            path = self._path(module)
+            source = SourceModule(self._body(path).decode(), path.name == "__init__.py") if path else None
+            self._sources[module] = source
+        return self._sources[module]
 
     def files(self, module: str) -> Iterator[ZipMember]:
         """The module's own file, and the files that it reads at run time."""

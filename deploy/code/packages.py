@@ -22,14 +22,18 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from email.parser import HeaderParser
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from console import screen
 from console.problem import Problem
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[2]
 PINS = ROOT / "requirements" / "packages.txt"
@@ -152,12 +156,17 @@ class Wheel:
 
     def needs(self, target: Target) -> set[str]:
         """The distributions that it needs on that target, by normalized name. Extras are not followed."""
-        from packaging.requirements import Requirement
         from packaging.utils import canonicalize_name
 
-        lines = HeaderParser().parsestr(self._text("METADATA")).get_all("Requires-Dist") or []
-        wanted = [Requirement(line) for line in lines]
+        wanted = self._requirements
         return {canonicalize_name(one.name) for one in wanted if not one.marker or one.marker.evaluate(target.markers)}
+
+    @cached_property
+    def _requirements(self) -> Sequence[Requirement]:
+        from packaging.requirements import Requirement
+
+        lines = HeaderParser().parsestr(self._text("METADATA")).get_all("Requires-Dist") or []
+        return [Requirement(line) for line in lines]
 
     def check(self) -> None:
         """Compare every file with RECORD. Raises `Problem`."""

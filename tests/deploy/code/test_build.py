@@ -50,6 +50,21 @@ def test_every_handler_becomes_a_function(built: dict[str, build.Function]) -> N
     assert "web" not in built
 
 
+def test_what_functions_share_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = build._Tree(packages.ROOT)
+    assert tree.sources("lambdas.web") is tree.sources("lambdas.web")
+    read, text = [], packages.Wheel._text
+
+    def reading(self: packages.Wheel, name: str) -> str:
+        read.append((self.path, name))
+        return text(self, name)
+
+    monkeypatch.setattr(packages.Wheel, "_text", reading)
+    build.functions(HERE)
+    assert any(name == "METADATA" for _, name in read)
+    assert len(read) == len(set(read))
+
+
 def test_each_carries_only_what_it_imports(built: dict[str, build.Function]) -> None:
     assert "web/frame.html" in names(built["next_step"])
     assert "lambdas/web.py" in names(built["next_step"])
