@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from typing import Any
 from urllib.parse import urlencode
 
@@ -31,6 +31,7 @@ from hippodrome.config import read_project
 from hippodrome.model import server
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.servers import dns
+from testing.certificates import authority
 from testing.simulation import hippo
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
@@ -280,7 +281,7 @@ def calls_of_the_trial() -> Iterator[Row]:
         project, now = study(id="bench"), bucket.now()
         record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="bench", nonce="bench")
         files = location(record.domain, bucket.settings.root_domain)
-        for key, pem in zip((files.fullchain, files.privkey), _certificate(), strict=True):
+        for key, pem in zip((files.fullchain, files.privkey), authority().issue("localhost"), strict=True):
             bucket.documents.put(key, pem)
         told = bucket.told(bucket.keep(record))
         trial = {"game": "ALE/MsPacman-v5", "maxEpisodes": 1, "ui": {"start": True, "stop": True}}
@@ -326,29 +327,3 @@ async def _play(port: int, step: str) -> None:
                 if not stopped and time.monotonic() > end:
                     await ws.send('{"command": "stop"}')
                     stopped = True
-
-
-def _certificate() -> tuple[bytes, bytes]:
-    """A certificate for a few minutes, and its key."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import NameOID
-
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
-    now = datetime.now(UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - MINUTE)
-        .not_valid_after(now + 30 * MINUTE)
-        .sign(key, hashes.SHA256())
-    )
-    private = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    return made.public_bytes(serialization.Encoding.PEM), private

@@ -5,6 +5,7 @@ Events and requests
     `visitors`        `Browser` and `Program` send a participant's requests and read pages, in the same process
     `browser`         the same in a real Chromium
     `files`           writes the files of a folder
+    `certificates`    an authority and what it issues
     `ports`           a port for a server that is started again where it was
     `studies`         small projects; `derived` what the installation derives from its secret
     `servers`         starts, registers and stops servers without events

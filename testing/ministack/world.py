@@ -6,7 +6,6 @@ What ministack does not do as AWS does stands here and in `emulator.py`, beside 
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import json
 import os
 import re
@@ -20,18 +19,16 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import boto3
 import httpx
 from botocore.config import Config
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 
 from testing import aws_events, preloaded, template
+from testing.certificates import authority
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCOUNT = "123456789012"
@@ -69,23 +66,12 @@ def until(look: Callable[[], T], what: str, seconds: float = 60) -> T:
     return found
 
 
-def _certificate(folder: Path) -> tuple[Path, Path]:
-    """A certificate for 127.0.0.1 that signs itself, and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "ministack")])
-    names = [x509.IPAddress(ipaddress.ip_address("127.0.0.1")), x509.DNSName("localhost")]
-    now = datetime.now(UTC)
-    made = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now, now + timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    pem = serialization.Encoding.PEM
-    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    files = folder / "tls.pem", folder / "tls.key"
-    files[0].write_bytes(made.public_bytes(pem))
-    files[1].write_bytes(secret)
+def _certificates(folder: Path) -> tuple[Path, Path, Path]:
+    """The files of an authority's certificate, of a certificate of its for loopback, and of its key."""
+    made = authority("ministack", days=1)
+    files = folder / "ca.pem", folder / "tls.pem", folder / "tls.key"
+    for file, content in zip(files, (made.certificate, *made.issue("localhost", "127.0.0.1")), strict=True):
+        file.write_bytes(content)
     return files
 
 
@@ -117,7 +103,7 @@ class MinistackWorld:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.endpoint = f"https://127.0.0.1:{self.port}"
-        self.ca, key = _certificate(self.home)
+        self.ca, certificate, key = _certificates(self.home)
         self.tls = ssl.create_default_context(cafile=str(self.ca))
         scratch = self.home / "tmp"
         scratch.mkdir()
@@ -136,7 +122,7 @@ class MinistackWorld:
             "AWS_ACCESS_KEY_ID": ROOT_KEYS[0],
             "AWS_SECRET_ACCESS_KEY": ROOT_KEYS[1],
             "USE_SSL": "1",  # buckets refuse what is not TLS
-            "MINISTACK_SSL_CERT": str(self.ca),
+            "MINISTACK_SSL_CERT": str(certificate),
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(self.ca),
             "DECISIONS": str(self._decisions),

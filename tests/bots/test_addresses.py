@@ -12,7 +12,7 @@ import pytest
 
 from bots.addresses import THIS_MACHINE, AddressRefused, AllowedAddresses, OneSite
 from bots.bot import Bot
-from tests.deploy.certificates import signed
+from testing.certificates import authority
 
 SITE = "study.example.org"
 SERVER = "s" + "a" * 20 + "-1"
@@ -109,11 +109,12 @@ class Site:
     """A site on loopback, over TLS, that answers what it is told to; `dialled` is where bots connected to."""
 
     def __init__(self, folder: Path) -> None:
-        authority, certificate, key = signed(SITE, "*.servers.example.org")
-        (folder / "cert.pem").write_bytes(certificate + key)
+        made = authority()
+        issued = made.issue(SITE, "*.servers.example.org")
+        (folder / "cert.pem").write_bytes(issued.certificate + issued.key)
         self._own = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         self._own.load_cert_chain(folder / "cert.pem")
-        self._theirs = ssl.create_default_context(cadata=authority.decode())
+        self._theirs = ssl.create_default_context(cadata=made.certificate.decode())
         self.answers: dict[str, str] = {}  # by method: the whole answer
         self.dialled: list[str] = []
 

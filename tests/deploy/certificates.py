@@ -29,27 +29,3 @@ def chain(*names: str, days: float = 60, issuer: str = "R12", lifetime: float = 
     if names:
         made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName(name) for name in names]), critical=False)
     return made.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-
-
-def signed(*names: str) -> tuple[bytes, bytes, bytes]:
-    """An authority's certificate, a certificate of its for these names that is good today, and its key: all PEM."""
-    now, ca_name = datetime.now(UTC), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Test authority")])
-    ca_key, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
-
-    def builder(subject: x509.Name, public: ec.EllipticCurvePublicKey) -> x509.CertificateBuilder:
-        made = x509.CertificateBuilder(ca_name, subject, public, x509.random_serial_number())
-        return made.not_valid_before(now - timedelta(hours=1)).not_valid_after(now + timedelta(days=60))
-
-    authority = builder(ca_name, ca_key.public_key()).add_extension(
-        x509.BasicConstraints(ca=True, path_length=0), critical=True
-    )
-    own = builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, names[0])]), key.public_key()).add_extension(
-        x509.SubjectAlternativeName([x509.DNSName(name) for name in names]), critical=False
-    )
-    pem = serialization.Encoding.PEM
-    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    return (
-        authority.sign(ca_key, hashes.SHA256()).public_bytes(pem),
-        own.sign(ca_key, hashes.SHA256()).public_bytes(pem),
-        secret,
-    )

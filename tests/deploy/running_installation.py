@@ -51,7 +51,7 @@ from lambdas import (
     update_project_master_list,
 )
 from testing import aws_events, preloaded
-from tests.deploy.certificates import signed
+from testing.certificates import authority
 from tests.deploy.installation import KEYS, ROOT, Installed
 from tests.deploy.registering import _stream
 
@@ -110,8 +110,9 @@ class RunningInstallation(Installed):
         self._stack.callback(botocore.handlers.BUILTIN_HANDLERS.remove, ours)
         installed.use(self.platform)
         self._stack.callback(installed.use, None)
-        authority, certificate, key = signed(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
-        self.authority = authority
+        made = authority()
+        self.authority = made.certificate
+        certificate, key = made.issue(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         SecretCache(self.platform.documents).get_or_create()  # there is one once a server has started
         files = location(self.platform.settings.servers_domain, self.root_domain)
         self.put(files.fullchain, certificate)
@@ -315,6 +316,8 @@ def _site(world: RunningInstallation, folder: Path, pem: bytes) -> http.server.T
     """The participants' site over TLS, as API Gateway hands it to `next_step`."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
+        timeout = 60  # seconds; a client that stops in the midst of its handshake keeps nothing from ending
+
         def do_GET(self) -> None:
             self._answer("http_get")
 
@@ -347,7 +350,8 @@ def _site(world: RunningInstallation, folder: Path, pem: bytes) -> http.server.T
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(folder / "site.pem")
     made = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    made.socket = context.wrap_socket(made.socket, server_side=True)
+    # Each client's handshake takes place in the thread of its request, not in the one that accepts all.
+    made.socket = context.wrap_socket(made.socket, server_side=True, do_handshake_on_connect=False)
     return made
 
 

@@ -8,6 +8,7 @@ environments, and what a `.dockerignore` in the folder names (Docker's own rules
 from __future__ import annotations
 
 import fnmatch
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -53,10 +54,8 @@ def project_files(folder: Path) -> dict[str, Path]:
 
 def inside(folder: Path, path: Path) -> bool:
     """Whether the path leads into the folder, also through links."""
-    try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a link that leads to itself
-        return False
+    real = _without_links(path)
+    return real is not None and real.is_relative_to(folder.resolve())
 
 
 class Ignore:
@@ -164,12 +163,21 @@ def _apps(root: Path) -> list[Path]:
     return [root / app for app in layout.APPS]
 
 
+def _without_links(path: Path) -> Path | None:
+    """The path as it is without links; None if one of them leads to itself, or cannot be followed."""
+    try:
+        return Path(os.path.realpath(path, strict=True))  # Path.resolve takes a circle for a path from Python 3.13 on
+    except FileNotFoundError:
+        return path.resolve()
+    except OSError:
+        return None
+
+
 def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
     """The file behind the path, which may be a link. Raises `Problem` where a link leads to what must not be there."""
-    try:
-        real = path.resolve()
-    except (OSError, RuntimeError):
-        raise Problem(f"{name} is a link that leads to itself.", "Remove it.") from None
+    real = _without_links(path)
+    if real is None:
+        raise Problem(f"{name} is a link that leads to itself.", "Remove it.")
     if path.is_symlink():
         if not real.is_relative_to(root):
             raise Problem(

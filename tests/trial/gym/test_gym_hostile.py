@@ -105,7 +105,7 @@ def test_what_is_no_request_gets_a_sentence(asking: TextClient, message: str | b
 def test_parameters_that_a_method_does_not_take_are_named(asking: TextClient, params: str, reason: str) -> None:
     kind, sentence = refused(json.loads(asking.say(f'{{"method": "step", "params": {params}}}')))
     assert kind == "WrongParameters"
-    assert sentence.endswith(f"are wrong: {reason}")
+    assert f"are wrong: {reason}" in sentence  # newer Pythons ask whether a similar name was meant
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,93 @@
+"""Certificate authorities for tests and benches, with all that RFC 5280 asks for: from 3.13 on, Python's clients check it."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+_AGO = timedelta(hours=1)  # since when all of them are valid
+_SIGNS = x509.KeyUsage(
+    digital_signature=False,
+    content_commitment=False,
+    key_encipherment=False,
+    data_encipherment=False,
+    key_agreement=False,
+    key_cert_sign=True,
+    crl_sign=False,
+    encipher_only=False,
+    decipher_only=False,
+)
+
+
+class Issued(NamedTuple):
+    """A certificate and its key, both PEM."""
+
+    certificate: bytes
+    key: bytes
+
+
+@dataclass(frozen=True)
+class Authority:
+    """Who signs. Its certificate, PEM, is what clients trust."""
+
+    certificate: bytes
+    _name: x509.Name
+    _key: ec.EllipticCurvePrivateKey
+
+    def issue(self, *names: str, serial: int | None = None, days: float = 60) -> Issued:
+        """A certificate for these names and addresses."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        made = _builder(_named(names[0]), key.public_key(), days, serial).issuer_name(self._name)
+        made = made.add_extension(x509.SubjectAlternativeName([_general(name) for name in names]), critical=False)
+        made = made.add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
+        )
+        secret = key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+        return Issued(_pem(made.sign(self._key, hashes.SHA256())), secret)
+
+
+def authority(name: str = "Test authority", days: float = 60) -> Authority:
+    """A new authority."""
+    key, own = ec.generate_private_key(ec.SECP256R1()), _named(name)
+    made = _builder(own, key.public_key(), days).issuer_name(own)
+    made = made.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    made = made.add_extension(_SIGNS, critical=True)
+    made = made.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    return Authority(_pem(made.sign(key, hashes.SHA256())), own, key)
+
+
+def _builder(
+    subject: x509.Name, public: ec.EllipticCurvePublicKey, days: float, serial: int | None = None
+) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .public_key(public)
+        .serial_number(serial or x509.random_serial_number())
+        .not_valid_before(now - _AGO)
+        .not_valid_after(now + timedelta(days=days))
+    )
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+
+
+def _general(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)
+
+
+def _pem(made: x509.Certificate) -> bytes:
+    return made.public_bytes(serialization.Encoding.PEM)
