@@ -5,13 +5,16 @@ Everything is read from the state a row at a time, so that memory does not grow 
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from export import scrub
+from export.page_fields import FieldKind
 from export.recording_columns import when
 from export.scrub import clean, texts
 from export.state import ExportedParticipant, ExportState
@@ -34,16 +37,18 @@ class Field:
     place: int  # the order of appearance
     count: int = 0
     kinds: set[str] = field(default_factory=set)
+    asked: FieldKind = FieldKind.TEXT  # what the page says that it sends
 
     @property
     def type(self) -> str:
         """The narrowest type that holds them all; else text, with JSON for what is none."""
-        if self.kinds <= {*_SENT_NUMBERS, _EMPTY} and self.kinds != {_EMPTY}:
-            return "number" if "number as text" in self.kinds else "whole"
-        kinds = {"text" if kind in (*_SENT_NUMBERS, _EMPTY) else kind for kind in self.kinds}
+        numbers = {*_SENT_NUMBERS, *_TYPED_NUMBERS} if self.asked is FieldKind.NUMBER else {*_SENT_NUMBERS}
+        if self.kinds <= {*numbers, _EMPTY} and (self.kinds != {_EMPTY} or self.asked is FieldKind.NUMBER):
+            return "number" if self.kinds & {"number as text", "number as typed"} else "whole"
+        kinds = {"text" if kind in (*_SENT_NUMBERS, *_TYPED_NUMBERS, _EMPTY) else kind for kind in self.kinds}
         if "other" in kinds:
             return "text"
-        if "texts" in kinds:
+        if "texts" in kinds or (self.asked is FieldKind.LIST and kinds == {"text"}):
             return "texts" if kinds <= {"text", "texts"} else "text"
         if kinds == {"whole", "number"}:
             return "number"
@@ -61,7 +66,14 @@ class Moved(NamedTuple):
 class StudyAnswers:
     """All answers of a study. Made by one pass that finds the columns; the tables are further passes."""
 
-    def __init__(self, state: ExportState, project: Project | None, apart: bool) -> None:
+    def __init__(
+        self,
+        state: ExportState,
+        project: Project | None,
+        apart: bool,
+        asked: Mapping[tuple[str, str], FieldKind] = MappingProxyType({}),
+    ) -> None:
+        """`asked` is what the study's pages say of their fields (`page_fields`), by step and name."""
         self._state = state
         self._project = project
         self._apart = apart
@@ -79,7 +91,8 @@ class StudyAnswers:
                 steps.add(step)
                 self._count_page(pages.setdefault(step, Counter()), step, answers)
                 for name, value in _fields(answers).items():
-                    seen = fields.setdefault((step, name), Field(len(fields)))
+                    new = Field(len(fields), asked=asked.get((step, name), FieldKind.TEXT))
+                    seen = fields.setdefault((step, name), new)
                     seen.count += 1
                     seen.kinds.add(_kind(value))
             for name in texts(participant.document.get("link")):
@@ -260,7 +273,12 @@ def _group(document: Mapping[str, Any]) -> int | None:
 
 
 _SENT_NUMBERS = ("whole as text", "number as text")
+_TYPED_NUMBERS = ("whole as typed", "number as typed")
+"""Such as 07 and 2.50: numbers if a field for numbers has sent them, and perhaps codes if another has."""
 _EMPTY = "empty text"
+_TYPED_WHOLE = re.compile(r"-?[0-9]{1,15}", re.ASCII)
+_TYPED = re.compile(r"-?(?:[0-9]{1,15}(?:\.[0-9]{1,17})?|\.[0-9]{1,17})(?:[eE][+-]?[0-9]{1,3})?", re.ASCII)
+"""HTML's "valid floating-point number", which a field for numbers sends; those with more digits stay texts."""
 _VERSION = re.compile(r"-[0-9]+\Z", re.ASCII)  # of a page for a group
 _WHOLE = re.compile(r"-?[1-9][0-9]{0,15}|0", re.ASCII)
 _DECIMAL = re.compile(r"-?[0-9]{1,16}\.[0-9]{1,17}", re.ASCII)
@@ -287,7 +305,9 @@ def _kind_of_text(text: str) -> str:
         return "whole as text" if abs(int(text)) <= 2**53 else "text"
     if _DECIMAL.fullmatch(text) and repr(float(text)) == text != "-0.0":
         return "number as text"
-    return "text"
+    if _TYPED_WHOLE.fullmatch(text):
+        return "whole as typed"
+    return "number as typed" if _TYPED.fullmatch(text) and math.isfinite(float(text)) else "text"
 
 
 def _only_common(fields: dict[tuple[str, str], Field]) -> None:

@@ -23,6 +23,7 @@ from export import datasets, fetch, keys, listing, manifest, table_files, tables
 from export.answers import StudyAnswers
 from export.fetch import Fetcher
 from export.listing import Tally, Wanted
+from export.page_fields import read_fields
 from export.source import FileGone, Source, TooLarge
 from export.state import ExportState, Kept
 from hippodrome.model.project import MASTER_LIST, Project, read_list
@@ -166,7 +167,7 @@ def _run(
     style = table_files.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
     with _bar("Writing tables") as told:
-        answers = StudyAnswers(state, project, options.apart)
+        answers = StudyAnswers(state, project, options.apart, read_fields(source, project))
         either = style if style.csv or style.parquet else table_files.Style(parquet=False)
         columns = answers.columns
         written += table_files.write(folder / "answers", columns, answers.rows(), either)

@@ -46,7 +46,9 @@ def test_nothing_is_cut_off_after_a_page(
     with world.recording() as calls:
         again = world.run(capsys, *arguments)
     assert again.json["run"]["unchanged"] == count
-    assert [call.params.get("Key") for call in calls if call.operation == "GetObject"] == ["project_master_list.json"]
+    pages_of_study = [made_of.PROJECT.page_key(file) for step in made_of.PROJECT.steps for file in step.files]
+    asked = [call.params.get("Key") for call in calls if call.operation == "GetObject"]
+    assert asked == ["project_master_list.json", *pages_of_study], "no answer is fetched twice"
 
 
 def test_a_bucket_and_a_folder_give_the_same(world: Installed, tmp_path: Path, capsys: Any) -> None:

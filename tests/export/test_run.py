@@ -18,6 +18,7 @@ from console.problem import Exit
 from deploy.__main__ import main
 from export import fetch, manifest
 from export.fetch import Fetcher
+from export.page_fields import fields_of
 from export.source import FileGone, Folder
 from hippodrome.model import warm_pool
 from hippodrome.model.records import to_json
@@ -72,6 +73,55 @@ def test_answers_from_another_page_than_their_step_has_now_are_told_apart(place:
     told = place.run().err
     assert "Step 2 is questionnaire now, and has 1 answer from about: column page.2 says which." in told
     assert "`finished` is by the steps as they are now." in told
+
+
+PAGE = """
+<input name="age" type="number"> <input type="range" name="mood" value="{{ answers["1"].mood }}">
+<input name="zip"> <input name="one" type="checkbox"> <INPUT type="CHECKBOX" name="pet" value="cat">
+<input name=pet type=checkbox value=dog> <select multiple name="days"><option>Mon</select> <select name="hand"></select>
+<input name="both" type="number"><textarea name="both"></textarea>
+"""
+
+
+def test_a_page_says_which_of_its_fields_send_numbers_and_which_lists() -> None:
+    kinds = fields_of(PAGE)
+    assert {name for name in kinds if kinds[name] == "number"} == {"age", "mood"}
+    assert {name for name in kinds if kinds[name] == "list"} == {"pet", "days"}
+    assert {name for name in kinds if kinds[name] == "text"} == {"zip", "one", "hand", "both"}
+
+
+def test_the_type_of_a_column_is_what_its_page_asks_for_whatever_was_sent_so_far(place: Place) -> None:
+    made_of.register(place.put)
+
+    def types(**sent: str | list[str]) -> dict[str, str]:
+        arrive(place.put, f"user-{len(place.rows()) if place.out.exists() else 0}", {"2": sent})
+        assert place.done()["counts"]["problems"] == 0
+        schema = pq.read_schema(place.out / "answers.parquet")
+        return {name: str(schema.field(f"2.{name}").type) for name in ("age", "mood", "zip", "pet") if name in sent}
+
+    first: dict[str, str | list[str]] = {"age": "31", "mood": "2.50", "zip": "90210", "pet": "cat"}
+    assert types(**first) == {"age": "int64", "mood": "string", "zip": "int64", "pet": "string"}  # there are no pages
+    place.put("maze/steps/questionnaire.html", PAGE.encode())
+    lists = "list<element: string>"
+    assert types(**first) == {"age": "int64", "mood": "double", "zip": "int64", "pet": lists}
+    assert pq.read_table(place.out / "answers.parquet")["2.pet"].to_pylist() == [["cat"], ["cat"]]
+    assert types(**first | {"age": "07", "mood": "1e3"}) == {
+        "age": "int64",
+        "mood": "double",
+        "zip": "int64",
+        "pet": lists,
+    }
+    assert types(**first | {"age": "1.50", "zip": "007"}) == {
+        "age": "double",
+        "mood": "double",
+        "zip": "string",
+        "pet": lists,
+    }
+    ages = pq.read_table(place.out / "answers.parquet")["2.age"].to_pylist()
+    assert ages == [31.0, 31.0, 7.0, 1.5]
+    assert [row["2.age"] for row in place.rows()] == ["31", "31", "07", "1.50"], "CSV has them as they were sent"
+    assert types(**first | {"age": "about 30"})["age"] == "string"  # no field for numbers has sent that
+    assert types(**first | {"age": "9" * 20})["age"] == "string"
 
 
 def test_what_callbacks_recorded_is_a_table(place: Place) -> None:
