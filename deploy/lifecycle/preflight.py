@@ -74,6 +74,8 @@ def look_at(checked: InstallationCheck) -> list[Finding]:
         checks |= _OF_ADDRESSES
     if domain_change.moves(checked.prepared):
         checks |= {"CAA": _authorities, "servers' names": _servers_names}
+    if (before.get("VpcId") or "") != after["VpcId"]:
+        checks["servers"] = _servers_that_run
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
         checks["network"] = _subnets
     if checked.prepared.existing is None:
@@ -247,11 +249,13 @@ def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
         yield of_problem("servers' names", problem)
 
 
-def _servers_that_store(checked: InstallationCheck) -> Iterator[Finding]:
-    try:
-        domain_change.check_site(checked.prepared)
-    except Problem as problem:
-        yield of_problem("servers", problem)
+def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
+    """They use the site's present address, and the present network."""
+    for check in (domain_change.check_site, domain_change.check_network):
+        try:
+            check(checked.prepared)
+        except Problem as problem:
+            yield of_problem("servers", problem)
 
 
 def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
@@ -272,7 +276,7 @@ _OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = 
     "domain": _delegation,
     "CAA": _authorities,
     "site": _site,
-    "servers": _servers_that_store,
+    "servers": _servers_that_run,
     "other stacks": _other_stacks,
 }
 

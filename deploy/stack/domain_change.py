@@ -1,4 +1,4 @@
-"""Moving the servers' names, or the site, of an existing installation: what must hold, and what comes first.
+"""Moving the servers' names, the site or the network of an existing installation: what must hold, and what comes first.
 
 Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
 that run keep their names and the certificate for those (`hippodrome.certificates.rules.location`). Servers get new
@@ -23,6 +23,11 @@ from hippodrome.certificates.rules import Verdict
 from hippodrome.model import ids
 from hippodrome.model.server import Server
 from hippodrome.ports import Settings
+
+_ENDING = (
+    "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end for good "
+    "when their study is closed (`python -m deploy register --no-live`)."
+)
 
 
 def moves(prepared: Prepared) -> bool:
@@ -60,8 +65,23 @@ def check_site(prepared: Prepared) -> None:
     if left := _running(prepared.account, before):
         raise Problem(
             f"Servers run that store their answers and recordings by way of {sites[0]}, which would be gone.",
-            "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end "
-            "for good when their study is closed (`python -m deploy register --no-live`).",
+            _ENDING,
+            [f"{len(left)} of them"],
+        )
+
+
+def check_network(prepared: Prepared) -> None:
+    """Check that no server runs in the present network, if that is given up for another. Raises `Problem`.
+
+    CloudFormation would take the servers' way out of the installation's own VPC, and then fail to delete what they use.
+    """
+    before = _before(prepared)
+    if before is None or (prepared.before.get("VpcId") or "") == prepared.parameters["VpcId"]:
+        return
+    if left := _running(prepared.account, before):
+        raise Problem(
+            "Servers run in the present network, which could not be removed, and they would lose their way out of it.",
+            _ENDING,
             [f"{len(left)} of them"],
         )
 

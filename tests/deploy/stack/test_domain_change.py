@@ -70,9 +70,9 @@ def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> 
 @pytest.mark.parametrize("state", [ServerState.STARTING, ServerState.READY, ServerState.DRAINING])
 def test_no_server_may_run_while_the_site_that_it_stores_through_changes(world: Installed, state: ServerState) -> None:
     world.record("alice", state)
-    for changed in ({"SiteHost": "lab"}, {"RootDomain": "pilot.example.org"}):
+    for moved in (prepared(world, SiteHost="lab"), prepared(world, RootDomain="pilot.example.org")):
         with pytest.raises(Problem, match=r"by way of study\.example\.org, which would be gone") as caught:
-            domain_change.check_site(prepared(world, **changed))
+            domain_change.check_site(moved)
         assert "deploy stop" in caught.value.advice
         assert caught.value.details == ("1 of them",)
     with world.recording() as calls:
@@ -82,9 +82,26 @@ def test_no_server_may_run_while_the_site_that_it_stores_through_changes(world: 
     domain_change.check_site(prepared(world, SiteHost="lab"))
 
 
-def test_an_apply_that_moves_the_site_looks_for_such_servers(world: Installed) -> None:
+def test_no_server_may_run_while_its_network_is_given_up(world: Installed) -> None:
     world.record("alice")
-    found = preflight.look_at(preflight.InstallationCheck(prepared(world, ServersHost="", SiteHost="lab", VpcId="")))
+    own = prepared(world, VpcId="")
+    with world.recording() as calls:
+        domain_change.check_network(own)
+    assert calls == []  # earlier versions had no such parameter, and a network of their own
+    with pytest.raises(Problem, match="lose their way out") as caught:
+        domain_change.check_network(prepared(world, VpcId="vpc-1"))
+    assert "deploy stop" in caught.value.advice
+    world.record("alice", ServerState.CLOSED)
+    domain_change.check_network(prepared(world, VpcId="vpc-1"))
+
+
+@pytest.mark.parametrize(("site", "vpc"), [("lab", ""), ("study", "vpc-1")])
+def test_an_apply_that_moves_the_site_or_the_network_looks_for_such_servers(
+    world: Installed, site: str, vpc: str
+) -> None:
+    world.record("alice")
+    moved = prepared(world, ServersHost="", SiteHost=site, VpcId=vpc, SubnetIds="subnet-1")
+    found = preflight.look_at(preflight.InstallationCheck(moved))
     assert [one.mark for one in found if one.check == "servers"] == [Mark.BAD]
 
 
