@@ -678,8 +678,7 @@ def test_over_https_browsers_are_told_to_stay_there_and_over_http_they_are_not(h
     said = []
     for headers in ({"x-forwarded-proto": "https"}, {"x-forwarded-proto": "http"}, {}):
         for query in ("", "projectId=maze&userId=alice", "projectId=maze"):
-            http = {"http": {"method": method, "path": "/next"}}
-            event = {"rawPath": "/next", "rawQueryString": query, "headers": headers, "requestContext": http}
+            event = aws_events.http_event(method, query, headers=headers)
             said.append((bool(headers), handler.handler(event, None)["headers"].get("Strict-Transport-Security")))
     assert said == [(True, "max-age=63072000")] * 3 + [(True, None)] * 3 + [(False, None)] * 3
     installed.use(None)

@@ -31,7 +31,7 @@ from local.backend.bus import Handler
 from local.backend.platform import LocalPlatform
 from local.backend.processes import end_everything, marked
 from local.publish import publish
-from testing import derived
+from testing import aws_events, derived
 from testing.os_faults import Killed, OsFault, OsFaultInjector
 from tests.local.conftest import write_study
 
@@ -148,15 +148,9 @@ class FaultyStudy:
         function: Handler = next_step.handler,
     ) -> dict[str, Any]:
         """A request, tried again until there is an answer."""
-        event = {
-            "version": "2.0",
-            "rawPath": "/next",
-            "rawQueryString": urlencode({"projectId": PROJECT, "userId": USER}),
-            "headers": {"accept": accept, "content-type": "application/x-www-form-urlencoded", "host": "localhost"},
-            "requestContext": {"http": {"method": method, "path": "/next"}},
-            "body": urlencode(form or {}),
-            "isBase64Encoded": False,
-        }
+        query = urlencode({"projectId": PROJECT, "userId": USER})
+        headers = {"accept": accept, "content-type": aws_events.FORM, "host": "localhost"}
+        event = aws_events.http_event(method, query, urlencode(form or {}), headers=headers)
         while True:
             self.check_time("no page comes")
             self.look()

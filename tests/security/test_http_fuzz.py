@@ -175,15 +175,7 @@ methods = st.sampled_from(["GET"] * 4 + ["POST"] * 6 + ["HEAD", "OPTIONS", "PUT"
 
 
 def _event(method: str, path: str, query: str, header: dict[str, str], body: str, coded: bool) -> dict[str, Any]:
-    return {
-        "version": "2.0",
-        "rawPath": path,
-        "rawQueryString": query,
-        "headers": header,
-        "requestContext": {"http": {"method": method, "path": path}},
-        "body": body,
-        "isBase64Encoded": coded,
-    }
+    return {**aws_events.http_event(method, query, body, path, header), "isBase64Encoded": coded}
 
 
 plain = {"accept": "text/html", "content-type": FORM}
