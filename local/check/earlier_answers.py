@@ -51,6 +51,21 @@ class EarlierAnswers:
         found = (name for text in texts for name in _answered(text)[0])
         return list(dict.fromkeys(found)), "\n".join(texts)
 
+    def fields_of(self, key: str) -> list[str] | None:
+        """The names of all that may be answered at an earlier step; None if that is not known.
+
+        It is not known where a script or Jinja may make fields, and of steps that are not done before the page.
+        """
+        step = next((step for step in self._steps if step.key == key), None)
+        if step is None or not (step.files or step.type.on_server):
+            return None
+        if step.type.on_server:
+            return [*_PLAYED, *_PLAYED_TOGETHER]
+        texts = [source_of(file) for file in step.files]
+        names = [control.name for text in texts for form in _forms(text) for control in form.controls if control.name]
+        unsure = any("<script" in text.lower() for text in texts) or any(spans.MARK in name for name in names)
+        return None if unsure else list(dict.fromkeys(names))
+
     def choices(self, field: str) -> int | None:
         """How many different answers a participant can give to a field; None if they write it, or a script makes it."""
         texts = self._texts()
@@ -88,6 +103,8 @@ class EarlierAnswers:
 
 
 _PLAYED = {"episodes": 1, "score": 1.5, "frames": 100, "seconds": 3.5, "trial": "t", "outcome": "finished"}
+
+_PLAYED_TOGETHER = ("scores", "session", "player")  # in games of several players
 
 
 def _forms(text: str) -> list[forms.Form]:

@@ -11,6 +11,7 @@ from jinja2.exceptions import SecurityError, TemplateRuntimeError, TemplateSynta
 from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments, sandbox
 from hippodrome.participants.sandbox import FragmentError
+from local.check.answers_named import check_answers_named
 from local.check.earlier_answers import EarlierAnswers
 from local.check.wording import short
 from protocol.answer import UNMATCHED
@@ -45,6 +46,7 @@ def check_template(
             strangers.remove(name.name)
             message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
+    yield from check_answers_named(label, parsed, earlier)
     for group in groups:
         for answers in earlier.answers(group):
             known = _nothing_known(config, group)

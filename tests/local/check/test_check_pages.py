@@ -67,6 +67,41 @@ def test_jinja_that_is_fine(folder: Path) -> None:
     assert looked(folder) == []
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{{ answers["1"].aeg }}', "step 1 has no answer aeg; did you mean age? (it has age, pets, go)"),
+        ("{{ answers['1']['mood'].x }}", "step 1 has no answer mood (it has age, pets, go)"),
+        ('{{ answers["2"].points }}', "step 2 has no answer points (it has episodes, score, "),
+        ("{% if answers[1].age %}{% endif %}", 'write answers["1"], with quotes'),
+    ],
+)
+def test_an_answer_that_nobody_can_have_given(folder: Path, text: str, said: str) -> None:
+    page(folder, ASKS)
+    page(folder, f"\n{text}", "bye")
+    (line,) = looked(folder)
+    assert line.startswith(f"steps/bye.html:2: remark: nothing is shown: {said}")
+
+
+ASKS = """<label>Age <input type="number" name="age"></label><textarea name="pets" aria-label="pets"></textarea>
+<button name="go" value="1">Go</button>"""
+
+
+def test_answers_that_may_have_been_given(folder: Path) -> None:
+    page(folder, ASKS)
+    page(
+        folder,
+        """{{ answers["1"].age }} {{ answers["1"]["pets"] }} {{ answers["1"].go }} {{ answers["1"].items() }}
+        {{ answers["2"].score }} {{ answers["2"].scores.red }} {{ answers["9"].x }} {{ answers["3"].own }} {{ answers[group] }}""",
+        "bye",
+    )
+    assert looked(folder) == []
+    for made in ("<script>document.title = 1</script>", '<input name="q{{ group }}" aria-label="q">'):
+        page(folder, ASKS + made)
+        page(folder, '{{ answers["1"].made }}', "bye")
+        assert looked(folder) == [], "its fields are not all known"
+
+
 def test_each_group_is_shown_its_page(folder: Path) -> None:
     (folder / "steps" / "hello.html").unlink()
     page(folder, "{{ 1 // group }}", "hello-0")
