@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +23,7 @@ from deploy.stack import cooldown, domain_change, states
 from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
 from deploy.stack.deletion import StackDeletion
 from deploy.stack.settings import StackSettings, taking_settings
-from deploy.stack.stack import GOOD, Stack
+from deploy.stack.stack import GOOD, Stack, role_is_new
 from hippodrome.aws import errors
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
 ROLE_PAUSE = 10  # seconds until a role that was just made is known
 ROLE_TRIES = 3
-_ROLE_IS_NEW = re.compile(r"Unable to assume the service linked role", re.IGNORECASE)
-"""CreateCluster's words where ECS's role was made a moment ago (1Password/scim-examples, issue 356)."""
 
 
 def _hint(python: str | None) -> None:
@@ -88,9 +85,9 @@ def apply(
     executor = Executor()
 
     def wait_for_role(error: Exception) -> bool:
-        if not isinstance(error, Problem) or not any(_ROLE_IS_NEW.search(line) for line in error.details):
+        if not isinstance(error, Problem) or not role_is_new(error):
             return False
-        screen.info(f"ECS does not know its role yet: once more in {ROLE_PAUSE} seconds.")
+        screen.info(f"AWS does not know a new role everywhere yet: once more in {ROLE_PAUSE} seconds.")
         executor.sleep(ROLE_PAUSE)
         return True
 

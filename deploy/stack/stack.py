@@ -28,6 +28,13 @@ _BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
 _OURSELVES = "AWS::CloudFormation::Stack"
 _BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
 _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
+_ROLE_IS_NEW = (
+    r"Unable to assume the service linked role|cannot be assumed by Lambda|"
+    r"CodeBuild is not authorized to perform: sts:AssumeRole|execution role does not have permissions to call"
+)
+"""What is said where IAM does not know a role or its policy everywhere yet: by CreateCluster (1Password/scim-examples,
+issue 356), CreateFunction (pulumi/pulumi-aws-native 148), CodeBuild's CreateProject (terraform-provider-aws 4233), and
+CreateEventSourceMapping (milliHQ/terraform-aws-next-js 138)."""
 
 
 @dataclass(frozen=True)
@@ -310,7 +317,10 @@ _ADVICE = (  # what is known to go wrong, and what helps
         r"QueueDeletedRecently|wait 60 seconds after deleting a queue",
         "Run the same command again in a minute: AWS keeps the names of deleted queues for so long.",
     ),
-    (r"service.linked role", "AWS makes that role now; run the same command again in a minute."),
+    (
+        rf"service.linked role|{_ROLE_IS_NEW}",
+        "AWS does not know that role everywhere yet; run the same command again in a minute.",
+    ),
     (
         r"is delegated|PENDING_VALIDATION|certificate.*(timed? ?out|validat)|CAA",
         "Delegate the domain to its hosted zone, and run the same command again.",
@@ -332,6 +342,11 @@ _ADVICE = (  # what is known to go wrong, and what helps
         "Run the same command again.",
     ),
 )
+
+
+def role_is_new(problem: Problem) -> bool:
+    """Whether something in a stack failed since a role, or the policy of one, was made a moment ago."""
+    return any(re.search(_ROLE_IS_NEW, line, re.IGNORECASE) for line in problem.details)
 
 
 def advice(failures: Sequence[FailedResource], details: Sequence[str] = ()) -> str:

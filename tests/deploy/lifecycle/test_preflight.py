@@ -452,7 +452,7 @@ def test_what_an_unfinished_destroy_has_left_is_named(world: World) -> None:
     assert "python -m deploy destroy --stack hippodrome" in found.advice
 
 
-# -- ECS's role --------------------------------------------------------------------------------------------------------
+# -- roles that were just made -----------------------------------------------------------------------------------------
 
 NOT_YET = (
     'Resource handler returned message: "Invalid request provided: CreateCluster Invalid Request: Unable to assume the '
@@ -462,6 +462,17 @@ UNKNOWN_ROLE = [
     ("CREATE_IN_PROGRESS", []),
     ("ROLLBACK_IN_PROGRESS", [("Cluster", "AWS::ECS::Cluster", "CREATE_FAILED", NOT_YET)]),
     ("ROLLBACK_COMPLETE", []),
+]
+OF_NEW_ROLES = [
+    ("AWS::Lambda::Function", "The role defined for the function cannot be assumed by Lambda."),
+    (
+        "AWS::CodeBuild::Project",
+        "CodeBuild is not authorized to perform: sts:AssumeRole on service role. Please verify",
+    ),
+    (
+        "AWS::Lambda::EventSourceMapping",
+        "Invalid request provided: The function execution role does not have permissions to call ReceiveMessage on SQS",
+    ),
 ]
 
 
@@ -501,6 +512,23 @@ def test_a_role_that_ecs_does_not_know_yet_is_waited_for(world: World, waits: li
     assert waits == [10, 10]
     assert world.cloud.stack is not None
     assert world.cloud.stack["StackStatus"] == "CREATE_COMPLETE"
+
+
+@pytest.mark.parametrize(("kind", "words"), OF_NEW_ROLES)
+def test_a_policy_that_is_not_known_everywhere_is_waited_for_in_an_update_too(
+    world: World, waits: list[float], kind: str, words: str, capsys: Capsys
+) -> None:
+    apply(world.account, "hippodrome", FIRST)
+    world.cloud.operations = [
+        [
+            ("UPDATE_IN_PROGRESS", []),
+            ("UPDATE_ROLLBACK_IN_PROGRESS", [("New", kind, "CREATE_FAILED", words)]),
+            ("UPDATE_ROLLBACK_COMPLETE", []),
+        ]
+    ]
+    assert apply(world.account, "hippodrome", StackSettings(max_runtime=60)).changed
+    assert waits == [10, 10]
+    assert "does not know a new role everywhere yet" in capsys.readouterr().err
 
 
 def test_nobody_waits_for_a_role_for_ever(world: World, waits: list[float]) -> None:
