@@ -33,7 +33,7 @@ class Issued(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Authority:
+class SigningAuthority:
     """Who signs. Its certificate, PEM, is what clients trust."""
 
     certificate: bytes
@@ -54,14 +54,14 @@ class Authority:
         return Issued(_pem(made.sign(self._key, hashes.SHA256())), secret)
 
 
-def authority(name: str = "Test authority", days: float = 60) -> Authority:
+def authority(name: str = "Test authority", days: float = 60) -> SigningAuthority:
     """A new authority."""
     key, own = ec.generate_private_key(ec.SECP256R1()), _named(name)
     made = _builder(own, key.public_key(), days).issuer_name(own)
     made = made.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     made = made.add_extension(_SIGNS, critical=True)
     made = made.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-    return Authority(_pem(made.sign(key, hashes.SHA256())), own, key)
+    return SigningAuthority(_pem(made.sign(key, hashes.SHA256())), own, key)
 
 
 def _builder(
