@@ -25,7 +25,7 @@ _SIGNS = x509.KeyUsage(
 )
 
 
-class Issued(NamedTuple):
+class CertificateAndKey(NamedTuple):
     """A certificate and its key, both PEM."""
 
     certificate: bytes
@@ -40,7 +40,7 @@ class SigningAuthority:
     _name: x509.Name
     _key: ec.EllipticCurvePrivateKey
 
-    def issue(self, *names: str, serial: int | None = None, days: float = 60) -> Issued:
+    def issue(self, *names: str, serial: int | None = None, days: float = 60) -> CertificateAndKey:
         """A certificate for these names and addresses."""
         key = ec.generate_private_key(ec.SECP256R1())
         made = _builder(_named(names[0]), key.public_key(), days, serial).issuer_name(self._name)
@@ -51,7 +51,7 @@ class SigningAuthority:
         secret = key.private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
-        return Issued(_pem(made.sign(self._key, hashes.SHA256())), secret)
+        return CertificateAndKey(_pem(made.sign(self._key, hashes.SHA256())), secret)
 
 
 def authority(name: str = "Test authority", days: float = 60) -> SigningAuthority:
