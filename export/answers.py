@@ -105,8 +105,12 @@ class StudyAnswers:
             if (others := {name: count for name, count in pages.get(step, Counter()).items() if name != page})
         ]
         widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
+        order = {key: place for place, key in enumerate(asked)}
         self.fields = {
-            key: fields[key] for key in sorted(widest, key=lambda key: (self.steps.index(key[0]), fields[key].place))
+            key: fields[key]
+            for key in sorted(
+                widest, key=lambda key: (self.steps.index(key[0]), order.get(key, len(order)), fields[key].place)
+            )
         }
         self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
         self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK

@@ -1,7 +1,7 @@
-"""What the pages of a study say of their fields: which of them send numbers, and which send lists.
+"""What the pages of a study say of their fields: in which order they stand, which send numbers, and which send lists.
 
-So a column has the same type whatever was sent so far: `2.50` in a field for numbers is a number, and one ticked box of
-several is a list.
+So a column has the same place and the same type whatever was sent so far: `2.50` in a field for numbers is a number,
+and one ticked box of several is a list.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ class FieldKind(StrEnum):
 
 
 def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str], FieldKind]:
-    """By step and name, the fields that send numbers or lists, on all of the step's pages that are there."""
+    """By step and name, the fields of the pages that are there, in the order of the pages.
+
+    A field that is not of one kind on all pages of its step is one of texts.
+    """
     found: dict[tuple[str, str], set[FieldKind]] = {}
     if project is None:
         return {}
@@ -36,7 +39,7 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
         for file in step.files:
             for name, kind in fields_of(_page(source, project.page_key(file))).items():
                 found.setdefault((step.key, name), set()).add(kind)
-    return {field: kinds.pop() for field, kinds in found.items() if len(kinds) == 1 and FieldKind.TEXT not in kinds}
+    return {field: kinds.pop() if len(kinds) == 1 else FieldKind.TEXT for field, kinds in found.items()}
 
 
 def fields_of(page: str) -> Mapping[str, FieldKind]:

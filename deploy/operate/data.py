@@ -252,7 +252,8 @@ def _tell(made: dict[str, Any], where: Path) -> None:
         )
     _tell_moved(made["moved"])
     if counts["problems"]:
-        screen.warning(f"{counts['problems']:,} files are not as they should be: {where / 'problems.csv'} says which.")
+        problems = formatting.count(counts["problems"], "remark")
+        screen.warning(f"{problems} on files that are not as they should be: {where / 'problems.csv'}")
     if where.stat().st_mode & 0o077:
         screen.warning(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
     rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]

@@ -90,6 +90,16 @@ def test_a_page_says_which_of_its_fields_send_numbers_and_which_lists() -> None:
     assert {name for name in kinds if kinds[name] == "text"} == {"zip", "one", "hand", "both"}
 
 
+def test_columns_of_a_step_stand_as_its_fields_on_the_page_whatever_was_sent_first(place: Place) -> None:
+    made_of.register(place.put)
+    place.put("maze/steps/questionnaire.html", PAGE.encode())
+    arrive(place.put, "user-1", {"2": {"old": "1", "zip": "1", "mood": "2"}})
+    arrive(place.put, "user-2", {"2": {"made": "1", "pet": "cat", "age": "3"}})
+    place.done()
+    columns = [name.partition(".")[2] for name in place.rows()[0] if name.startswith("2.")]
+    assert columns == ["age", "mood", "zip", "pet", "old", "made"], "what the page does not have comes last"
+
+
 def test_the_type_of_a_column_is_what_its_page_asks_for_whatever_was_sent_so_far(place: Place) -> None:
     made_of.register(place.put)
 
