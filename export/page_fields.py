@@ -6,6 +6,7 @@ and one ticked box of several is a list.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
@@ -45,8 +46,9 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
 def fields_of(page: str) -> Mapping[str, FieldKind]:
     """The fields of one page. Jinja stays as it is: what it makes of a field is not known here."""
     reader = _Reader()
-    reader.feed(page)
-    reader.close()
+    with contextlib.suppress(AssertionError):  # html.parser raises it at `<![1]>`; what stands before it is known
+        reader.feed(page)
+        reader.close()
     return dict(reader.kinds())
 
 
