@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from html.parser import HTMLParser
+
+from hippodrome.participants.page_parser import PageParser
 
 PRESSED = ("submit", "image")
 """The types of buttons that send a form."""
@@ -77,7 +78,7 @@ def hidden(form: Form) -> Iterator[tuple[str, str]]:
     return ((control.name, control.value) for control in form.controls if control.kind == "hidden")
 
 
-class _Reader(HTMLParser):
+class _Reader(PageParser):
     """Gathers forms. Follows `form="…"` and disabled fieldsets; tolerates what browsers tolerate."""
 
     def __init__(self) -> None:

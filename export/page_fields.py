@@ -6,16 +6,15 @@ and one ticked box of several is a list.
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
-from html.parser import HTMLParser
 
 from botocore.exceptions import ClientError
 
 from export.source import FileGone, Source, TooLarge
 from hippodrome.model.project import Project
+from hippodrome.participants.page_parser import PageParser
 
 _MOST = 1024 * 1024  # bytes of a page, as in docs/config.md
 
@@ -46,9 +45,8 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
 def fields_of(page: str) -> Mapping[str, FieldKind]:
     """The fields of one page. Jinja stays as it is: what it makes of a field is not known here."""
     reader = _Reader()
-    with contextlib.suppress(AssertionError):  # html.parser raises it at `<![1]>`; what stands before it is known
-        reader.feed(page)
-        reader.close()
+    reader.feed(page)
+    reader.close()
     return dict(reader.kinds())
 
 
@@ -59,7 +57,7 @@ def _page(source: Source, key: str) -> str:
         return ""
 
 
-class _Reader(HTMLParser):
+class _Reader(PageParser):
     """Counts, by name, the kinds of a page's fields."""
 
     def __init__(self) -> None:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from html.parser import HTMLParser
 from pathlib import Path
 
 from hippodrome.config.project_keys import origin
+from hippodrome.participants.page_parser import PageParser
 
 LIMIT = 50  # as many as `allowedHosts` may have
 
@@ -43,7 +43,7 @@ def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
     return tuple(found)[:LIMIT]
 
 
-class _Addresses(HTMLParser):
+class _Addresses(PageParser):
     def __init__(self) -> None:
         super().__init__()
         self.origins: list[str] = []

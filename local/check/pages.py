@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from html.parser import HTMLParser
 from pathlib import Path
 
 from jinja2 import meta
@@ -12,6 +11,7 @@ from hippodrome.config import Config, Diagnostic
 from hippodrome.config.diagnostics import printable
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import fragments, sandbox
+from hippodrome.participants.page_parser import PageParser
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, source_of
 from local.check.structure import check_structure
@@ -84,7 +84,7 @@ def _leads_back(source: str) -> bool:
     return links.elsewhere
 
 
-class _Links(HTMLParser):
+class _Links(PageParser):
     """Whether a page has a link to another place."""
 
     elsewhere = False

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from html.parser import HTMLParser
 
 from hippodrome.config import Diagnostic
 from hippodrome.config.diagnostics import printable
+from hippodrome.participants.page_parser import PageParser
 from local.check import spans
 
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
@@ -75,7 +75,7 @@ class _Radio:
     row: int
 
 
-class _Reader(HTMLParser):
+class _Reader(PageParser):
     """Notes the choices of a page and the tags that are not closed."""
 
     def __init__(self, label: str) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from html.parser import HTMLParser
 from urllib.parse import unquote, urlsplit
 
 from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments
 from hippodrome.participants.files import KINDS
+from hippodrome.participants.page_parser import PageParser
 from local.check import spans
 from local.check.wording import short
 from protocol.similar import SIMILAR_FILES, did_you_mean
@@ -22,7 +22,7 @@ _BUTTONS = ("button", "reset", "submit", "image")  # inputs that do well without
 _LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
-class Tags(HTMLParser):
+class Tags(PageParser):
     """Looks at each tag of a page for what browsers or our frame will not do."""
 
     def __init__(self, label: str, names: Iterable[str], config: Config | None) -> None:

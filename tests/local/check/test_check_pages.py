@@ -168,6 +168,12 @@ def test_html_mistakes(folder: Path, text: str, said: str) -> None:
     assert line.startswith(f"steps/hello.html:2: {said}")
 
 
+def test_what_browsers_take_for_a_comment_hides_nothing_after_it(folder: Path) -> None:
+    page(folder, '<![1]>\n<![if !mso]><p onclick="x()">a</p><![endif]>')
+    (line,) = looked(folder)
+    assert line.startswith("steps/hello.html:2: remark: onclick never runs")
+
+
 def test_html_that_is_fine(folder: Path) -> None:
     config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
     (folder / "steps" / "a cat.png").touch()
