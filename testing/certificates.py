@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
@@ -11,18 +10,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from local.backend.authority import SIGNS_CERTIFICATES, general_name
+
 _AGO = timedelta(hours=1)  # since when all of them are valid
-_SIGNS = x509.KeyUsage(
-    digital_signature=False,
-    content_commitment=False,
-    key_encipherment=False,
-    data_encipherment=False,
-    key_agreement=False,
-    key_cert_sign=True,
-    crl_sign=False,
-    encipher_only=False,
-    decipher_only=False,
-)
 
 
 class CertificateAndKey(NamedTuple):
@@ -44,7 +34,7 @@ class SigningAuthority:
         """A certificate for these names and addresses."""
         key = ec.generate_private_key(ec.SECP256R1())
         made = _builder(_named(names[0]), key.public_key(), days, serial).issuer_name(self._name)
-        made = made.add_extension(x509.SubjectAlternativeName([_general(name) for name in names]), critical=False)
+        made = made.add_extension(x509.SubjectAlternativeName([general_name(name) for name in names]), critical=False)
         made = made.add_extension(
             x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False
         )
@@ -59,7 +49,7 @@ def authority(name: str = "Test authority", days: float = 60) -> SigningAuthorit
     key, own = ec.generate_private_key(ec.SECP256R1()), _named(name)
     made = _builder(own, key.public_key(), days).issuer_name(own)
     made = made.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    made = made.add_extension(_SIGNS, critical=True)
+    made = made.add_extension(SIGNS_CERTIFICATES, critical=True)
     made = made.add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     return SigningAuthority(_pem(made.sign(key, hashes.SHA256())), own, key)
 
@@ -80,13 +70,6 @@ def _builder(
 
 def _named(name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
-
-
-def _general(name: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(name))
-    except ValueError:
-        return x509.DNSName(name)
 
 
 def _pem(made: x509.Certificate) -> bytes:

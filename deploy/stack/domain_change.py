@@ -7,7 +7,7 @@ names only when there is a certificate for them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -24,9 +24,9 @@ from hippodrome.model import ids
 from hippodrome.model.server import Server
 from hippodrome.ports import Settings
 
-_ENDING = (
-    "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end for good "
-    "when their study is closed (`python -m deploy register --no-live`)."
+_WAIT = "Wait until they have ended, or end them with `python -m deploy stop`; then apply again."
+_WAIT_FOR_WARM_TOO = (
+    f"{_WAIT} Warm servers end for good when their study is closed (`python -m deploy register --no-live`)."
 )
 
 
@@ -44,11 +44,11 @@ def check(prepared: Prepared) -> None:
     if after != prepared.parameters["RootDomain"]:  # whose own NS record is in the zone and is no delegation
         _delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
     _neighbours(prepared, after)
-    if before is not None and (left := [one for one in _running(prepared.account, before) if _stays(one, prepared)]):
-        raise Problem(
+    if before is not None:
+        _refuse(
+            [one for one in _running(prepared.account, before) if _stays(one, prepared)],
             f"Servers run below {before.servers_domain} whose names the installation could not remove any more.",
-            "Wait until they have ended, or end them with `python -m deploy stop`; then apply again.",
-            [f"{len(left)} of them"],
+            _WAIT,
         )
 
 
@@ -62,12 +62,11 @@ def check_site(prepared: Prepared) -> None:
     sites = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
     if before is None or sites[0] == sites[1]:
         return
-    if left := _running(prepared.account, before):
-        raise Problem(
-            f"Servers run that store their answers and recordings by way of {sites[0]}, which would be gone.",
-            _ENDING,
-            [f"{len(left)} of them"],
-        )
+    _refuse(
+        _running(prepared.account, before),
+        f"Servers run that store their answers and recordings by way of {sites[0]}, which would be gone.",
+        _WAIT_FOR_WARM_TOO,
+    )
 
 
 def check_network(prepared: Prepared) -> None:
@@ -78,12 +77,17 @@ def check_network(prepared: Prepared) -> None:
     before = _before(prepared)
     if before is None or (prepared.before.get("VpcId") or "") == prepared.parameters["VpcId"]:
         return
-    if left := _running(prepared.account, before):
-        raise Problem(
-            "Servers run in the present network, which could not be removed, and they would lose their way out of it.",
-            _ENDING,
-            [f"{len(left)} of them"],
-        )
+    _refuse(
+        _running(prepared.account, before),
+        "Servers run in the present network, which could not be removed, and they would lose their way out of it.",
+        _WAIT_FOR_WARM_TOO,
+    )
+
+
+def _refuse(running: Collection[Server], why: str, advice: str) -> None:
+    """Raise `Problem` if there are such servers."""
+    if running:
+        raise Problem(why, advice, [f"{len(running)} of them"])
 
 
 def certify(prepared: Prepared) -> None:

@@ -34,8 +34,8 @@ def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Newcomer]:
         pytest.skip(pebble.MISSING)
     home = tmp_path_factory.mktemp("newcomer")
     (home / "world").mkdir()
-    with MinistackWorld(emulated(), home / "world") as world, arrived(world, home / "arrived") as somebody:
-        yield somebody
+    with MinistackWorld(emulated(), home / "world") as world, arrived(world, home / "arrived") as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
