@@ -1,2 +1,2 @@
-"""What is tried before participants come, wherever a study is held: `make try` sends simulated ones on one machine,
-`deploy doctor` on AWS; and which packages servers lack."""
+"""Bots are simulated participants. They try a study before people come: `make try` sends them through a study on one
+machine, `deploy doctor --rehearse --play` on AWS."""

@@ -1,8 +1,8 @@
 """The addresses that bots may send requests to. Pure.
 
-Bots check every address before they send anything to it: that of a link, a redirect, a page's form or a server's state.
-An attacker who can write one of these must not be able to send simulated participants, their answers or a server's
-token anywhere else.
+Bots check each address before they send anything to it, whether it comes from a link, a redirect, a page's form or a
+server's state. An attacker who can write one of these must not be able to direct bots, their answers or a server's
+token to another site.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Dial = Callable[[str, int], tuple[str, int]]
 
 
 class AddressRefused(ValueError):
-    """An address that bots do not go to."""
+    """Bots may not send requests to this address. `str()` names it, without its query."""
 
 
 class AllowedAddresses(Protocol):
@@ -30,21 +30,21 @@ class AllowedAddresses(Protocol):
 
     @property
     def tls(self) -> ssl.SSLContext | None:
-        """Whom to believe; None where nothing is encrypted."""
+        """The TLS context that verifies the certificates of pages and servers; None if addresses are not encrypted."""
 
     def page(self, address: str) -> str:
-        """The address, if it is one of the study's pages. Raises AddressRefused."""
+        """Return the address if it is one of the study's pages. Raises AddressRefused for any other."""
 
     def server(self, address: str) -> str:
-        """The address, if it is one of the study's servers. Raises AddressRefused."""
+        """Return the address if it is one of the study's trial servers. Raises AddressRefused for any other."""
 
     def dial(self, host: str, port: int) -> tuple[str, int]:
-        """AllowedAddresses to connect for an address that was allowed: the address itself, but in tests."""
+        """Return the host and port of the TCP connection for an allowed address: its own ones, except in tests."""
 
 
 @dataclass(frozen=True)
 class ThisMachine:
-    """Studies that are held here, whatever their ports: simulated participants have no business in a real study."""
+    """Allows all studies on this machine, on any port, and nothing else: bots must not take part in a real study."""
 
     tls: ssl.SSLContext | None = None
 
@@ -67,29 +67,29 @@ class ThisMachine:
 THIS_MACHINE = ThisMachine()
 
 
-def _as_it_is(host: str, port: int) -> tuple[str, int]:
+def _unchanged(host: str, port: int) -> tuple[str, int]:
     return host, port
 
 
 @dataclass(frozen=True)
 class OneSite:
-    """One installation's own site, one project's pages there, and its servers by their own names: nothing else.
+    """Allows the pages of one project on one installation's site, and the installation's trial servers.
 
-    `site` is an https address; `servers` are what the pages let the game connect to, as their Content-Security-Policy
-    has it (`wss://*.example.org:443`): one label in the place of the asterisk, which must be a server's own name.
+    `site` is an https address. `servers` are the sources for trial servers in the pages' Content-Security-Policy, such
+    as `wss://*.example.org:443`. An allowed address has the name of a server (`ids.parse_server_name`) in the place of
+    the asterisk. `connect` is the function behind `dial`.
     """
 
     site: str
     servers: Sequence[str]
     project_id: str
     tls: ssl.SSLContext | None = None
-    connect: Dial = field(default=_as_it_is, repr=False)
+    connect: Dial = field(default=_unchanged, repr=False)
 
     def page(self, address: str) -> str:
         parts, own = _split(address), _split(self.site)
-        there = parts is not None and own is not None and parts.scheme == "https" and _origin(parts) == _origin(own)
-        if parts is None or not there:
-            raise AddressRefused(f"bots only go to {self.site}, not to {_named(parts)}")
+        if parts is None or own is None or parts.scheme != "https" or _origin(parts) != _origin(own):
+            raise AddressRefused(f"bots only go to {self.site}, not to {_without_path(parts)}")
         if parts.path != "/next" or parse_qs(parts.query).get("projectId") != [self.project_id]:
             raise AddressRefused(
                 f"bots only go to the pages of their own project, not to {parts.path or '/'} of another"
@@ -98,16 +98,16 @@ class OneSite:
 
     def server(self, address: str) -> str:
         parts = _split(address)
-        if parts is None or parts.scheme != "wss" or not any(_fits(parts, source) for source in self.servers):
-            raise AddressRefused(f"bots only go to servers of {self.site}, not to {_named(parts)}")
+        if parts is None or parts.scheme != "wss" or not any(_matches(parts, source) for source in self.servers):
+            raise AddressRefused(f"bots only go to servers of {self.site}, not to {_without_path(parts)}")
         return address
 
     def dial(self, host: str, port: int) -> tuple[str, int]:
         return self.connect(host, port)
 
 
-def _fits(parts: SplitResult, source: str) -> bool:
-    """Whether the address has one server's name in the place of the source's asterisk, and the source's port."""
+def _matches(parts: SplitResult, source: str) -> bool:
+    """Whether the address has a server's name in the place of the source's asterisk, and the source's port."""
     allowed = _split(source.replace("*.", "any.", 1))
     first, _, rest = (parts.hostname or "").partition(".")
     if allowed is None or not source.startswith("wss://*.") or ids.parse_server_name(first) is None:
@@ -116,21 +116,23 @@ def _fits(parts: SplitResult, source: str) -> bool:
 
 
 def _split(address: str) -> SplitResult | None:
-    """The parts of an address that says plainly where it leads; None for one that might be read in two ways."""
+    """The parts of an address; None if two programs may read it differently (credentials, port 0, spaces, `\\`)."""
     try:
         parts = urlsplit(address)
         port = parts.port
     except ValueError:
         return None
-    odd = parts.username is not None or parts.password is not None or port == 0
-    odd = odd or any(character.isspace() or character == "\\" or ord(character) < 32 for character in address)
-    return None if odd or not parts.hostname else parts
+    ambiguous = parts.username is not None or parts.password is not None or port == 0
+    ambiguous = ambiguous or any(
+        character.isspace() or character == "\\" or ord(character) < 32 for character in address
+    )
+    return None if ambiguous or not parts.hostname else parts
 
 
 def _origin(parts: SplitResult) -> tuple[str, str, int]:
     return parts.scheme, parts.hostname or "", parts.port or PORTS.get(parts.scheme, 0)
 
 
-def _named(parts: SplitResult | None) -> str:
-    """Which address was refused, without its query, which may hold a token."""
+def _without_path(parts: SplitResult | None) -> str:
+    """The scheme, host and port of a refused address. Its query may hold a token."""
     return f"{parts.scheme}://{parts.netloc}" if parts else "an address that cannot be read"

@@ -1,4 +1,4 @@
-"""Many bots at once, and how they are interrupted."""
+"""Sends many bots at once, and ends them after a signal."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import signal
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from bots.account import BotReport
 from bots.bot import Bot
+from bots.report import BotReport
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 T = TypeVar("T")
@@ -17,36 +17,42 @@ T = TypeVar("T")
 async def walk(
     crowd: Sequence[Bot], *, at_once: int, ramp: float, watch: Callable[[Sequence[BotReport]], None]
 ) -> list[BotReport]:
-    """Send these bots through their study, `at_once` at a time; what happened to each. Cancelling ends all of them."""
-    places = asyncio.Semaphore(at_once)
+    """Send these bots through their study, `at_once` at a time, and return their reports in the order of the bots.
 
-    async def one(number: int, bot: Bot) -> None:
+    The first bots start `ramp` seconds apart. `watch` gets the reports five times a second. Cancelling ends all bots.
+    """
+    slots = asyncio.Semaphore(at_once)
+
+    async def run(number: int, bot: Bot) -> None:
         await asyncio.sleep(min(number, at_once) * ramp)
-        async with places:
+        async with slots:
             await bot.run()
 
     async def show() -> None:
         while True:
-            watch([bot.account for bot in crowd])
+            watch([bot.report for bot in crowd])
             await asyncio.sleep(0.2)
 
     showing = asyncio.create_task(show())
     try:
         async with asyncio.TaskGroup() as group:
             for number, bot in enumerate(crowd):
-                group.create_task(one(number, bot))
+                group.create_task(run(number, bot))
     finally:
         showing.cancel()
-    watch([bot.account for bot in crowd])
-    return [bot.account for bot in crowd]
+    watch([bot.report for bot in crowd])
+    return [bot.report for bot in crowd]
 
 
-def interruptible(walk: Coroutine[Any, Any, T]) -> T:
-    """Its result. A signal cancels it, again every second until it has ended: a timeout that is over at the very
-    moment of a cancellation swallows it. Raises KeyboardInterrupt then."""
+def interruptible(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run the coroutine and return its result. A signal (`SIGNALS`) cancels it; then this raises KeyboardInterrupt.
 
-    async def held() -> T:
-        loop, task = asyncio.get_running_loop(), asyncio.ensure_future(walk)
+    The cancellation is repeated every second until the coroutine has ended, since a timeout that expires at the same
+    moment swallows a cancellation.
+    """
+
+    async def run() -> T:
+        loop, task = asyncio.get_running_loop(), asyncio.ensure_future(coroutine)
 
         def cancel() -> None:
             task.cancel()
@@ -61,6 +67,6 @@ def interruptible(walk: Coroutine[Any, Any, T]) -> T:
                 signal.signal(number, signal.default_int_handler)
 
     try:
-        return asyncio.run(held())
+        return asyncio.run(run())
     except asyncio.CancelledError:
         raise KeyboardInterrupt from None

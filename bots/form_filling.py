@@ -1,7 +1,7 @@
-"""Filling in a page's form as a person might: from the page's own inputs and within their limits. Pure.
+"""Fills in a page's form as a person might, within the limits of its inputs. Pure.
 
-What is sent is what a browser would send (https://html.spec.whatwg.org/#constructing-the-form-data-set): the fields in
-their order, hidden ones as they are, line ends as CR LF, and the button that was pressed.
+The result is what a browser would send (https://html.spec.whatwg.org/#constructing-the-form-data-set): the fields in
+their order, hidden fields unchanged, line ends as CR LF, and the button that was pressed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bots.forms import PRESSED, Control, Form
 Pairs = list[tuple[str, str]]
 
 ANSWERED = 0.8
-"""The share of the optional fields that get an answer."""
+"""The probability with which an optional field gets an answer."""
 
 _WORDS = (
     "It was fine, thank you.",
@@ -52,7 +52,8 @@ _EPOCH = datetime(1970, 1, 1)
 
 
 def fill(form: Form, random: Random) -> Pairs:
-    """Answers to every required field and most of the others, with one of the buttons."""
+    """Return a name and value for each field that a browser would send. Every required field has an answer, most of
+    the others too, and one of the buttons is pressed."""
     chosen = _choose_radios(form, random)
     checked = _choose_boxes(form, random)
     pressed = random.choice(form.buttons) if form.buttons else None
@@ -65,9 +66,9 @@ def fill(form: Form, random: Random) -> Pairs:
                 pairs += [(f"{prefix}x", "1"), (f"{prefix}y", "1")]
                 continue
         elif control.kind == "radio":
-            values = [control.given.get("value", "on")] if control in chosen else []
+            values = [control.attributes.get("value", "on")] if control in chosen else []
         elif control.kind == "checkbox":
-            values = [control.given.get("value", "on")] if control in checked else []
+            values = [control.attributes.get("value", "on")] if control in checked else []
         elif control.kind == "select":
             values = _select(control, random)
         else:
@@ -86,12 +87,12 @@ def _choose_radios(form: Form, random: Random) -> list[Control]:
         if control.kind == "radio":
             sets.setdefault(control.name, []).append(control)
     chosen = []
-    for circles in sets.values():
-        given = [circle for circle in circles if "checked" in circle.given]
-        if any(circle.required for circle in circles) or random.random() < ANSWERED:
-            chosen.append(random.choice(circles))
+    for radios in sets.values():
+        checked = [radio for radio in radios if "checked" in radio.attributes]
+        if any(radio.required for radio in radios) or random.random() < ANSWERED:
+            chosen.append(random.choice(radios))
         else:
-            chosen += given[-1:]
+            chosen += checked[-1:]
     return chosen
 
 
@@ -108,10 +109,10 @@ def _select(control: Control, random: Random) -> list[str]:
     answers = [option for option in free if option.value] or free
     if not answers:
         return []
-    if "multiple" in control.given:
+    if "multiple" in control.attributes:
         least = 1 if control.required else 0
-        some = random.sample(answers, random.randint(least, len(answers)))
-        return [option.value for option in free if option in some]
+        chosen = random.sample(answers, random.randint(least, len(answers)))
+        return [option.value for option in free if option in chosen]
     if control.required or random.random() < ANSWERED:
         return [random.choice(answers).value]
     return [next((option for option in reversed(free) if option.selected), free[0]).value]
@@ -121,10 +122,10 @@ def _select(control: Control, random: Random) -> list[str]:
 
 
 def _text(control: Control, random: Random) -> str:
-    """What a field that holds a text is filled with."""
-    if control.kind in _MADE and "readonly" not in control.given:
+    """The value of a field that is no choice: an answer, nothing, or for a hidden or read-only field its own value."""
+    if control.kind in _GENERATORS and "readonly" not in control.attributes:
         if control.required or control.kind in ("range", "color") or random.random() < ANSWERED:
-            return _MADE[control.kind](control, random)
+            return _GENERATORS[control.kind](control, random)
         return ""
     return control.text if control.kind == "textarea" else control.value
 
@@ -135,25 +136,26 @@ def _words(control: Control, random: Random) -> str:
 
 
 def _phrase(control: Control, random: Random) -> str:
-    pattern = control.given.get("pattern")
+    pattern = control.attributes.get("pattern")
     if pattern is None:
         return _words(control, random)
     try:
-        fitting = [text for text in _PATTERNS if re.fullmatch(pattern, text)]
-    except re.error:  # JavaScript's expressions are not quite Python's
-        fitting = []
-    return _fitted(control, random.choice(fitting or _PATTERNS))
+        matching = [text for text in _PATTERNS if re.fullmatch(pattern, text)]
+    except re.error:  # JavaScript's regular expressions are not quite Python's
+        matching = []
+    return _fitted(control, random.choice(matching or _PATTERNS))
 
 
 def _fitted(control: Control, text: str) -> str:
-    """The text within minlength and maxlength, which count as JavaScript does."""
-    most, least = _whole(control.given.get("maxlength")), _whole(control.given.get("minlength"))
+    """The text, shortened to maxlength or lengthened to minlength."""
+    most, least = _whole(control.attributes.get("maxlength")), _whole(control.attributes.get("minlength"))
     while most is not None and text and _length(text) > most:
         text = text[:-1]
     return text + "x" * max(0, (least or 0) - _length(text)) if text else "x" * (least or 0)
 
 
 def _length(text: str) -> int:
+    """The length in UTF-16 code units, in which HTML counts minlength and maxlength."""
     return len(text.encode("utf-16-le")) // 2
 
 
@@ -166,7 +168,7 @@ def _url(control: Control, random: Random) -> str:
 
 
 def _phone(control: Control, random: Random) -> str:
-    return _phrase(control, random) if "pattern" in control.given else "+1 204 555 0100"
+    return _phrase(control, random) if "pattern" in control.attributes else "+1 204 555 0100"
 
 
 def _color(control: Control, random: Random) -> str:
@@ -175,20 +177,23 @@ def _color(control: Control, random: Random) -> str:
 
 def _number(control: Control, random: Random) -> str:
     slider = control.kind == "range"
-    low, high = _decimal(control.given.get("min")), _decimal(control.given.get("max"))
-    base = low if low is not None else _decimal(control.given.get("value")) or Decimal(0)
-    step = _decimal(control.given.get("step"))
+    low, high = _decimal(control.attributes.get("min")), _decimal(control.attributes.get("max"))
+    base = low if low is not None else _decimal(control.attributes.get("value")) or Decimal(0)
+    step = _decimal(control.attributes.get("step"))
     if step is None or step <= 0:
-        step = Decimal("0.25") if control.given.get("step", "").lower() == "any" else Decimal(1)
+        step = Decimal("0.25") if control.attributes.get("step", "").lower() == "any" else Decimal(1)
     if slider:
         low = Decimal(0) if low is None else low
         base = low
         high = max(low, Decimal(100) if high is None else high)
-    return _plain(_on_grid(low, high, base, step, random))
+    return _digits(_on_grid(low, high, base, step, random))
 
 
 def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Decimal, random: Random) -> Decimal:
-    """A value from low to high (and not far from base) that is whole steps away from base."""
+    """A value from `low` to `high` that lies a whole number of steps from `base`.
+
+    Without one of the limits, it lies at most 40 steps from the other; without both, at most 20 from `base`.
+    """
     first = -20 if low is None else -_floor((base - low) / step)
     last = first + 40 if high is None else _floor((high - base) / step)
     if low is None and high is not None:
@@ -197,37 +202,38 @@ def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Dec
 
 
 def _floor(number: Decimal) -> int:
-    """The largest whole number that is not above; Decimal's own `//` rounds towards zero."""
+    """The largest whole number that is not greater. (Decimal's own `//` rounds towards zero.)"""
     return int(number.to_integral_value(ROUND_FLOOR))
 
 
-def _plain(number: Decimal) -> str:
+def _digits(number: Decimal) -> str:
+    """The number without an exponent, and without zeros at its end."""
     text = f"{number:f}"
     return (text.rstrip("0").rstrip(".") if "." in text else text) or "0"
 
 
-def _when(control: Control, random: Random) -> str:
-    """A date, time, month or week within its limits, counted in steps of its smallest part."""
+def _moment_text(control: Control, random: Random) -> str:
+    """A date, time, month or week within its limits, a whole number of steps from its base."""
     kind = control.kind
     unit = _SECONDS[kind]
-    low, high = _moment(kind, control.given.get("min")), _moment(kind, control.given.get("max"))
-    step = _decimal(control.given.get("step"))
+    low, high = _moment(kind, control.attributes.get("min")), _moment(kind, control.attributes.get("max"))
+    step = _decimal(control.attributes.get("step"))
     length = unit * (step if step is not None and step > 0 else Decimal(60 if unit == 1 else 1))
     if kind == "time":
         low = Decimal(0) if low is None else low
-        high = Decimal(86399) if high is None or high < low else high  # a time after midnight is as good as before
+        high = Decimal(86399) if high is None or high < low else high  # high < low: a span over midnight
     elif low is None and high is None:
-        low = _moment(kind, _PLAIN[kind])
-    given = _moment(kind, control.given.get("value"))
-    base = low if control.given.get("min") and low is not None else given if given is not None else Decimal(0)
-    if kind == "week" and low is None and given is None:
-        base = Decimal(4 * 86400)  # the first Monday
+        low = _moment(kind, _DEFAULT_LOW[kind])
+    value = _moment(kind, control.attributes.get("value"))
+    base = low if control.attributes.get("min") and low is not None else value if value is not None else Decimal(0)
+    if kind == "week" and low is None and value is None:
+        base = Decimal(4 * 86400)  # the first Monday after 1970 began
     seconds = _on_grid(low, high, base, length, random)
     return _write(kind, int(seconds))
 
 
 def _moment(kind: str, text: str | None) -> Decimal | None:
-    """Seconds (of months: months) since 1970 began; None for what is no such time."""
+    """Seconds since 1970 began, or months for the kind `month`; None if the text is no time of this kind."""
     if not text:
         return None
     try:
@@ -244,6 +250,7 @@ def _moment(kind: str, text: str | None) -> Decimal | None:
 
 
 def _write(kind: str, count: int) -> str:
+    """The text of a moment; the inverse of `_moment`."""
     if kind == "month":
         return f"{1970 + count // 12:04d}-{count % 12 + 1:02d}"
     moment = _EPOCH + timedelta(seconds=count)
@@ -269,8 +276,8 @@ def _whole(text: str | None) -> int | None:
 
 
 _SECONDS = {"date": 86400, "time": 1, "datetime-local": 1, "month": 1, "week": 7 * 86400}
-_PLAIN = {"date": "2024-02-29", "datetime-local": "2024-02-29T12:00", "month": "2024-02", "week": "2024-W09"}
-_MADE = {
+_DEFAULT_LOW = {"date": "2024-02-29", "datetime-local": "2024-02-29T12:00", "month": "2024-02", "week": "2024-W09"}
+_GENERATORS = {
     "text": _phrase,
     "search": _phrase,
     "password": _phrase,
@@ -281,14 +288,15 @@ _MADE = {
     "color": _color,
     "number": _number,
     "range": _number,
-    **dict.fromkeys(_SECONDS, _when),
+    **dict.fromkeys(_SECONDS, _moment_text),
 }
 
 
 def gathered(pairs: Iterable[tuple[str, str]]) -> dict[str, str | list[str]]:
-    """The answers as they are to be stored: a name that comes twice holds all its values."""
-    seen: dict[str, list[str]] = {}
+    """Return the answers as the study stores them: a name that comes several times has the list of its values, and
+    Hippodrome's own fields are left out."""
+    answers: dict[str, list[str]] = {}
     for name, value in pairs:
         if not name.startswith("hippodrome-"):
-            seen.setdefault(name, []).append(value)
-    return {name: values[0] if len(values) == 1 else values for name, values in seen.items()}
+            answers.setdefault(name, []).append(value)
+    return {name: values[0] if len(values) == 1 else values for name, values in answers.items()}

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 from hippodrome.participants.page_parser import PageParser
 
 PRESSED = ("submit", "image")
-"""The types of buttons that send a form."""
+"""Types of the buttons that send a form."""
 _NEVER_SENT = ("reset", "button")
+"""Types of the buttons that send nothing."""
 _TIMES = ("date", "time", "datetime-local", "month", "week")
 _TEXTS = ("text", "search", "password", "email", "url", "tel")
 _TYPES = {*_TEXTS, *_TIMES, *PRESSED, *_NEVER_SENT, "color", "number", "range", "hidden", "radio", "checkbox", "file"}
-"""Of inputs; any other is a text."""
+"""Types of inputs. A browser takes any other type for `text`."""
 
 
 @dataclass(frozen=True)
@@ -30,26 +31,26 @@ class Control:
     """An input, select, textarea or button; `kind` is the type of an input or button, or the name of the element."""
 
     kind: str
-    given: Mapping[str, str]
-    options: list[SelectOption] = field(default_factory=list)
+    attributes: Mapping[str, str]
+    options: list[SelectOption] = field(default_factory=list)  # of a select
     text: str = ""  # of a textarea
 
     @property
     def name(self) -> str:
-        return self.given.get("name", "")
+        return self.attributes.get("name", "")
 
     @property
     def required(self) -> bool:
-        return "required" in self.given
+        return "required" in self.attributes
 
     @property
     def value(self) -> str:
-        return self.given.get("value", "")
+        return self.attributes.get("value", "")
 
 
 @dataclass
 class Form:
-    """A form of a page. Disabled fields are not in it."""
+    """A form of a page, without its disabled controls."""
 
     action: str
     method: str
@@ -61,7 +62,7 @@ class Form:
 
 
 def read(page: str) -> list[Form]:
-    """The forms of a page in their order."""
+    """Return the forms of a page in their order."""
     reader = _Reader()
     reader.feed(page)
     reader.close()
@@ -69,61 +70,61 @@ def read(page: str) -> list[Form]:
 
 
 def to_answer(page: str) -> Form | None:
-    """The form that a page asks to be answered; None if it asks for nothing."""
+    """Return the first form of a page that is sent by POST; None if there is none."""
     return next((form for form in read(page) if form.method == "post"), None)
 
 
 def hidden(form: Form) -> Iterator[tuple[str, str]]:
-    """The hidden fields of a form."""
+    """Return the names and values of a form's hidden fields."""
     return ((control.name, control.value) for control in form.controls if control.kind == "hidden")
 
 
 class _Reader(PageParser):
-    """Gathers forms. Follows `form="…"` and disabled fieldsets; tolerates what browsers tolerate."""
+    """Gathers forms with their controls, as browsers do: it follows `form="…"` and disabled fieldsets."""
 
     def __init__(self) -> None:
         super().__init__(convert_charrefs=True)
         self.forms: list[Form] = []
         self._by_id: dict[str, Form] = {}
         self._form: Form | None = None
-        self._elsewhere: list[tuple[str, Control]] = []  # controls that name their form
+        self._by_form_id: list[tuple[str, Control]] = []  # controls that name their form by `form="…"`
         self._fieldsets: list[_Fieldset] = []
         self._select: Control | None = None
         self._option: dict[str, str] | None = None
-        self._label: list[str] = []  # the text of the option
+        self._label: list[str] = []  # the text of the open option
         self._group_disabled = False
         self._textarea: Control | None = None
 
     def handle_starttag(self, tag: str, attrs: Iterable[tuple[str, str | None]]) -> None:
-        given: dict[str, str] = {}
+        attributes: dict[str, str] = {}
         for name, value in attrs:
-            given.setdefault(name, value or "")
+            attributes.setdefault(name, value or "")
         if tag == "form" and self._form is None:
-            self._form = Form(given.get("action", ""), given.get("method", "get").lower())
+            self._form = Form(attributes.get("action", ""), attributes.get("method", "get").lower())
             self.forms.append(self._form)
-            self._by_id.setdefault(given.get("id", ""), self._form)
+            self._by_id.setdefault(attributes.get("id", ""), self._form)
         elif tag == "fieldset":
-            self._fieldsets.append(_Fieldset("disabled" in given))
+            self._fieldsets.append(_Fieldset("disabled" in attributes))
         elif tag == "legend" and self._fieldsets:
             self._fieldsets[-1].legend_begins()
         elif tag == "input":
-            kind = given.get("type", "text").lower()
-            self._add(Control(kind if kind in _TYPES else "text", given))
+            kind = attributes.get("type", "text").lower()
+            self._add(Control(kind if kind in _TYPES else "text", attributes))
         elif tag == "button":
-            kind = given.get("type", "submit").lower()
-            self._add(Control(kind if kind in _NEVER_SENT else "submit", given))
+            kind = attributes.get("type", "submit").lower()
+            self._add(Control(kind if kind in _NEVER_SENT else "submit", attributes))
         elif tag == "textarea":
-            self._textarea = Control("textarea", given)
+            self._textarea = Control("textarea", attributes)
             self._add(self._textarea)
         elif tag == "select":
-            self._select = Control("select", given)
+            self._select = Control("select", attributes)
             self._add(self._select)
         elif tag == "optgroup":
             self._end_option()
-            self._group_disabled = "disabled" in given
+            self._group_disabled = "disabled" in attributes
         elif tag == "option" and self._select is not None:
             self._end_option()
-            self._option, self._label = given, []
+            self._option, self._label = attributes, []
 
     def handle_endtag(self, tag: str) -> None:
         if tag == "form":
@@ -152,32 +153,32 @@ class _Reader(PageParser):
 
     def close(self) -> None:
         super().close()
-        for form_id, control in self._elsewhere:
+        for form_id, control in self._by_form_id:
             if form_id in self._by_id:
                 self._by_id[form_id].controls.append(control)
 
     def _add(self, control: Control) -> None:
-        if "disabled" in control.given or any(fieldset.disables for fieldset in self._fieldsets):
+        if "disabled" in control.attributes or any(fieldset.disables for fieldset in self._fieldsets):
             return
         if control.kind in _NEVER_SENT:
             return
-        if "form" in control.given:
-            self._elsewhere.append((control.given["form"], control))
+        if "form" in control.attributes:
+            self._by_form_id.append((control.attributes["form"], control))
         elif self._form is not None:
             self._form.controls.append(control)
 
     def _end_option(self) -> None:
         if self._select is not None and self._option is not None:
-            given = self._option
+            attributes = self._option
             text = " ".join("".join(self._label).split())
-            disabled = "disabled" in given or self._group_disabled
-            self._select.options.append(SelectOption(given.get("value", text), "selected" in given, disabled))
+            disabled = "disabled" in attributes or self._group_disabled
+            self._select.options.append(SelectOption(attributes.get("value", text), "selected" in attributes, disabled))
         self._option = None
 
 
 @dataclass
 class _Fieldset:
-    """A fieldset that is open; what stands in its first legend is not disabled with it."""
+    """An open fieldset. If it is disabled, so are its controls, except those in its first legend."""
 
     disabled: bool
     legends: int = 0

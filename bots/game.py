@@ -14,7 +14,7 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
-from bots.account import BotReport, PlayedStep
+from bots.report import BotReport, PlayedStep
 from protocol import keyboard
 from trial.core.choices import NOT_POSSIBLE
 from trial.pictures.frames import Decoder
@@ -22,91 +22,95 @@ from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecode
 
 _ASSET, _SCENES = bytes([ASSET]), (bytes([SCENE]), bytes([PACKED_SCENE]))
 
-MOST_THINKING = 600.0  # seconds that another player's turn may take (policySeconds)
-QUIET_SECONDS = 20.0  # a playing game that shows nothing for so long is taken for lost
+MAX_TURN_SECONDS = 600.0  # of another player's turn: the largest `policySeconds`
+QUIET_SECONDS = 20.0  # without a message, after which the bot takes a game that is played for lost
 
 
-class Hands:
-    """Presses keys at random: some are held, some are single presses."""
+class RandomKeys:
+    """Presses keys at random: it holds some keys down, and presses others once."""
 
     def __init__(self, random: Random, controls: dict[str, Any]) -> None:
         self._random = random
         shown: Sequence[str] = controls.get("UI", ())
         self._keys = [key for key in ("left", "right", "up", "down", "fire") if key in shown]
         self._actions = [name for name in controls.get("actionSpace", ()) if name != "noop" and _offered(name, shown)]
-        own: Mapping[str, str] = controls.get("keys", {})
-        self._pressed = list(dict.fromkeys(key for combined in own for key in keyboard.parts(combined)))
+        key_map: Mapping[str, str] = controls.get("keys", {})
+        self._mapped_keys = list(dict.fromkeys(key for combined in key_map for key in keyboard.parts(combined)))
         self._words = [*(word for word in ("good", "bad") if word in shown), *controls.get("words", ())]
         self._held: list[str] = []
 
     def move(self) -> list[dict[str, Any]]:
-        """The next messages."""
+        """Return the next messages to the server: key releases, then key presses or an action, and rarely a word."""
         random = self._random
-        field, keys = ("key", self._pressed) if self._pressed else ("action", self._keys)
-        said: list[dict[str, Any]] = [{field: key, "held": False} for key in self._held]
+        field, keys = ("key", self._mapped_keys) if self._mapped_keys else ("action", self._keys)
+        messages: list[dict[str, Any]] = [{field: key, "held": False} for key in self._held]
         self._held = []
         if keys and random.random() < 0.7:
             self._held = random.sample(keys, min(len(keys), random.choice((1, 1, 1, 2))))
-            said += [{field: key, "held": True} for key in self._held]
+            messages += [{field: key, "held": True} for key in self._held]
         elif self._actions:
-            said.append({"action": random.choice(self._actions)})
+            messages.append({"action": random.choice(self._actions)})
         if self._words and random.random() < 0.1:
-            said.append({"command": random.choice(self._words)})
-        return said
+            messages.append({"command": random.choice(self._words)})
+        return messages
 
 
 def _offered(action: str, shown: Sequence[str]) -> bool:
-    """Whether the page has the keys that make this action; those that are no directions it always has."""
+    """Whether the page offers this action. It offers directions by the keys that it shows, and every other action."""
     if re.fullmatch("(up|down|left|right|fire)+", action) is None:
         return True
     return all(key in shown for key in re.findall("up|down|left|right", action))
 
 
 class GameConnection:
-    """One connection to a trial server. It plays for `seconds` where the game may be stopped; 0: to the end."""
+    """Plays on one connection to a trial server, and writes into `play` and `report` what comes over it.
+
+    After `seconds` of play it stops the game, if the game's controls have "stop"; with 0 it plays to the end.
+    """
 
     def __init__(
-        self, websocket: ClientConnection, play: PlayedStep, account: BotReport, random: Random, seconds: float
+        self, websocket: ClientConnection, play: PlayedStep, report: BotReport, random: Random, seconds: float
     ) -> None:
         self._websocket = websocket
         self._play = play
-        self._account = account
+        self._report = report
         self._random = random
         self._seconds = seconds
         self._screen = Decoder()
         self._scene = SceneDecoder()
-        self._images: set[str] = set()  # hashes of those that were asked for
-        self._hands: Hands | None = None
+        self._images: set[str] = set()  # hashes of the images that the bot has asked for
+        self._keys: RandomKeys | None = None  # None until the server has sent the controls
         self._state = ""
-        self._turns = False
-        self._to_act = True
-        self._first = True
-        self._last_frame: float | None = None
+        self._turns = False  # the game is played turn by turn
+        self._to_act = True  # it is this player's turn
+        self._first = True  # no frame has come yet
+        self._last_frame: float | None = None  # time.monotonic() of the last frame while playing
         self._may_stop = False
-        self._break_seconds = 0.0
+        self._break_seconds = 0.0  # that the server has announced, in which nothing is played
 
     async def run(self, hello: dict[str, Any]) -> None:
-        """Play until the server closes. Raises ConnectionClosed, TimeoutError, Failed."""
-        await self._say(hello)
-        moving: asyncio.Task[None] | None = None
+        """Play until the server closes. Raises ConnectionClosed then, TimeoutError after QUIET_SECONDS without a
+        message, and FrameError for a frame that cannot be decoded."""
+        await self._send(hello)
+        pressing: asyncio.Task[None] | None = None
         try:
             while True:
-                waits = MOST_THINKING if self._turns and not self._to_act else self._break_seconds
+                waits = MAX_TURN_SECONDS if self._turns and not self._to_act else self._break_seconds
                 async with asyncio.timeout(QUIET_SECONDS + waits):
                     data = await self._websocket.recv()
                 if isinstance(data, bytes):
-                    await self._frame(data)
+                    await self._receive_frame(data)
                 else:
-                    await self._told(json.loads(data))
-                if self._hands is not None and moving is None:
-                    moving = asyncio.create_task(self._move(self._hands))
+                    await self._receive_message(json.loads(data))
+                if self._keys is not None and pressing is None:
+                    pressing = asyncio.create_task(self._press(self._keys))
         finally:
-            if moving is not None:
-                moving.cancel()
-                await asyncio.wait({moving})
+            if pressing is not None:
+                pressing.cancel()
+                await asyncio.wait({pressing})
 
-    async def _say(self, message: dict[str, Any]) -> None:
-        with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be heard
+    async def _send(self, message: dict[str, Any]) -> None:
+        with contextlib.suppress(ConnectionClosed):  # messages that came before the end are still to be read
             await self._websocket.send(json.dumps(message))
 
     async def _load(self, images: Sequence[dict[str, Any]]) -> None:
@@ -114,9 +118,10 @@ class GameConnection:
         for image in images:
             if image["hash"] not in self._images:
                 self._images.add(image["hash"])
-                await self._say({"asset": image["name"]})
+                await self._send({"asset": image["name"]})
 
-    async def _frame(self, data: bytes) -> None:
+    async def _receive_frame(self, data: bytes) -> None:
+        """Acknowledge a frame or a scene, and count it."""
         if data[:1] == _ASSET:
             self._play.bytes += len(data)
             return
@@ -124,27 +129,28 @@ class GameConnection:
             frame_id = self._scene.decode(data)
         else:
             frame_id, _ = self._screen.decode(data)
-        await self._say({"ack": frame_id})
+        await self._send({"ack": frame_id})
         play, now = self._play, time.monotonic()
         play.bytes += len(data)
-        if not self._first:  # the first picture may be one that an earlier connection has shown
+        if not self._first:  # an earlier connection may have shown the first frame, too
             play.frames += 1
         self._first = False
-        if self._state == "playing" and not self._turns:  # turn by turn there is no rate at which pictures come
+        if self._state == "playing" and not self._turns:  # a game that is played turn by turn has no frame rate
             if self._last_frame is not None:
-                play.seen += 1
+                play.timed_frames += 1
                 play.seconds += now - self._last_frame
             self._last_frame = now
         else:
             self._last_frame = None
 
-    async def _told(self, message: dict[str, Any]) -> None:
+    async def _receive_message(self, message: dict[str, Any]) -> None:
+        """Note what the server says of the game, and press the button that begins it or goes on."""
         play = self._play
-        if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # a bot that presses keys at random hears that one
-            self._account.troubles.append(f"the game says: {message['error']}")
+        if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # random keys cause NOT_POSSIBLE
+            self._report.troubles.append(f"the game says: {message['error']}")
         if "UI" in message:
             self._turns = message.get("pace") == "turns"
-            self._hands = Hands(self._random, message)
+            self._keys = RandomKeys(self._random, message)
             await self._load(message.get("assets", ()))
             self._may_stop = "stop" in message["UI"]
         if message.get("done"):
@@ -157,23 +163,24 @@ class GameConnection:
             self._break_seconds = sum(message.get(name, 0.0) for name in ("nextIn", "startsIn", "beginsIn", "heldFor"))
             if self._state in ("ready", "paused", "break"):
                 self._last_frame = None
-            if self._goes_on(message):
-                await self._say({"command": "start"})
+            if self._presses_start(message):
+                await self._send({"command": "start"})
 
-    def _goes_on(self, message: dict[str, Any]) -> bool:
-        """Whether the bot presses the button with which the game begins or goes on."""
+    def _presses_start(self, message: dict[str, Any]) -> bool:
+        """Whether the bot presses the button that begins the game or goes on."""
         if self._state == "break":
-            by_itself = "nextIn" in message  # otherwise there is a page to read, and a button after it
-            # Of those who are offered a break that ends by itself, every second one waits for its end.
+            by_itself = "nextIn" in message  # otherwise the break shows a page with a button
+            # If a break ends by itself, every second bot waits for its end.
             if not by_itself or self._random.random() < 0.5:
                 return True
         if "people" not in message:
             return self._state in ("ready", "paused")
-        waits = "beginsIn" in message or "heldFor" in message  # for others, which no command ends
+        waits = "beginsIn" in message or "heldFor" in message  # the game waits for others, and no command ends that
         reads = message["people"].get(message.get("you")) == "reads"
         return reads or (self._state == "paused" and not waits)
 
-    async def _move(self, hands: Hands) -> None:
+    async def _press(self, keys: RandomKeys) -> None:
+        """Press keys while the game is played; stop the game when it was played for long enough."""
         began: float | None = None
         while True:
             await asyncio.sleep(self._random.uniform(0.1, 0.5))
@@ -182,7 +189,7 @@ class GameConnection:
             began = began or time.monotonic()
             played = time.monotonic() - began if self._turns else self._play.seconds
             if self._seconds and played >= self._seconds and self._may_stop:
-                await self._say({"command": "stop"})
+                await self._send({"command": "stop"})
                 return
-            for message in hands.move():
-                await self._say(message)
+            for message in keys.move():
+                await self._send(message)

@@ -1,4 +1,4 @@
-"""A request of a bot's, and its answer: it goes where `AllowedAddresses` allows, and follows no redirect by itself."""
+"""Sends a bot's HTTP requests: only to addresses that `AllowedAddresses` allows. It does not follow redirects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import h11
 
 from bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
 
-ASK_SECONDS = 20.0  # for the answer to a request
+ASK_SECONDS = 20.0  # from a request to the end of its response
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Reply:
 
 
 async def ask(
-    address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS, where: AllowedAddresses = THIS_MACHINE
+    address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS, allowed: AllowedAddresses = THIS_MACHINE
 ) -> Reply:
-    """One request, a POST of a form if there is a body.
+    """Send one request and return its response. With a `body`, the request is the POST of a form.
 
-    Raises AddressRefused for an address that bots do not go to, OSError if there is no (whole) answer in time.
+    Raises AddressRefused if `allowed` does not have the address, OSError without a whole response in `seconds`.
     """
-    parts = urlsplit(where.page(address))
+    parts = urlsplit(allowed.page(address))
     target = urlunsplit(("", "", parts.path or "/", parts.query, ""))
     headers = [("Host", parts.netloc), ("Accept", "text/html"), ("Connection", "close"), ("User-Agent", "rehearsal")]
     if body is not None:
@@ -44,9 +44,9 @@ async def ask(
     try:
         async with asyncio.timeout(seconds):
             host = parts.hostname or ""
-            tls = where.tls if parts.scheme == "https" else None
+            tls = allowed.tls if parts.scheme == "https" else None
             return await _exchange(
-                *where.dial(host, parts.port or PORTS[parts.scheme]), request, body or b"", tls=tls, name=host
+                *allowed.dial(host, parts.port or PORTS[parts.scheme]), request, body or b"", tls=tls, name=host
             )
     except h11.ProtocolError as error:
         raise ConnectionError(f"not HTTP: {error}") from error
@@ -75,7 +75,7 @@ async def _exchange(
                 fields = {bytes(name).decode().lower(): bytes(value).decode("latin-1") for name, value in head.headers}
                 return Reply(head.status_code, fields, b"".join(parts))
             elif isinstance(event, h11.ConnectionClosed):
-                raise ConnectionError("closed without an answer")
+                raise ConnectionError("the connection was closed before a response")
     finally:
         writer.close()
         with contextlib.suppress(OSError):

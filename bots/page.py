@@ -1,4 +1,4 @@
-"""A page of the study as a bot reads it."""
+"""The page of a study, as a bot reads it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from bots import forms
 
 @dataclass(frozen=True)
 class VisitedPage:
-    """A page of the study."""
+    """A page of the study; `text` is its HTML."""
 
     address: str
     text: str
 
     @property
     def game(self) -> dict[str, Any] | None:
-        """What the game page was told; None on other pages."""
+        """The JSON data in the game page (docs/pages.md); None on other pages."""
         found = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
         data = json.loads(found[1]) if found else None
         return data if isinstance(data, dict) else None
@@ -37,11 +37,11 @@ class VisitedPage:
 
     @property
     def is_last(self) -> bool:
-        """Whether the study ends with this page."""
+        """Whether this is the study's last page."""
         return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None
 
     @property
     def code(self) -> str | None:
-        """The completion code, where a page shows one as the example does."""
+        """The text of the first element of class `code`: the completion code. None if there is no such element."""
         found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
         return html.unescape(found[1]).strip() if found else None

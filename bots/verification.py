@@ -1,4 +1,4 @@
-"""What bots sent and played, looked for in a folder with a study's data (keys: docs/architecture.md, "Documents")."""
+"""Looks for what bots sent and played in a folder with a study's data (keys: docs/architecture.md, "Documents")."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from bots.account import BotReport, PlayedStep
+from bots.report import BotReport, PlayedStep
 
-LARGEST = 512 * 1024**2  # bytes of a recording, unpacked: a study's agent writes it, and bots play for seconds
-BETWEEN = ("presence", "ping")  # lines of a session that may stand anywhere, also after an episode's end
+MAX_BYTES = 512 * 1024**2  # of a recording, unpacked: a study's agent writes it, and bots play only for seconds
+ANYWHERE = ("presence", "ping")  # kinds of lines of a session that may stand anywhere, also after an episode's end
 PIECE = 1024**2  # bytes unpacked at once
 
 
 @dataclass
 class StoredRecording:
-    """One recording as it lies in the data folder."""
+    """One recording in the data folder."""
 
     name: str
-    complete: bool = False
+    complete: bool = False  # it begins with a header and has its end
     step: str = ""  # of the study
     steps: int = 0  # of the environment
-    pictures: int = 0  # that could be shown: steps and resets
-    counted: bool = False  # in a `Verification`
+    pictures: int = 0  # that a browser could show: one for each step and each reset
+    counted: bool = False  # `Verification` has counted it, for this bot or another of the session
 
 
 def read_recording(path: Path) -> StoredRecording:
-    """Read a recording to its end. Never raises: what cannot be read is not complete."""
+    """Read a recording to its end. Raises nothing: a recording that cannot be read is not complete."""
     found = StoredRecording(path.name)
     unpack, counts = zlib.decompressobj(31), Counter[str]()
     first, last = None, ("", "")
@@ -40,20 +40,20 @@ def read_recording(path: Path) -> StoredRecording:
             kind = str(line["kind"])
             first = first or line
             counts[kind if kind in ("step", "reset") else "other"] += 1
-            if kind not in BETWEEN:
+            if kind not in ANYWHERE:
                 last = (last[1], kind)
         found.step = str(first["step"]) if first else ""
         found.steps = counts["step"]
         found.pictures = found.steps + counts["reset"]
-        over = last[0] if last[1] == "break" else last[1]  # the break after an episode stands in its file
-        found.complete = unpack.eof and first is not None and first["kind"] == "header" and over == "end"
+        end = last[0] if last[1] == "break" else last[1]  # the break after an episode stands in the episode's file
+        found.complete = unpack.eof and first is not None and first["kind"] == "header" and end == "end"
     except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         found.complete = False
     return found
 
 
 def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
-    """The lines of a recording, unpacked piece by piece. Raises ValueError if there is more of it than of any game."""
+    """The lines of a recording, unpacked piece by piece. Raises ValueError if they are larger than MAX_BYTES."""
     begun, size = bytearray(), 0
     with path.open("rb") as file:
         while not unpack.eof:
@@ -62,7 +62,7 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
             if not packed and not text:
                 break
             size += len(text)
-            if size > LARGEST:
+            if size > MAX_BYTES:
                 raise ValueError("it is larger than a recording of a bot's game")
             *whole, rest = text.split(b"\n")
             for line in whole:
@@ -75,16 +75,16 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 
 @dataclass
 class Verification:
-    """What the data say about the bots, and what is missing. `recorded`: the project keeps recordings."""
+    """What was found of the bots in the data, and what is missing. `recorded`: the project keeps recordings."""
 
     recorded: bool = True
-    answers: int = 0
+    answers: int = 0  # of pages, found as they were sent
     answers_sent: int = 0
-    games: int = 0
+    games: int = 0  # answers of games found
     games_played: int = 0
     recordings: int = 0
-    steps: int = 0
-    codes: int = 0
+    steps: int = 0  # of environments, in the recordings
+    codes: int = 0  # final pages that show the stored completion code
     starts: list[float] = field(default_factory=list)  # seconds from request to ready
     sessions: dict[str, int] = field(default_factory=dict)  # how many of the bots played in each, by its id
     missing: list[str] = field(default_factory=list)
@@ -93,80 +93,82 @@ class Verification:
 def verify(
     data: Path,
     project_id: str,
-    accounts: Sequence[BotReport],
+    reports: Sequence[BotReport],
     *,
     recorded: bool = True,
     last_error: Callable[[str], str] = lambda _: "",
 ) -> Verification:
-    """Compare what is in a data folder with what the bots say. `recorded`: the project keeps recordings.
+    """Compare a data folder with the bots' reports. `recorded`: the project keeps recordings.
 
-    `last_error` gives what the log of a participant's last server says of its last error, where that is known.
+    `last_error` returns the last error in the log of a participant's last server, by the participant's id; "" if it
+    is not known.
     """
     found, read = Verification(recorded=recorded), dict[Path, list[StoredRecording]]()
-    for account in accounts:
-        folder = data / project_id / "users" / account.user_id
+    for report in reports:
+        folder = data / project_id / "users" / report.user_id
         membership = document(folder / "session.json")
-        together = data / project_id / "sessions" / str(membership["session"]) if membership.get("session") else None
-        if together is not None:
-            found.sessions[together.name] = found.sessions.get(together.name, 0) + 1
-        _look_at_answers(found, account, folder)
-        trials = (together or folder) / "trials"
-        _look_at_plays(found, account, folder, _recordings(trials, read), last_error)
+        session_id = membership.get("session") and str(membership["session"])
+        session = data / project_id / "sessions" / session_id if session_id else None
+        if session is not None:
+            found.sessions[session.name] = found.sessions.get(session.name, 0) + 1
+        _look_at_answers(found, report, folder)
+        trials = (session or folder) / "trials"
+        _look_at_plays(found, report, folder, _recordings(trials, read), last_error)
         for path in sorted(trials.rglob("*")):
             if path.is_file() and path.suffix != ".gz":
-                found.missing.append(f"{account.user_id}: {path.name} lies among the recordings")
+                found.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
         code = membership.get("completionCode") or document(folder / "participant.json").get("completionCode")
-        found.codes += bool(code) and str(code) in account.final_page
-    owners = {account.user_id for account in accounts} | found.sessions.keys()
+        found.codes += bool(code) and str(code) in report.final_page
+    owners = {report.user_id for report in reports} | found.sessions.keys()
     for path in sorted((data / "_servers").glob("*.json")):
         record = document(path)
         if record.get("ready") and record.get("userId") in owners:
             found.starts.append(_seconds(record["requested"], record["ready"]))
-    if 0 < found.codes < sum(account.finished for account in accounts):
+    if 0 < found.codes < sum(report.finished for report in reports):
         found.missing.append("some final pages lack their completion code, or show another")
     return found
 
 
-def _look_at_answers(found: Verification, account: BotReport, folder: Path) -> None:
-    """Compare the answers to pages with what the bot has sent."""
-    for step, sent in account.answers.items():
+def _look_at_answers(found: Verification, report: BotReport, folder: Path) -> None:
+    """Compare the stored answers to pages with those that the bot has sent."""
+    for step, sent in report.answers.items():
         found.answers_sent += 1
         if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
             found.answers += 1
         else:
-            found.missing.append(f"{account.user_id}: the answers of step {step} are not what was sent")
+            found.missing.append(f"{report.user_id}: the answers of step {step} are not what was sent")
 
 
 def _look_at_plays(
     found: Verification,
-    account: BotReport,
+    report: BotReport,
     folder: Path,
     recordings: list[StoredRecording],
     last_error: Callable[[str], str],
 ) -> None:
     """Compare each game step with its answer and its recordings."""
-    for play in account.plays:
-        who, stored = f"{account.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
+    for play in report.plays:
+        who, stored = f"{report.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
         answers = stored.get("answers") or {}
         if play.unmatched:
             _look_at_unmatched(found, who, play, answers)
             continue
-        own = [one for one in recordings if one.step == play.step]
-        _look_at_game(found, who, play, answers, own)
-        _look_for_the_cause(found, who, answers, last_error(account.user_id))
-        if found.recorded and not own:
+        of_step = [recording for recording in recordings if recording.step == play.step]
+        _look_at_game(found, who, play, answers, of_step)
+        _look_for_the_cause(found, who, answers, last_error(report.user_id))
+        if found.recorded and not of_step:
             found.missing.append(f"{who}: no recording")
 
 
 def _recordings(trials: Path, read: dict[Path, list[StoredRecording]]) -> list[StoredRecording]:
-    """The recordings in this folder. Those of a session are several bots', and are read once."""
+    """The recordings in this folder, read once: several bots share those of a session."""
     if trials not in read:
         read[trials] = [read_recording(path) for path in sorted(trials.glob("*/*.gz"))]
     return read[trials]
 
 
 def _look_at_unmatched(found: Verification, who: str, play: PlayedStep, answers: dict[str, Any]) -> None:
-    """Whether the answer to a game says that its bot found no others."""
+    """Check that the answer of a game says that its bot was unmatched."""
     found.games_played += 1
     if answers.get("outcome") == play.outcome:
         found.games += 1
@@ -177,7 +179,7 @@ def _look_at_unmatched(found: Verification, who: str, play: PlayedStep, answers:
 def _look_at_game(
     found: Verification, who: str, play: PlayedStep, answers: dict[str, Any], recordings: list[StoredRecording]
 ) -> None:
-    """Compare what a bot has seen of a game with its answer and its recordings."""
+    """Compare what a bot has received of a game with its answer and its recordings."""
     found.games_played += 1
     if not answers:
         found.missing.append(f"{who}: the game's answer is not there")
@@ -188,7 +190,7 @@ def _look_at_game(
     if not recordings:
         return
     steps, pictures = sum(one.steps for one in recordings), sum(one.pictures for one in recordings)
-    uncounted = [one for one in recordings if not one.counted]  # another member's look may have counted them
+    uncounted = [one for one in recordings if not one.counted]  # the others were counted for another member
     found.recordings += len(uncounted)
     found.steps += sum(one.steps for one in uncounted)
     found.missing += [f"{who}: {one.name} is cut off" for one in uncounted if not one.complete]
@@ -201,7 +203,7 @@ def _look_at_game(
 
 
 def _look_for_the_cause(found: Verification, who: str, answers: dict[str, Any], error: str) -> None:
-    """Say why a game failed, in the words of its server's log."""
+    """Add the last error in the server's log to `missing`, if the game failed or has no answer."""
     if answers.get("outcome") == "failed":
         found.missing.append(f"{who}: the game ended with an error of the agent's{f': {error}' if error else ''}")
     elif not answers and error:
@@ -209,7 +211,7 @@ def _look_for_the_cause(found: Verification, who: str, answers: dict[str, Any], 
 
 
 def _same(stored: object, sent: object) -> bool:
-    """Byte for byte: the same names in the same order with the same texts."""
+    """Whether both hold the same names in the same order with the same texts."""
     return json.dumps(stored).encode() == json.dumps(sent).encode()
 
 
@@ -218,7 +220,7 @@ def _seconds(before: str, after: str) -> float:
 
 
 def document(path: Path) -> dict[str, Any]:
-    """What a JSON file holds; empty if it is not there (yet)."""
+    """Return the object in a JSON file; {} if there is no such file, or no object in it."""
     try:
         data = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):

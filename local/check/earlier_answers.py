@@ -134,9 +134,9 @@ def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
     kinds = {control.kind for control in controls}
     needed = any(control.required for control in controls)
     if kinds == {"radio"} or (kinds == {"checkbox"} and len(controls) == 1):
-        found = {control.given.get("value", "on") for control in controls}
+        found = {control.attributes.get("value", "on") for control in controls}
         unanswered = not needed
-    elif kinds == {"select"} and len(controls) == 1 and "multiple" not in controls[0].given:
+    elif kinds == {"select"} and len(controls) == 1 and "multiple" not in controls[0].attributes:
         found = {option.value for option in controls[0].options if not option.disabled}
         if needed:
             found.discard("")

@@ -26,11 +26,11 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from bots.account import BotReport
 from bots.addresses import THIS_MACHINE, AddressRefused
 from bots.bot import Bot
 from bots.crowd import SIGNALS, interruptible, walk
 from bots.links import with_project
+from bots.report import BotReport
 from hippodrome.config import Config, ConfigErrors, read_project
 from local.rehearsal.crashes import ServerLogs
 from local.rehearsal.logs import FunctionLog, verify
@@ -84,8 +84,8 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("Bots", total=bots, doing="")
 
-        def watch(accounts: Sequence[BotReport]) -> None:
-            stages = [re.sub(r"step \S+", "pages", account.stage) for account in accounts]
+        def watch(reports: Sequence[BotReport]) -> None:
+            stages = [re.sub(r"step \S+", "pages", report.stage) for report in reports]
             over = sum(stage in ("finished", "failed") for stage in stages)
             doing = [
                 f"{stages.count(stage)} {words}"
@@ -183,19 +183,19 @@ def _rehearse_and_report(
     functions = FunctionLog(data) if data else None
     servers = ServerLogs(data) if data else None
     with _bar(console, crowd.bots) as watch:
-        accounts = interruptible(rehearse(link, crowd, watch))
+        reports = interruptible(rehearse(link, crowd, watch))
     left = None
     if data:
-        ids = {account.user_id for account in accounts}
+        ids = {report.user_id for report in reports}
         sessions = sessions_of(data, config.project.id, ids)
         left = wait_until_gone(data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set()))
     if study and left:
         left.stubborn = not study.interrupt()
         left.processes = max(left.processes, study.clear())
-    found = verify(data, config.project.id, accounts, recorded=config.trial.s3upload) if data else None
+    found = verify(data, config.project.id, reports, recorded=config.trial.s3upload) if data else None
     fine = report(
         console,
-        accounts,
+        reports,
         found,
         left,
         time.monotonic() - began,

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from bots import verification
-from bots.account import BotReport
+from bots.report import BotReport
 from bots.verification import Verification, document
 from hippodrome.model import ids
 from local.activity.function_log import complaint
@@ -17,10 +17,10 @@ from local.rehearsal.study_process import logs_of
 from protocol.keys import membership_key
 
 
-def verify(data: Path, project_id: str, accounts: Sequence[BotReport], *, recorded: bool = True) -> Verification:
+def verify(data: Path, project_id: str, reports: Sequence[BotReport], *, recorded: bool = True) -> Verification:
     """Compare what is in the data folder with what the bots say. `recorded`: the project keeps recordings."""
     return verification.verify(
-        data, project_id, accounts, recorded=recorded, last_error=partial(_last_error, data, project_id)
+        data, project_id, reports, recorded=recorded, last_error=partial(_last_error, data, project_id)
     )
 
 

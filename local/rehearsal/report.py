@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bots.account import BotReport, PlayedStep
+from bots.report import BotReport, PlayedStep
 from bots.verification import Verification
 from local.rehearsal.crashes import AgentCrash
 from local.rehearsal.study_process import Leftovers
@@ -24,7 +24,7 @@ SHOWN_CRASHES = 3  # tracebacks of agent.py
 
 def report(
     console: Console,
-    accounts: Sequence[BotReport],
+    reports: Sequence[BotReport],
     found: Verification | None,
     left: Leftovers | None,
     seconds: float,
@@ -39,15 +39,15 @@ def report(
     `recorded` and `live` are what config.yml says, `said` what the functions complained of, `crashes` the errors of
     agent.py.
     """
-    table = Table(show_header=False, title=_title(accounts, seconds), title_justify="left")
+    table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")
     for name, value in [
-        *_played(accounts, found),
-        *_found(accounts, found, recorded=recorded, live=live),
+        *_played(reports, found),
+        *_found(reports, found, recorded=recorded, live=live),
         *([("servers left over", str(max(left.processes, len(left.records))))] if left else []),
     ]:
         table.add_row(name, value)
-    errors = [f"{account.user_id}: {error}" for account in accounts for error in account.errors]
-    troubles = [f"{account.user_id}: {trouble}" for account in accounts for trouble in account.troubles]
+    errors = [f"{report.user_id}: {error}" for report in reports for error in report.errors]
+    troubles = [f"{report.user_id}: {trouble}" for report in reports for trouble in report.troubles]
     if troubles:
         table.add_row("troubles got over", str(len(troubles)))
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
@@ -61,21 +61,21 @@ def report(
     if said:
         console.print("  Local mode said:")
     _print(console, said, "red" if bad else "yellow")
-    return all(account.finished for account in accounts) and not bad and not crashes
+    return all(report.finished for report in reports) and not bad and not crashes
 
 
 Rows = list[tuple[str, str]]
 
 
-def _title(accounts: Sequence[BotReport], seconds: float) -> str:
-    return f"Rehearsal with {len(accounts)} bot{'s' if len(accounts) != 1 else ''}, {seconds:.0f} s"
+def _title(reports: Sequence[BotReport], seconds: float) -> str:
+    return f"Rehearsal with {len(reports)} bot{'s' if len(reports) != 1 else ''}, {seconds:.0f} s"
 
 
-def _played(accounts: Sequence[BotReport], found: Verification | None) -> Rows:
+def _played(reports: Sequence[BotReport], found: Verification | None) -> Rows:
     """What the bots have seen."""
-    plays = [play for account in accounts for play in account.plays]
-    rows = [("bots finished", _of(sum(account.finished for account in accounts), len(accounts)))]
-    rows += _together(accounts)
+    plays = [play for report in reports for play in report.plays]
+    rows = [("bots finished", _of(sum(report.finished for report in reports), len(reports)))]
+    rows += _together(reports)
     if plays:
         rows.append(("wait on the game page", _spread([play.waited for play in plays])))
     if found and found.starts:
@@ -89,9 +89,9 @@ def _played(accounts: Sequence[BotReport], found: Verification | None) -> Rows:
     return rows
 
 
-def _together(accounts: Sequence[BotReport]) -> Rows:
+def _together(reports: Sequence[BotReport]) -> Rows:
     """Who played with others, for a study of several participants."""
-    plays = [play for account in accounts for play in account.plays]
+    plays = [play for report in reports for play in report.plays]
     waited = [play.lobby for play in plays if play.lobby is not None]
     if not waited and not any(play.unmatched or play.members > 1 for play in plays):
         return []
@@ -106,7 +106,7 @@ def _together(accounts: Sequence[BotReport]) -> Rows:
     )
     early = Counter(play.outcome for play in plays if play.outcome in EARLY)
     ended = ", ".join(f"{count} {outcome}" for outcome, count in sorted(early.items()))
-    alone = [account.user_id for account in accounts if any(play.unmatched for play in account.plays)]
+    alone = [report.user_id for report in reports if any(play.unmatched for play in report.plays)]
     names = ", ".join(alone[:SHOWN_NAMES]) + (" …" if len(alone) > SHOWN_NAMES else "")
     return [
         ("games played together", made or "none"),
@@ -116,13 +116,13 @@ def _together(accounts: Sequence[BotReport]) -> Rows:
     ]
 
 
-def _found(accounts: Sequence[BotReport], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
+def _found(reports: Sequence[BotReport], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
     """What of it is in the data."""
     if not found:
         return [("data", "not looked at: --data says where they are")]
     unrecorded = "none expected: config.yml says `s3upload: false`"
     closed = "none expected: config.yml says `live: false`, so no participant gets in"
-    finished = sum(account.finished for account in accounts)
+    finished = sum(report.finished for report in reports)
     recordings = f"{found.recordings}, with {found.steps} steps"
     return [
         ("answers found", _of(found.answers, found.answers_sent)),

@@ -141,13 +141,13 @@ class Site:
                 self.dialled.append(f"{host}:{asked}")
                 return "127.0.0.1", port
 
-            where: AllowedAddresses = OneSite(
+            allowed: AllowedAddresses = OneSite(
                 ONE_SITE.site, ONE_SITE.servers, ONE_SITE.project_id, tls=self._theirs, connect=connect
             )
-            bot = Bot(LINK, "bot-1", Random(1), patience=patience, where=where, play=1)
+            bot = Bot(LINK, "bot-1", Random(1), patience=patience, allowed=allowed, play=1)
             async with server:
-                account = await bot.run()
-            return [*account.errors, *account.troubles]
+                report = await bot.run()
+            return [*report.errors, *report.troubles]
 
         return asyncio.run(held())
 

@@ -63,7 +63,7 @@ def test_what_is_no_whole_recording_is_not_complete(tmp_path: Path, packed: byte
 def test_a_bomb_is_no_recording_and_fills_no_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: bytes
 ) -> None:
-    monkeypatch.setattr(verification, "LARGEST", 2 * 1024**2)
+    monkeypatch.setattr(verification, "MAX_BYTES", 2 * 1024**2)
     packed = recorded(tmp_path, gzip.compress(lines(GAME[0]) + line * 10_000))
     assert packed.stat().st_size < 1024**2
     tracemalloc.start()

@@ -21,7 +21,7 @@ import pytest
 
 from bots.addresses import THIS_MACHINE, AddressRefused
 from bots.bot import Bot
-from bots.game import Hands
+from bots.game import RandomKeys
 from bots.links import with_project, with_user
 from local.new import LEFT_OUT
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
@@ -299,26 +299,28 @@ def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: 
     assert yaml.safe_load((tmp_path / "copy" / "config.yml").read_text())["project"] == tree["project"]
 
 
-def test_hands_press_only_what_the_game_knows() -> None:
-    hands = Hands(Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]})
-    said = [message for _ in range(300) for message in hands.move()]
+def test_random_keys_are_only_what_the_game_knows() -> None:
+    keys_pressed = RandomKeys(
+        Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]}
+    )
+    said = [message for _ in range(300) for message in keys_pressed.move()]
     assert {message["action"] for message in said if "action" in message} == {"left", "up", "jump"}
     assert {message["command"] for message in said if "command" in message} == {"good"}
 
 
-def test_hands_press_the_keys_that_the_project_names() -> None:
+def test_random_keys_are_the_keys_that_the_project_names() -> None:
     keys = {"ArrowLeft": "left", "x+y": "jump"}
-    hands = Hands(Random(1), {"UI": ["left", "up"], "actionSpace": ["noop", "left", "jump"], "keys": keys})
-    said = [message for _ in range(300) for message in hands.move()]
+    keys_pressed = RandomKeys(Random(1), {"UI": ["left", "up"], "actionSpace": ["noop", "left", "jump"], "keys": keys})
+    said = [message for _ in range(300) for message in keys_pressed.move()]
     assert {message["key"] for message in said if "held" in message} == {"ArrowLeft", "x", "y"}
     assert {message["action"] for message in said if "action" in message} == {"left", "jump"}
 
 
 def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
     bot = Bot(f"http://127.0.0.1:{free_port}/next?projectId=x", "ada", Random(0), patience=1)
-    account = asyncio.run(bot.run())
-    assert not account.finished
-    assert "no answer from" in account.errors[0]
+    report = asyncio.run(bot.run())
+    assert not report.finished
+    assert "no answer from" in report.errors[0]
 
 
 def test_the_link_of_one_participant() -> None:

@@ -12,10 +12,10 @@ from typing import Any
 import psutil
 import pytest
 
-from bots.account import BotReport
 from bots.bot import Bot
 from bots.http import ask
 from bots.links import with_user
+from bots.report import BotReport
 from local.rehearsal.logs import Verification, verify
 from local.rehearsal.study_process import NotHeld, StudyProcess, servers_of, wait_until_gone
 
@@ -37,19 +37,19 @@ async def with_bots(bots: list[Bot], meanwhile: Awaitable[Any] | None = None) ->
             group.create_task(each.run())
         if meanwhile is not None:
             await meanwhile
-    return [each.account for each in bots]
+    return [each.report for each in bots]
 
 
 def plays(*bots: Bot, frames: int = 10) -> Callable[[], bool]:
-    return lambda: all(b.account.plays and b.account.plays[-1].frames >= frames for b in bots)
+    return lambda: all(b.report.plays and b.report.plays[-1].frames >= frames for b in bots)
 
 
-def looked_at(study: StudyProcess, accounts: list[BotReport]) -> Verification:
+def looked_at(study: StudyProcess, reports: list[BotReport]) -> Verification:
     """Everybody has finished, and nothing they did is missing."""
-    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * len(accounts), accounts
-    found = verify(study.data, "tiny", accounts)
+    assert [(report.errors, report.finished) for report in reports] == [([], True)] * len(reports), reports
+    found = verify(study.data, "tiny", reports)
     assert found.missing == []
-    assert (found.answers, found.games, found.codes) == (3 * len(accounts), len(accounts), len(accounts))
+    assert (found.answers, found.games, found.codes) == (3 * len(reports), len(reports), len(reports))
     return found
 
 
@@ -62,12 +62,12 @@ def test_two_play_at_once_on_servers_of_their_own(project: Any, hold: Any) -> No
         await until(plays(*bots))
         together.append({process.environ()["USER_ID"] for process in servers_of(study.data)})
 
-    accounts = asyncio.run(with_bots(bots, watch()))
+    reports = asyncio.run(with_bots(bots, watch()))
     assert together == [{"ada", "grace"}]
-    ada, grace = (account.plays[0] for account in accounts)
+    ada, grace = (report.plays[0] for report in reports)
     assert set(ada.addresses).isdisjoint(grace.addresses)
-    found = looked_at(study, accounts)
-    assert [account.troubles for account in accounts] == [[], []]
+    found = looked_at(study, reports)
+    assert [report.troubles for report in reports] == [[], []]
     assert [(play.done, play.episodes, play.score) for play in (ada, grace)] == [(True, 2, 90)] * 2
     assert (found.recordings, found.steps) == (4, 180)
     assert wait_until_gone(study.data).words() == []
@@ -95,9 +95,9 @@ def test_local_mode_is_killed_and_started_again(project: Any, hold: Any, free_po
             page = await reader.do(page)
 
     asyncio.run(with_bots([player], crash()))
-    found = looked_at(study, [player.account, reader.account])
+    found = looked_at(study, [player.report, reader.report])
     assert (found.recordings, found.steps) == (2, 480)
-    assert len(player.account.plays[0].addresses) == 1  # went on where they were
+    assert len(player.report.plays[0].addresses) == 1  # went on where they were
     assert wait_until_gone(study.data).words() == []
 
 
@@ -108,7 +108,7 @@ def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port:
 
     async def crash() -> None:
         await until(plays(player, frames=60))
-        seen = player.account.plays[0]
+        seen = player.report.plays[0]
         await until(lambda: study.steps_written() > seen.frames - 30)  # a busy machine may write it late
         study.kill()
         for process in servers_of(study.data):
@@ -117,15 +117,15 @@ def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port:
         await asyncio.to_thread(hold, folder, port=free_port)
 
     asyncio.run(with_bots([player], crash()))
-    account = player.account
-    assert (account.errors, account.finished) == ([], True)
-    assert len(account.plays[0].addresses) == 2
-    found = verify(study.data, "tiny", [account])
+    report = player.report
+    assert (report.errors, report.finished) == ([], True)
+    assert len(report.plays[0].addresses) == 2
+    found = verify(study.data, "tiny", [report])
     assert (found.answers, found.games) == (3, 1)
     assert found.recordings == 2  # what was played before is kept, too
     # 150 if the game went on where it was; else all of the second game, and most of the first.
-    assert 150 <= found.steps < account.plays[0].frames + 2
-    assert found.steps > account.plays[0].frames - 45  # half a second may be lost, and what was played until the kill
+    assert 150 <= found.steps < report.plays[0].frames + 2
+    assert found.steps > report.plays[0].frames - 45  # half a second may be lost, and what was played until the kill
     assert [line for line in found.missing if "is cut off" not in line and "frames seen" not in line] == []
     assert wait_until_gone(study.data).words() == []
 
@@ -144,11 +144,11 @@ def test_ctrl_c_ends_everything_and_the_study_can_go_on(project: Any, hold: Any,
         assert servers_of(study.data) == []
         await asyncio.to_thread(hold, folder, port=free_port)
 
-    accounts = asyncio.run(with_bots(bots, interrupt()))
+    reports = asyncio.run(with_bots(bots, interrupt()))
     assert lasted[0] < 20
-    found = looked_at(study, accounts)  # no recording is cut off
+    found = looked_at(study, reports)  # no recording is cut off
     assert found.recordings == 4
-    assert [len(account.plays[0].addresses) for account in accounts] == [2, 2]
+    assert [len(report.plays[0].addresses) for report in reports] == [2, 2]
     assert wait_until_gone(study.data).words() == []
 
 
@@ -164,8 +164,8 @@ def test_one_data_folder_is_for_one_study_at_a_time(project: Any, hold: Any) -> 
     study = hold(folder)
     with pytest.raises(NotHeld, match="already held"):
         StudyProcess(folder, study.data, log=study.log.with_name("second.log")).start()
-    accounts = asyncio.run(with_bots([bot(study, "ada")]))  # the first does not mind
-    looked_at(study, accounts)
+    reports = asyncio.run(with_bots([bot(study, "ada")]))  # the first does not mind
+    looked_at(study, reports)
 
 
 def test_a_study_that_is_not_live_does_not_exist(project: Any, hold: Any) -> None:
@@ -192,7 +192,7 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
         assert (again.step, (await ada.open()).step, second.step) == ("2", "2", "2")
 
     asyncio.run(walk())
-    found = verify(study.data, "tiny", [ada.account])
+    found = verify(study.data, "tiny", [ada.report])
     assert (found.answers, found.missing) == (1, [])
 
 

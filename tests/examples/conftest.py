@@ -61,13 +61,13 @@ def play_example(tmp_path: Path) -> Iterator[PlayExample]:
         study.start()
         bot = Bot(study.link, "ada", Random(name), play=0, patience=PATIENCE)
         asyncio.run(asyncio.wait_for(bot.run(), PATIENCE))
-        account, project = bot.account, config["project"]["id"]
-        assert (account.errors, account.troubles, account.finished) == ([], [], True)
-        assert verify(study.data, project, [account]).missing == []
+        report, project = bot.report, config["project"]["id"]
+        assert (report.errors, report.troubles, report.finished) == ([], [], True)
+        assert verify(study.data, project, [report]).missing == []
         assert wait_until_gone(study.data).words() == []
         assert study.interrupt()
         files = sorted((study.data / project / "users" / "ada" / "trials").glob("*/*.gz"))
-        return Played([list(read(file.read_bytes())) for file in files], vars(account.plays[-1]))
+        return Played([list(read(file.read_bytes())) for file in files], vars(report.plays[-1]))
 
     yield play
     for study in held:

@@ -61,10 +61,10 @@ def test_two_people_play(name: str, players: tuple[str, str], options: dict[str,
         async def walk() -> list[Any]:
             return list(await asyncio.wait_for(asyncio.gather(*(bot.run() for bot in bots)), PATIENCE))
 
-        accounts = asyncio.run(walk())
-        assert [(each.errors, each.troubles, each.finished) for each in accounts] == [([], [], True)] * 2
-        assert verify(study.data, name, accounts).missing == []
-        assert [each.plays[0].outcome for each in accounts] == ["finished", "finished"]
+        reports = asyncio.run(walk())
+        assert [(each.errors, each.troubles, each.finished) for each in reports] == [([], [], True)] * 2
+        assert verify(study.data, name, reports).missing == []
+        assert [each.plays[0].outcome for each in reports] == ["finished", "finished"]
         (file,) = (study.data / name / "sessions").glob("*/trials/*/*.gz")
         steps = [line for line in read(file.read_bytes()) if line["kind"] == "step"]
         for player in players:

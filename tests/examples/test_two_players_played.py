@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.account import BotReport
 from bots.bot import Bot
 from bots.page import VisitedPage
+from bots.report import BotReport
 from bots.verification import document
 from local.new import LEFT_OUT
 from local.rehearsal.logs import verify
@@ -64,12 +64,10 @@ async def walk(bots: list[Bot]) -> list[BotReport]:
     return list(await asyncio.gather(*(bot.run() for bot in bots)))
 
 
-def all_is_well(study: HeldStudy, accounts: list[BotReport]) -> None:
-    assert [(account.errors, account.troubles, account.finished) for account in accounts] == [([], [], True)] * len(
-        accounts
-    )
-    assert verify(study.data, PROJECT, accounts).missing == []
-    names = {account.user_id for account in accounts}
+def all_is_well(study: HeldStudy, reports: list[BotReport]) -> None:
+    assert [(report.errors, report.troubles, report.finished) for report in reports] == [([], [], True)] * len(reports)
+    assert verify(study.data, PROJECT, reports).missing == []
+    names = {report.user_id for report in reports}
     assert (
         wait_until_gone(
             study.data, names | sessions_of(study.data, PROJECT, names) | sessions_not_open(study.data, PROJECT)
@@ -86,14 +84,14 @@ def recorded(study: HeldStudy) -> list[list[dict[str, Any]]]:
 
 def test_two_find_each_other_and_a_third_goes_on_unmatched(hold: Hold) -> None:
     study = hold({"patience": 10}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
-    accounts = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo", "cy")), PATIENCE))
-    all_is_well(study, accounts)
-    plays = {account.user_id: account.plays[0] for account in accounts}
+    reports = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo", "cy")), PATIENCE))
+    all_is_well(study, reports)
+    plays = {report.user_id: report.plays[0] for report in reports}
     (alone,) = (name for name, play in plays.items() if play.unmatched)
     one, other = (name for name in plays if name != alone)
     assert plays[one].addresses == plays[other].addresses
     assert [plays[name].outcome for name in (one, other, alone)] == ["finished", "finished", "unmatched"]
-    assert "back" in accounts[["ada", "bo", "cy"].index(alone)].answers["4"]  # the survey asks them something else
+    assert "back" in reports[["ada", "bo", "cy"].index(alone)].answers["4"]  # the survey asks them something else
     (lines,) = recorded(study)
     steps = [line["players"] for line in lines if line["kind"] == "step"]
     assert steps
@@ -107,32 +105,32 @@ def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
     async def lose_it() -> list[BotReport]:
         bots = bots_of(study, "ada", "bo")
         walking = asyncio.ensure_future(walk(bots))
-        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
+        while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in bots):
             assert not walking.done()
             await asyncio.sleep(0.05)
-        while study.steps_written() < bots[0].account.plays[0].frames - 5:  # a busy machine may write them late
+        while study.steps_written() < bots[0].report.plays[0].frames - 5:  # a busy machine may write them late
             assert not walking.done()
             await asyncio.sleep(0.05)
         for server in servers_of(study.data):
             server.kill()
         return await walking
 
-    accounts = asyncio.run(asyncio.wait_for(lose_it(), PATIENCE))
-    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * 2
-    assert [len(account.plays[0].addresses) for account in accounts] == [2, 2]
-    assert [account.plays[0].outcome for account in accounts] == ["finished", "finished"]
-    missing = verify(study.data, PROJECT, accounts).missing  # the killed server's recording is cut off
+    reports = asyncio.run(asyncio.wait_for(lose_it(), PATIENCE))
+    assert [(report.errors, report.finished) for report in reports] == [([], True)] * 2
+    assert [len(report.plays[0].addresses) for report in reports] == [2, 2]
+    assert [report.plays[0].outcome for report in reports] == ["finished", "finished"]
+    missing = verify(study.data, PROJECT, reports).missing  # the killed server's recording is cut off
     assert [line for line in missing if not line.endswith(" is cut off") and " frames seen but " not in line] == []
     steps = sum(line["kind"] == "step" for lines in recorded(study) for line in lines)
     # Of what was seen, half a second may be lost, and what was played until the kill.
-    assert all(steps > account.plays[0].frames - 12 for account in accounts)
+    assert all(steps > report.plays[0].frames - 12 for report in reports)
 
 
 def test_after_patience_one_may_play_with_the_helper_in_the_empty_place(hold: Hold) -> None:
     study = hold({"patience": 10, "afterPatience": "policies"}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
-    (account,) = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada")), PATIENCE))
-    all_is_well(study, [account])
-    assert (account.plays[0].outcome, account.plays[0].members) == ("finished", 1)
+    (report,) = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada")), PATIENCE))
+    all_is_well(study, [report])
+    assert (report.plays[0].outcome, report.plays[0].members) == ("finished", 1)
     (lines,) = recorded(study)
     steps = [line["players"] for line in lines if line["kind"] == "step"]
     assert {step["red"]["by"] for step in steps} <= {"human", "none"}
@@ -146,16 +144,16 @@ def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(ho
     async def leave() -> BotReport:
         bots = bots_of(study, "ada", "bo")
         ada, bo = (asyncio.ensure_future(bot.run()) for bot in bots)
-        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in bots):
+        while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in bots):
             await asyncio.sleep(0.05)
         bo.cancel()
         return await ada
 
-    account = asyncio.run(asyncio.wait_for(leave(), PATIENCE))
-    assert (account.finished, account.errors, account.plays[0].outcome) == (True, [], "partnerLeft")
-    assert ["has not come back" in trouble for trouble in account.troubles] == [True]
+    report = asyncio.run(asyncio.wait_for(leave(), PATIENCE))
+    assert (report.finished, report.errors, report.plays[0].outcome) == (True, [], "partnerLeft")
+    assert ["has not come back" in trouble for trouble in report.troubles] == [True]
     assert document(study.data / PROJECT / "users/bo/answers/3.json")["answers"]["outcome"] == "left"
-    assert verify(study.data, PROJECT, [account]).missing == []
+    assert verify(study.data, PROJECT, [report]).missing == []
 
 
 def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -> None:
@@ -164,21 +162,21 @@ def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -
     async def kill_twice() -> list[BotReport]:
         ada, bo = bots_of(study, "ada", "bo")
         first = asyncio.ensure_future(ada.run())
-        while ada.account.stage != "waits for others":
+        while ada.report.stage != "waits for others":
             await asyncio.sleep(0.05)
         study.kill()
         await asyncio.to_thread(study.start)
         second = asyncio.ensure_future(bo.run())
-        while not all(bot.account.plays and bot.account.plays[0].frames > 6 for bot in (ada, bo)):
+        while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in (ada, bo)):
             await asyncio.sleep(0.05)
         study.kill()
         await asyncio.to_thread(study.start)
         return [await first, await second]
 
-    accounts = asyncio.run(asyncio.wait_for(kill_twice(), PATIENCE))
-    assert [(account.errors, account.finished) for account in accounts] == [([], True)] * 2
-    assert [(account.plays[0].outcome, account.plays[0].members) for account in accounts] == [("finished", 2)] * 2
-    assert verify(study.data, PROJECT, accounts).missing == []
+    reports = asyncio.run(asyncio.wait_for(kill_twice(), PATIENCE))
+    assert [(report.errors, report.finished) for report in reports] == [([], True)] * 2
+    assert [(report.plays[0].outcome, report.plays[0].members) for report in reports] == [("finished", 2)] * 2
+    assert verify(study.data, PROJECT, reports).missing == []
     assert len(recorded(study)) == 1
 
 
@@ -202,7 +200,7 @@ class Decided(Bot):
     plays = ""
 
     async def post(self, address: str, pairs: list[tuple[str, str]]) -> VisitedPage:
-        for answers in self.account.answers.values():
+        for answers in self.report.answers.values():
             if "plays" in answers:
                 answers["plays"] = self.plays
         return await super().post(address, [(name, self.plays if name == "plays" else it) for name, it in pairs])
@@ -211,7 +209,7 @@ class Decided(Bot):
 def decided(study: HeldStudy, **plays: str) -> list[Bot]:
     bots = [Decided(study.link, name, Random(name), play=0, patience=PATIENCE) for name in plays]
     for bot in bots:
-        bot.plays = plays[bot.account.user_id]
+        bot.plays = plays[bot.report.user_id]
     return list[Bot](bots)
 
 
@@ -220,9 +218,9 @@ def test_the_function_match_puts_opposites_together(hold: Hold) -> None:
         {"patience": 40, "matching": "match"}, {"maxEpisodes": 1, "episodeSeconds": 3, "countdown": 1}, OPPOSITES
     )
     bots = decided(study, ada="never", bo="never", cy="often", di="often")
-    accounts = asyncio.run(asyncio.wait_for(walk(bots), PATIENCE))
-    all_is_well(study, accounts)
-    assert [account.plays[0].outcome for account in accounts] == ["finished"] * 4
+    reports = asyncio.run(asyncio.wait_for(walk(bots), PATIENCE))
+    all_is_well(study, reports)
+    assert [report.plays[0].outcome for report in reports] == ["finished"] * 4
     sessions = [document(file) for file in (study.data / PROJECT / "sessions").glob("*/session.json")]
     groups = [sorted(member["userId"] for member in session["members"]) for session in sessions]
     assert len(groups) == 2
@@ -231,9 +229,9 @@ def test_the_function_match_puts_opposites_together(hold: Hold) -> None:
 
 def test_if_the_function_match_raises_people_go_on_unmatched_and_the_log_says_why(hold: Hold) -> None:
     study = hold({"patience": 15, "matching": "match"}, {"maxEpisodes": 1}, FAILS)
-    accounts = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo")), PATIENCE))
-    all_is_well(study, accounts)
-    assert [account.plays[0].outcome for account in accounts] == ["unmatched"] * 2
+    reports = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo")), PATIENCE))
+    all_is_well(study, reports)
+    assert [report.plays[0].outcome for report in reports] == ["unmatched"] * 2
     logs = [file.read_text(errors="replace") for file in study.data.parent.rglob("*.log")]
     told = [log for log in logs if "match() failed, and nobody is matched" in log]
     assert told

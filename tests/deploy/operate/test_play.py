@@ -185,9 +185,9 @@ def test_ctrl_c_in_the_midst_removes_everything(
 ) -> None:
     watch = walk.Walk._watch
 
-    def pressed(self: walk.Walk, accounts: Any) -> None:
-        watch(self, accounts)
-        if any(account.stage == "plays" for account in accounts):
+    def pressed(self: walk.Walk, reports: Any) -> None:
+        watch(self, reports)
+        if any(report.stage == "plays" for report in reports):
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(walk.Walk, "_watch", pressed)

@@ -53,7 +53,7 @@ class RehearsalContext:
         self.transcript.hide(user)
         patience = min(BOT_PATIENCE, self.left())
         random = Random(user)  # noqa: S311 - a game's keys
-        return Bot(self.copy.link(user), user, random, play=play, patience=patience, where=self.where)
+        return Bot(self.copy.link(user), user, random, play=play, patience=patience, allowed=self.where)
 
     def server(self, user: str) -> Server | None:
         """The record of a bot's server, or of its session's server. The transcript hides its token and names."""

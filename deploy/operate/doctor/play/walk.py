@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from bots import verification
-from bots.account import BotReport
 from bots.bot import Bot
 from bots.crowd import interruptible, walk
 from bots.http import ask
+from bots.report import BotReport
 from console.formatting import count
 from deploy.core.finding import Mark
 from deploy.operate.doctor.check_context import CheckFailed
@@ -62,12 +62,12 @@ class Walk:
     def links(self) -> None:
         """A link without a signature is refused, and one with another participant's signature; the site sends HSTS."""
         scene = self._scene
-        own, other = scene.copy.link(self.bots[0].account.user_id), scene.copy.link(self.victim.account.user_id)
+        own, other = scene.copy.link(self.bots[0].report.user_id), scene.copy.link(self.victim.report.user_id)
         unsigned = own.partition("&signature=")[0]
         forged = f"{unsigned}&signature={other.rpartition('=')[2]}"
 
         async def asked() -> list[int]:
-            return [(await ask(address, where=scene.where)).status for address in (unsigned, forged)]
+            return [(await ask(address, allowed=scene.where)).status for address in (unsigned, forged)]
 
         statuses = interruptible(asked())
         if all(400 <= status < 500 for status in statuses):
@@ -84,7 +84,7 @@ class Walk:
         scene = self._scene
 
         async def asked() -> tuple[int, str]:
-            reply = await ask(scene.copy.link(self.bots[0].account.user_id), where=scene.where)
+            reply = await ask(scene.copy.link(self.bots[0].report.user_id), allowed=scene.where)
             return reply.status, reply.headers.get("strict-transport-security", "")
 
         status, hsts = interruptible(asked())
@@ -108,18 +108,18 @@ class Walk:
                 await walk(self.all, at_once=len(self.all), ramp=ARRIVALS, watch=self._watch)
         except TimeoutError:
             for bot in self.all:
-                if not bot.account.finished:
-                    bot.account.errors.append("the time for the rehearsal was over")
+                if not bot.report.finished:
+                    bot.report.errors.append("the time for the rehearsal was over")
         finally:
             striking.cancel()
 
-    def _watch(self, accounts: Sequence[BotReport]) -> None:
-        stages = [account.stage for account in accounts]
+    def _watch(self, reports: Sequence[BotReport]) -> None:
+        stages = [report.stage for report in reports]
         self._scene.told("bots: " + ", ".join(f"{stages.count(stage)} {stage}" for stage in dict.fromkeys(stages)))
 
     async def _strike(self) -> None:
         """Kill the task of the victim, in the midst of its game."""
-        while not any(play.seconds >= STRUCK for play in self.victim.account.plays):
+        while not any(play.seconds >= STRUCK for play in self.victim.report.plays):
             await asyncio.sleep(0.2)
         try:
             self._struck = await asyncio.to_thread(self._kill)
@@ -127,7 +127,7 @@ class Walk:
             self._not_struck = f"{type(error).__name__}: {error}"
 
     def _kill(self) -> Server | None:
-        record = self._scene.server(self.victim.account.user_id)
+        record = self._scene.server(self.victim.report.user_id)
         if record is None or record.task is None:
             self._not_struck = "its task is not known"
             return None
@@ -139,22 +139,22 @@ class Walk:
 
     def pages(self) -> None:
         """Every bot came to the last page."""
-        accounts = [bot.account for bot in self.all]
-        for account in accounts:
-            self._scene.transcript.hide(account.code, account.user_id)
-        finished, sent = sum(one.finished for one in accounts), sum(len(one.answers) for one in accounts)
-        if finished == len(accounts):
+        reports = [bot.report for bot in self.all]
+        for report in reports:
+            self._scene.transcript.hide(report.code, report.user_id)
+        finished, sent = sum(one.finished for one in reports), sum(len(one.answers) for one in reports)
+        if finished == len(reports):
             self._scene.transcript.good("pages", f"{finished} of {finished} bots finished, with {sent} forms answered.")
             return
-        why = "; ".join(dict.fromkeys(error for one in accounts for error in one.errors)) or "they did not finish"
-        self._scene.transcript.bad("pages", f"{finished} of {len(accounts)} bots finished: {why}.", LOGS)
+        why = "; ".join(dict.fromkeys(error for one in reports for error in one.errors)) or "they did not finish"
+        self._scene.transcript.bad("pages", f"{finished} of {len(reports)} bots finished: {why}.", LOGS)
 
     def servers(self) -> None:
         """Every bot got a server that became ready; says how, and after how many seconds."""
         transcript = self._scene.transcript
-        found = {bot: self._scene.server(bot.account.user_id) for bot in self.all}
-        self.records = {bot.account.user_id: record for bot, record in found.items() if record}
-        waited = [play.waited for bot in self.bots for play in bot.account.plays if play.addresses]
+        found = {bot: self._scene.server(bot.report.user_id) for bot in self.all}
+        self.records = {bot.report.user_id: record for bot, record in found.items() if record}
+        waited = [play.waited for bot in self.bots for play in bot.report.plays if play.addresses]
         if len(waited) < len(self.bots) or not all(record.running for record in self.ran):
             reasons = sorted({str(record.reason or record.state) for record in self.ran})
             transcript.bad(
@@ -172,14 +172,14 @@ class Walk:
 
     def games(self) -> None:
         """The bots played: frames came, and each game came to its end."""
-        plays = [play for bot in self.bots for play in bot.account.plays]
+        plays = [play for bot in self.bots for play in bot.report.plays]
         frames, done = sum(play.frames for play in plays), sum(play.done for play in plays)
         if plays and done == len(plays) and frames:
             rates = [rate for play in plays if (rate := play.received_rate)]
             speed = f", {min(rates):.0f} to {max(rates):.0f} a second" if rates else ""
             self._scene.transcript.good("game", f"{done} games came to their end, with {frames} frames{speed}.")
             return
-        troubles = "; ".join(dict.fromkeys(trouble for bot in self.bots for trouble in bot.account.troubles))
+        troubles = "; ".join(dict.fromkeys(trouble for bot in self.bots for trouble in bot.report.troubles))
         self._scene.transcript.bad(
             "game",
             f"{done} of {len(plays)} games came to their end, with {frames} frames: {troubles or 'nothing was said'}.",
@@ -188,13 +188,13 @@ class Walk:
 
     def killed(self) -> None:
         """The victim got another server, and came to the end of its game there."""
-        transcript, account = self._scene.transcript, self.victim.account
-        record = self.records.get(account.user_id)
+        transcript, report = self._scene.transcript, self.victim.report
+        record = self.records.get(report.user_id)
         if self._struck is None or record is None:
             transcript.bad("killed", f"No task was killed: {self._not_struck}.", "These credentials need ecs:StopTask.")
             return
         lost = record.earlier[0] if record.earlier else None
-        if record.attempt < 2 or lost is None or not account.finished:
+        if record.attempt < 2 or lost is None or not report.finished:
             transcript.bad(
                 "killed",
                 f"The task was killed, and its server not replaced: {record.reason or record.state}.",
@@ -211,11 +211,11 @@ class Walk:
 
     def end(self) -> None:
         """The stop step ended every server; nothing is left."""
-        scene, users = self._scene, [bot.account.user_id for bot in self.all]
+        scene, users = self._scene, [bot.report.user_id for bot in self.all]
         late = CheckFailed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
         for bot in self.all:
-            if not bot.account.finished:  # it never came to the step that stops its server
-                stop = StopServer(scene.copy.id, bot.account.user_id)
+            if not bot.report.finished:  # it never came to the step that stops its server
+                stop = StopServer(scene.copy.id, bot.report.user_id)
                 scene.platform.bus.publish(Topic.STOP, to_message(stop))
 
         def gone() -> bool | None:
@@ -239,9 +239,9 @@ class Walk:
 
     def _played_with_the_victim(self) -> list[Bot]:
         """The victim, and the bots of its session."""
-        record = self.records.get(self.victim.account.user_id)
+        record = self.records.get(self.victim.report.user_id)
         own = {user for user, other in self.records.items() if record and other.label == record.label}
-        return [bot for bot in self.all if bot is self.victim or bot.account.user_id in own]
+        return [bot for bot in self.all if bot is self.victim or bot.report.user_id in own]
 
     def data(self) -> None:
         """`deploy data` brings everything that the bots have sent and played."""
@@ -259,7 +259,7 @@ class Walk:
             struck = self._played_with_the_victim()
             others = [bot for bot in self.all if bot not in struck]
             found = [
-                verification.verify(folder / "seen", scene.copy.id, [bot.account for bot in bots], recorded=recorded)
+                verification.verify(folder / "seen", scene.copy.id, [bot.report for bot in bots], recorded=recorded)
                 for bots in (others, struck)
             ]
         of_others, of_struck = found
