@@ -34,6 +34,7 @@ import moto.core.models
 import moto.core.responses
 import moto.core.serialize
 import moto.s3.models
+import moto.utilities.utils
 from moto import backend_index
 from moto.core.models import DEFAULT_ACCOUNT_ID
 from moto.core.request import normalize_request
@@ -46,6 +47,9 @@ def keep() -> None:
     """Start keeping results, in this process and in the processes that it starts."""
     # moto makes thousands of machine images for every region that is asked anything of EC2; no test needs one.
     os.environ["MOTO_EC2_LOAD_DEFAULT_AMIS"] = "false"
+    # Nor does a test ask which types of instances there are: a million values in each process, 80 MB.
+    load = moto.utilities.utils.load_resource
+    setattr(moto.utilities.utils, "load_resource", lambda name: {} if "/instance_type" in name else load(name))  # noqa: B010
     _keep_clients()
     _keep_calls()
     _keep_moto()
