@@ -1,6 +1,6 @@
 """The answer to a step: `{projectId}/users/{userId}/answers/{step}.json`, created once and never written again.
 
-The control plane writes the answer of a page, and the trial that of a game step. Both read them.
+The control plane writes the answer to a page, and the trial server that to a game step. Both sides read answers.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any
 from protocol.times import time_text
 
 GAME = "game"
-"""The `page` of a game step's answer."""
+"""`page` in the answer to a game step."""
 UNMATCHED = "unmatched"
-"""The `outcome` of a game step whose participant found no others to play with."""
+"""`outcome` in the answer to a game step for which the lobby found no other participants."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What one participant answered at one step. The fields are the keys of the document."""
+    """One participant's answer to one step. The fields are the keys of the document."""
 
     step: str
     page: str
@@ -33,16 +33,16 @@ class Answer:
 
 
 def to_json(answer: Answer) -> bytes:
-    """The document. `answered` must be in UTC."""
+    """Return the document. `answered` must be in UTC."""
     document = asdict(answer) | {"answered": time_text(answer.answered)}
     return json.dumps(document).encode()
 
 
 def answers_in(body: bytes) -> dict[str, Any] | None:
-    """What was answered; None if the document holds no answers.
+    """Return `answers` of the document; None if the document is not valid or has no `answers`.
 
-    The code of an agent decides what a trial's document holds. So what is no JSON in UTF-8 (RFC 8259) is refused: NaN,
-    numbers that are too large for a float, and half of a surrogate pair, which no page could show.
+    A study's agent decides what the answer to a game step holds. So the document must be JSON in UTF-8 (RFC 8259):
+    without NaN, numbers that are too large for a float, and unpaired surrogates, which no page could show.
     """
     try:
         answers = json.loads(body.decode(), parse_float=_finite, parse_constant=_finite)["answers"]
@@ -52,7 +52,7 @@ def answers_in(body: bytes) -> dict[str, Any] | None:
     return answers if isinstance(answers, dict) else None
 
 
-def _finite(written: str) -> float:
-    if not math.isfinite(number := float(written)):
-        raise ValueError("no number that JSON knows")
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError("not a finite number")
     return number

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and survive a power cut once the call that wrote them has returned.
+"""Writes files that appear whole or not at all, and that survive a power cut once the call has returned.
 
 On POSIX a file's content is on the disk after an `fsync` of the file; its name is there after an `fsync` of the folder
 (https://man7.org/linux/man-pages/man2/fsync.2.html). A new folder's own name is in the folder above it.
@@ -13,7 +13,7 @@ import secrets
 import shutil
 from pathlib import Path
 
-_CANNOT = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # some network file systems have no fsync for folders
+_NO_FSYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # some network file systems have no fsync for folders
 
 
 def sync_folder(folder: Path) -> None:
@@ -22,14 +22,14 @@ def sync_folder(folder: Path) -> None:
     try:
         os.fsync(handle)
     except OSError as error:
-        if error.errno not in _CANNOT:
+        if error.errno not in _NO_FSYNC:
             raise
     finally:
         os.close(handle)
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder and those above it that are missing, and bring their names to the disk. Raises OSError."""
+    """Make the folder and the missing folders above it, and bring their names to the disk. Raises OSError."""
     missing = []
     while not _is_folder(folder):
         missing.append(folder)
@@ -42,7 +42,7 @@ def make_folder(folder: Path) -> None:
 def write_new(path: Path, data: bytes | Path) -> None:
     """Write a new file with these bytes, or with the content of another file, and bring it to the disk.
 
-    Raises FileExistsError and other OSErrors; then there is no such file, or half of it.
+    Raises FileExistsError if there is such a file, and other OSErrors, after which there is no file or a part of it.
     """
     with path.open("xb") as out:
         if isinstance(data, Path):
@@ -55,10 +55,10 @@ def write_new(path: Path, data: bytes | Path) -> None:
 
 
 def create(path: Path, data: bytes | Path, scratch: Path | None = None) -> None:
-    """Create the file whole, with these bytes or with the content of another file; it is on the disk then.
+    """Create a whole file with these bytes, or with the content of another file, and bring it to the disk.
 
-    `scratch` is a folder of the same file system for the unfinished file, if that should not lie beside it. Raises
-    FileExistsError if there is such a file (which is on the disk then, too), and other OSErrors.
+    `scratch` is a folder of the same file system for the unfinished file; by default it lies in the file's own folder.
+    Raises FileExistsError if there is such a file (its name is on the disk then, too), and other OSErrors.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
@@ -73,9 +73,9 @@ def create(path: Path, data: bytes | Path, scratch: Path | None = None) -> None:
 
 
 def move(file: Path, path: Path) -> None:
-    """Bring a finished file to another place, perhaps of another file system; it is on the disk then.
+    """Move a finished file to `path`, perhaps on another file system, and bring it to the disk there.
 
-    Raises FileExistsError if there is such a file, and other OSErrors; then the file is still at its old place.
+    Raises FileExistsError if there is such a file, and other OSErrors; then `file` is still at its old place.
     """
     with file.open("rb") as content:
         os.fsync(content.fileno())
@@ -89,11 +89,11 @@ def move(file: Path, path: Path) -> None:
     remove_if_possible(file)
 
 
-def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, surely: bool = True) -> None:
-    """Create the file, or put these bytes or the content of another file in its place; they are on the disk then.
+def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, durable: bool = True) -> None:
+    """Create or replace the file, with these bytes or with the content of another file.
 
-    If not `surely`, a power cut may bring the bytes back that stood there before (or no file), but never half of them.
-    Raises OSError.
+    With `durable`, the new file is on the disk when this returns. Otherwise a power cut may bring the earlier file back
+    (or none), but always a whole one. `scratch` is as in `create`. Raises OSError.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
@@ -102,12 +102,12 @@ def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, sure
     except OSError:
         remove_if_possible(unfinished)
         raise
-    if surely:
+    if durable:
         sync_folder(path.parent)
 
 
 def remove_if_possible(path: Path) -> None:
-    """Remove an unfinished file. If it cannot be removed now, it does no harm: the next start removes it."""
+    """Remove an unfinished file. An OSError is ignored: local mode removes such files at its next start."""
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
 

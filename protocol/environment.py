@@ -1,7 +1,7 @@
 """The environment variables that a participant's server is started with.
 
 `hippodrome/servers/start.py`, `hippodrome/aws/tasks.py`, `deploy/study/definition.py` and `local/` write them;
-`trial/settings.py` reads them. The names are also those of HIPPO's and of earlier versions, and stay. All values are
+`trial/settings.py` reads them. HIPPO and earlier versions use the same names, so they must not change. All values are
 text; durations are seconds.
 """
 
@@ -11,72 +11,77 @@ from __future__ import annotations
 
 PROJECT_ID = "PROJECT_ID"
 SERVER = "SERVER"
-"""The server's name, under which the recordings lie. Of a warm server: the name of its handover."""
+"""The server's name, under which the recordings lie. For a warm server, its handover has this name."""
 TOKEN = "TOKEN"  # noqa: S105 - a variable's name
-"""A secret. A client that shows it may play."""
+"""A secret. A client that sends it may play."""
 GAME_STEPS = "GAME_STEPS"
 """Keys of the game steps, separated by commas: `3` or `2,4`."""
 STORE = "STORE"
-"""Where documents are stored: the address that signs requests (trial/recordings/presigned.py), or a folder."""
+"""The store of documents: a folder, or the address that signs requests (trial/recordings/presigned.py)."""
 
-# The participant. A warm server reads both in its handover.
+# The participant. A warm server reads its participant and group in its handover.
 
 USER_ID = "USER_ID"
 GROUP = "GROUP"
 """The participant's group, a whole number; empty in a study without groups. The researcher's agent may read it."""
 WARM_SERVER = "SPARE"
-"""`on`: a warm server."""
+"""`on` if this is a warm server."""
 SESSION = "SESSION"
-"""The session's id, if several participants play on this server. Then there are no USER_ID and no GROUP: the server
-reads both in the session's document."""
+"""The session's id, if several participants play on this server. The server has no USER_ID and no GROUP then: it reads
+its members and the group in the session's document."""
 
 # Given by the control plane
 
 MATCHING = "MATCHING"
-"""`match`: the server asks the function `match` of agent.py who plays with whom, while its session has no members."""
+"""`match` if the server asks the function `match` of agent.py who plays with whom, while its session has no members."""
 
 TRIAL = "TRIAL"
-"""The `trial` section as JSON. Without it, ./config.yml is read."""
+"""The `trial` section as JSON. Without it, the server reads ./config.yml."""
 CREDENTIAL = "CREDENTIAL"
-"""A secret. It is shown to the address in STORE."""
+"""A secret. The server sends it to the address in STORE."""
 DEADLINE = "DEADLINE"
-"""When the server ends in any case: seconds since the epoch."""
+"""The time at which the server ends in any case: seconds since the epoch."""
 PLAIN_ORIGINS = "PLAIN_ORIGINS"
 """The origins of the project's front end, separated by spaces. Their pages need no token (plainClients)."""
 SSL_FULLCHAIN = "SSL_FULLCHAIN"
+"""The key of the certificate in STORE."""
 SSL_PRIVKEY = "SSL_PRIVKEY"
-"""The keys of the certificate and of its private key in STORE."""
+"""The key of the certificate's private key in STORE."""
 TLS = "TLS"
-"""`on` or `off`; on by default, and then SSL_FULLCHAIN and SSL_PRIVKEY are required."""
+"""`on` (the default) or `off`. With `on`, SSL_FULLCHAIN and SSL_PRIVKEY are required."""
 HOST = "HOST"
 PORT = "PORT"
-"""0: any free port. The server prints the port that it listens on."""
+"""The port, 5000 by default. With 0 the server takes any free port; it prints the port that it listens on."""
 AGENT_DIR = "AGENT_DIR"
 """The folder of agent.py."""
 SPOOL = "SPOOL"
 """The folder where recordings are written before they are stored."""
 STOP_SECONDS = "STOP_SECONDS"
-"""From SIGTERM to SIGKILL; 30 by default."""
+"""From SIGTERM to SIGKILL; 30 by default, and at least 15."""
 
 # For tests and slow agents
 
 IDLE_SECONDS = "IDLE_SECONDS"
+"""Without a participant, after which the server ends; 600 by default."""
 GRACE_SECONDS = "GRACE_SECONDS"
+"""Without a participant who was connected before, after which the server may end; 60 by default."""
 START_SECONDS = "START_SECONDS"
+"""For the start of the agent; 300 by default."""
 STEP_SECONDS = "STEP_SECONDS"
-"""For one step of the agent."""
+"""For one step of the agent; 30 by default."""
 HELLO_SECONDS = "HELLO_SECONDS"
+"""From a client's connection to its first message; 10 by default."""
 RECORDINGS_FIRST_SECONDS = "RECORDINGS_FIRST_SECONDS"
-"""An answer waits for so long until the recordings before it are stored; 120 by default."""
+"""For which an answer waits until the recordings before it are stored; 120 by default."""
 LINGER_SECONDS = "LINGER_SECONDS"
-"""From the stored answer to the process's end."""
+"""From the stored answer to the process's end; 2 by default."""
 WARM_SERVER_SECONDS = "SPARE_SECONDS"
-"""From one look for a handover to the next."""
+"""Between two times that a warm server looks for its handover; 20 by default."""
 
 SECRETS = (TOKEN, CREDENTIAL)
 PARTICIPANT = (USER_ID, GROUP)
 
 
 def group_text(group: int | None) -> str:
-    """The value of GROUP."""
+    """Return the value of GROUP."""
     return "" if group is None else str(group)

@@ -1,6 +1,6 @@
-"""The keys `keys`, `labels` and `playerNames` of the section `trial`: maps of names of the project's own.
+"""Checks `keys`, `labels` and `playerNames` in the section `trial`: maps whose names the project chooses.
 
-Each function returns what is good of the map at this path, and what is wrong.
+Each function gets such a map and its path, and returns the valid entries and the problems.
 """
 
 from __future__ import annotations
@@ -12,44 +12,46 @@ from protocol import keyboard, values
 from protocol.values import LONGEST_NAME, Keys, SectionProblem, checked
 
 MAX_KEYS = 100
-"""Keys of one player, and labels."""
+"""Entries of one map: keys of one player, labels, or names."""
 _LABEL = values.text("the text of a button", LONGEST_NAME)
 _NAME = values.text("what participants read", LONGEST_NAME)
 
 
 def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[SectionProblem]]:
-    """What the keys do: `{key: action}`, or such a map for each player."""
+    """Check `keys`: `{key: action}`, or such a map for each player."""
     if not value or not all(isinstance(each, dict) for each in value.values()):
         return _one_players_keys(value, path)
     read = {str(player): _one_players_keys(each, (*path, player)) for player, each in value.items()}
-    return {player: found for player, (found, _) in read.items()}, [one for _, many in read.values() for one in many]
+    return {player: found for player, (found, _) in read.items()}, [
+        problem for _, problems in read.values() for problem in problems
+    ]
 
 
 def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
     problems: list[SectionProblem] = []
-    known: dict[frozenset[str], str] = {}
+    names: dict[frozenset[str], str] = {}  # by combination: the same one can be written in several ways
     for name, action in value.items():
         here = (*path, name)
         key, wrong = checked(lambda text: keyboard.combination(str(text)), name, here)
-        named, wrong_action = checked(_action, action, here)
+        action_name, wrong_action = checked(_action, action, here)
         problems += wrong + wrong_action
         if wrong or wrong_action:
             continue
-        same = known.setdefault(frozenset(keyboard.parts(key)), name)
-        if same != name:
-            problems.append(SectionProblem(here, f"is the same as {keyboard.shown(same)}; keep one of them"))
-        found[key] = named
-    return found, _few(value, problems, path)
+        first = names.setdefault(frozenset(keyboard.parts(key)), name)
+        if first != name:
+            problems.append(SectionProblem(here, f"is the same as {keyboard.shown(first)}; keep one of them"))
+        found[key] = action_name
+    return found, problems + _too_many(value, path)
 
 
 def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
-    """The texts of buttons: `{action: text}`."""
+    """Check `labels`, the texts of buttons: `{action: text}`."""
     return _texts(value, path, _action, _LABEL)
 
 
 def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
-    """What participants read of players: `{player: text}`."""
+    """Check `playerNames`, the players' names for participants: `{player: text}`."""
     return _texts(value, path, str, _NAME)
 
 
@@ -58,22 +60,22 @@ def _texts(
 ) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
     problems: list[SectionProblem] = []
-    for given, said in value.items():
-        here = (*path, given)
-        name, wrong = checked(key, given, here)
-        words, wrong_text = checked(text, said, here)
+    for name, item in value.items():
+        here = (*path, name)
+        checked_name, wrong = checked(key, name, here)
+        checked_text, wrong_text = checked(text, item, here)
         problems += wrong + wrong_text
         if not wrong and not wrong_text:
-            found[name] = words
-    return found, _few(value, problems, path)
+            found[checked_name] = checked_text
+    return found, problems + _too_many(value, path)
 
 
-def _few(value: Mapping[str, Any], problems: list[SectionProblem], path: Keys) -> list[SectionProblem]:
+def _too_many(value: Mapping[str, Any], path: Keys) -> list[SectionProblem]:
     if len(value) <= MAX_KEYS:
-        return problems
-    return [*problems, SectionProblem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
+        return []
+    return [SectionProblem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]
 
 
 def _action(value: object) -> str:
-    """The name of an action as the trial has it, in small letters."""
+    """The name of an action in small letters, as the trial server has it."""
     return values.action_name(value).lower()

@@ -1,4 +1,4 @@
-"""Keys of the keyboard as config.yml names them: by `KeyboardEvent.key`, several held at once joined by `+`.
+"""Reads the names of keys in config.yml: those of `KeyboardEvent.key`, with `+` between keys that are held together.
 
 Source of the names: https://www.w3.org/TR/uievents-key/. A letter is the same key with Shift and without.
 """
@@ -10,8 +10,8 @@ import re
 from protocol.similar import nearest
 from protocol.values import printable, show
 
-MOST_AT_ONCE = 4
-"""Keys that may be joined."""
+MAX_TOGETHER = 4
+"""Keys that may be joined by `+`."""
 
 _SPACE = " "
 _NAMED = frozenset(
@@ -42,7 +42,8 @@ _CODE = re.compile(r"(?:Key([A-Z])|(?:Digit|Numpad)([0-9]))")  # KeyboardEvent.c
 
 
 def key_name(text: str) -> str:
-    """The key as `KeyboardEvent.key` has it, a letter always small; `Space` is " ". Raises ValueError."""
+    """Return the key's `KeyboardEvent.key`, a letter always small, and " " for `Space`. Raises ValueError with what to
+    write."""
     if text in (_SPACE, "Space"):
         return _SPACE
     if len(text) == 1 and text.isprintable():
@@ -58,6 +59,7 @@ def key_name(text: str) -> str:
 
 
 def _meant(text: str) -> str | None:
+    """The name that was probably meant by a text that names no key; None if there is none."""
     code = _CODE.fullmatch(text)
     if code:
         return (code[1] or code[2]).lower()
@@ -69,7 +71,7 @@ def _meant(text: str) -> str | None:
 
 
 def parts(combined: str) -> tuple[str, ...]:
-    """The keys that are joined by `+`, as written; `+` alone and at the end is the key itself."""
+    """Return the keys that are joined by `+`, as written. A `+` alone, or a second one at the end, is the key `+`."""
     if combined == "+":
         return ("+",)
     if combined.endswith("++"):
@@ -78,16 +80,15 @@ def parts(combined: str) -> tuple[str, ...]:
 
 
 def combination(text: str) -> str:
-    """The keys in a text, each as `key_name` has it, joined by `+`. Raises ValueError with what to write."""
-    given = parts(text if text == _SPACE else text.strip() or _SPACE)
-    found = [key_name(part) for part in given]
-    if len(set(found)) < len(found):
+    """Return the keys in a text, each as by `key_name`, joined by `+`. Raises ValueError with what to write."""
+    keys = [key_name(part) for part in parts(text if text == _SPACE else text.strip() or _SPACE)]
+    if len(set(keys)) < len(keys):
         raise ValueError("names the same key twice")
-    if len(found) > MOST_AT_ONCE:
-        raise ValueError(f"joins {len(found)} keys; {MOST_AT_ONCE} at most, since few keyboards report more at once")
-    return "+".join(found)
+    if len(keys) > MAX_TOGETHER:
+        raise ValueError(f"joins {len(keys)} keys; {MAX_TOGETHER} at most, since few keyboards report more at once")
+    return "+".join(keys)
 
 
 def shown(combined: str) -> str:
-    """The combination as it may stand in a sentence."""
+    """Return the combination for a message, with `Space` for " "."""
     return printable("+".join("Space" if part == _SPACE else part for part in parts(combined)))

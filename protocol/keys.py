@@ -1,7 +1,7 @@
-"""Keys of the documents that a server reads and writes: answers, recordings and its handover.
+"""Keys of the documents that trial servers read and write: answers, recordings, handovers, sessions and questions.
 
-docs/architecture.md lists all documents. Keys that servers do not use are elsewhere, such as those below `SSL/`
-(`hippodrome/certificates/rules.py`) and `_builds/` (`deploy/study/image/codebuild.py`).
+docs/architecture.md lists all documents. Other modules have the keys that servers do not use, such as those below
+`SSL/` (`hippodrome/certificates/rules.py`) and `_builds/` (`deploy/study/image/codebuild.py`).
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-"""The names that a project, a participant and a step may have."""
+"""The ids that a project, a participant and a step may have."""
 QUESTIONS = "_match/"
-"""The folder of what the function `match` is asked, of all projects."""
+"""The folder of the questions to the functions `match` of all projects."""
 QUESTION_ID = re.compile(r"[0-9a-f]{20}")
 """The id of a question to the function `match`."""
 SERVER_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
@@ -59,12 +59,12 @@ def session_recordings_folder(project_id: str, session_id: str) -> str:
 
 
 def questions_folder(project_id: str) -> str:
-    """The folder of what `matching: match` asks the researcher's function. Older versions are kept for a day."""
+    """The folder of a project's questions to its function `match`. S3 keeps their older versions for a day."""
     return f"{QUESTIONS}{project_id}/"
 
 
 def waiting_key(project_id: str) -> str:
-    """The key of the document that says who waits: the question to the function `match` (`matching: match`)."""
+    """The key of the document with the participants who wait: the question to the function `match`."""
     return f"{questions_folder(project_id)}waiting.json"
 
 
@@ -89,5 +89,6 @@ def handover_key(project_id: str, server_name: str) -> str:
 
 
 def with_number(key: str, number: int) -> str:
-    """The key of a recording if `number` - 1 others have it: `…-0001.jsonl.gz`, then `…-0001-2.jsonl.gz` and so on."""
+    """The key of the recording with this number among those that would have the same key: `…-0001.jsonl.gz` for 1,
+    `…-0001-2.jsonl.gz` for 2."""
     return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"

@@ -1,4 +1,4 @@
-"""The keys `players` and `idleAction` of the section `trial`: who plays whom. Checks of single values."""
+"""Checks the values of `players`, `substitute` and `idleAction` in the section `trial`: who plays each player."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from protocol.values import show
 
 HUMAN = "human"
 GYM_PLAYER = "gym://"
-"""Before the name of a program at the trial's /gym."""
+"""The prefix of the name of a program that is connected to the trial server's /gym."""
 AGENT_PLAYER = "agent:"
-"""Before the name of a class of agent.py."""
+"""The prefix of the name of a class of agent.py."""
 SAMPLE = "sample:"
-"""Before a policy's file: actions are drawn by the softmax of its output, instead of the best one being taken."""
+"""The prefix of a policy's file whose actions are drawn by the softmax of its output. Without it, the policy takes the
+action with the highest output."""
 ONNXRUNTIME = "onnxruntime==1.32.0"
 """The package that runs policies' files, in the version that was tested (requirements/dev.txt)."""
-WHO = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
+ALL_KINDS = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
+"""All kinds of values of a player, for messages."""
 
-MOST_PLAYERS = 64
-_MOST_NEAR = 5
+MAX_PLAYERS = 64
+_MAX_FILES_NAMED = 5
 _NAME = values.text("the name of a player", values.LONGEST_NAME)
-_PLAYS = values.text(WHO, 200)
+_PLAYS = values.text(ALL_KINDS, 200)
 _GROUP = re.compile(r"[0-9]{1,9}")
 _CLASS = re.compile(r"[A-Za-z_]\w*")
 _PROGRAM = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def by_group(value: Mapping[Any, Any]) -> bool:
-    """Whether `players` says it group by group: all keys are whole numbers, and all values maps."""
+    """Whether `players` has a map for each group: all keys are whole numbers, and all values are maps."""
     return (
         bool(value)
         and all(_GROUP.fullmatch(str(key)) for key in value)
@@ -41,7 +43,8 @@ def by_group(value: Mapping[Any, Any]) -> bool:
 
 
 def players(value: object) -> dict[str, Any]:
-    """What plays each player, or that for each group. Raises ValueError with what to write instead."""
+    """Check `players` and return what plays each player, or such a map for each group. Raises ValueError with what to
+    write instead."""
     if not isinstance(value, dict):
         raise ValueError(f'must be a map: indented lines such as "player_0: human" below it, not {show(value)}')
     if not by_group(value):
@@ -50,19 +53,20 @@ def players(value: object) -> dict[str, Any]:
 
 
 def _players(value: dict[Any, Any], where: str) -> dict[str, str]:
-    if len(value) > MOST_PLAYERS:
-        raise ValueError(f"{where}must have at most {MOST_PLAYERS} players, not {len(value)}")
+    if len(value) > MAX_PLAYERS:
+        raise ValueError(f"{where}must have at most {MAX_PLAYERS} players, not {len(value)}")
     found = {}
     for name, plays in value.items():
-        known = _one(_NAME, str(name), where)
-        found[known] = _plays(plays, f"{where}{values.printable(known)} ")
+        player = _checked(_NAME, str(name), where)
+        found[player] = _plays(plays, f"{where}{values.printable(player)} ")
     if found and HUMAN not in found.values():
         raise ValueError(f"{where}must have a human: write human for the player that the participant plays")
     return found
 
 
 def policy(value: object) -> str:
-    """What plays in an empty place. Raises ValueError with what to write instead."""
+    """Check `substitute` and return the policy that plays in an empty place. Raises ValueError with what to write
+    instead."""
     plays = _plays(value, "")
     if plays == HUMAN or plays.startswith(GYM_PLAYER):
         raise ValueError(f"must be a policy: random, idle, agent:Class or a file, not {show(plays)}")
@@ -70,7 +74,8 @@ def policy(value: object) -> str:
 
 
 def _plays(value: object, where: str) -> str:
-    plays: str = _one(_PLAYS, value, where)
+    """What plays one player; `where` begins the sentence of a mistake."""
+    plays: str = _checked(_PLAYS, value, where)
     kind, _, rest = plays.partition(":")
     if plays in (HUMAN, "random", "idle"):
         return plays
@@ -84,17 +89,18 @@ def _plays(value: object, where: str) -> str:
         if fits and (file.startswith("/") or ".." in file.split("/")):
             raise ValueError(f"{where}must be a file below the project's folder, not {show(plays)}")
     if not fits:
-        raise ValueError(f"{where}must be {WHO}, not {show(plays)}{_meant(plays)}")
+        raise ValueError(f"{where}must be {ALL_KINDS}, not {show(plays)}{_hint(plays)}")
     return plays
 
 
-def _meant(plays: str) -> str:
-    """What was probably meant by what plays nobody; empty if nobody knows."""
+def _hint(plays: str) -> str:
+    """The end of the message about a wrong value: what was probably meant; empty if that is not known."""
     as_class = f"; a class of agent.py is {AGENT_PLAYER}{plays}" if _CLASS.fullmatch(plays) else ""
     return did_you_mean(plays, (HUMAN, "random", "idle")) or as_class
 
 
-def _one(check: values.Check, value: object, where: str) -> Any:
+def _checked(check: values.Check, value: object, where: str) -> Any:
+    """The result of a check; `where` begins the sentence of its mistake."""
     try:
         return check(value)
     except ValueError as error:
@@ -102,19 +108,20 @@ def _one(check: values.Check, value: object, where: str) -> Any:
 
 
 def idle_action(value: object) -> str | dict[str, str]:
-    """The name of the action of no key, or one for each player."""
+    """Check `idleAction` and return the name of the action that is taken without a key, or one for each player. Raises
+    ValueError with what to write instead."""
     if isinstance(value, dict):
-        if len(value) > MOST_PLAYERS:
-            raise ValueError(f"must have at most {MOST_PLAYERS} players, not {len(value)}")
+        if len(value) > MAX_PLAYERS:
+            raise ValueError(f"must have at most {MAX_PLAYERS} players, not {len(value)}")
         return {
-            str(_one(_NAME, str(name), "")): _one(values.action_name, item, f"{values.printable(str(name))} ")
+            str(_checked(_NAME, str(name), "")): _checked(values.action_name, item, f"{values.printable(str(name))} ")
             for name, item in value.items()
         }
     return values.action_name(value)
 
 
-class Naming(Protocol):
-    """A section `trial`, as far as it names policies."""
+class NamesPolicies(Protocol):
+    """The keys of a section `trial` that name policies."""
 
     @property
     def players(self) -> Mapping[str, Any]: ...
@@ -123,28 +130,25 @@ class Naming(Protocol):
     def substitute(self) -> str | None: ...
 
 
-def files_of(trial: Naming) -> Iterator[tuple[tuple[str, ...], str]]:
-    """The policies' files that a section `trial` names, each with its path of keys."""
-    for key, given in (("players", trial.players), ("substitute", {"": trial.substitute})):
-        yield from (((key, *filter(None, path)), file) for path, file in files(given))
+def files_of(trial: NamesPolicies) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the policies' files that a section `trial` names, each after its path of keys."""
+    yield from files({"players": trial.players, "substitute": trial.substitute})
 
 
-def files(given: object) -> Iterator[tuple[tuple[str, ...], str]]:
-    """The policies' files that `players` names, each with its path of keys below `players`.
+def files(named: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the policies' files in this map and the maps in it, each after its path of keys.
 
-    `given` need not have been checked: what is no name of a file is left out.
+    The map need not have been checked: values that are no name of a file are left out.
     """
-    for name, plays in given.items() if isinstance(given, Mapping) else ():
+    for key, plays in named.items():
         if isinstance(plays, Mapping):
-            yield from (((name, *path), file) for path, file in files(plays))
+            yield from (((key, *path), file) for path, file in files(plays))
         elif isinstance(plays, str) and plays.endswith(".onnx"):
-            yield (name,), plays.removeprefix(SAMPLE)
+            yield (key,), plays.removeprefix(SAMPLE)
 
 
 def files_there(folder: Path) -> str:
-    """How a sentence about a policy's missing file ends: the files that there are beside agent.py; empty without any.
-
-    At most five are named.
-    """
-    near = sorted(other.relative_to(folder).as_posix() for other in folder.glob("policies/**/*.onnx"))
-    return f"; there are {', '.join(near[:_MOST_NEAR])}" if near else ""
+    """Return the end of a message about a policy's missing file: the first five policies' files in the folder of
+    agent.py; "" if it has none."""
+    files = sorted(file.relative_to(folder).as_posix() for file in folder.glob("policies/**/*.onnx"))
+    return f"; there are {', '.join(files[:_MAX_FILES_NAMED])}" if files else ""

@@ -1,4 +1,4 @@
-"""Which known name was probably meant by a name that is not known."""
+"""Finds the known name that was probably meant by an unknown one."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import difflib
 from collections.abc import Iterable
 
 SIMILAR = 0.65
-"""How alike two names must be for a message to ask whether one was meant by the other: difflib's ratio, from 0 to 1."""
+"""How similar an unknown name must be to a known one for a message to suggest it: difflib's ratio, from 0 to 1."""
 
 SIMILAR_FILES = 0.75
-"""The same for files: their names are words and have common endings, so unlike ones look more alike."""
+"""The same for names of files. It is higher, because different names of files have words and endings in common."""
 
 
 def nearest(name: str, known: Iterable[str], similar: float = SIMILAR) -> str | None:
-    """The known name that is most like this one, in upper or lower case; None if no name is alike enough."""
+    """Return the known name that is most similar to this one, whatever their case; None if no name is similar."""
     names = {each.lower(): each for each in known}
-    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=similar)
-    return names[near[0]] if near else None
+    matches = difflib.get_close_matches(name.lower(), names, n=1, cutoff=similar)
+    return names[matches[0]] if matches else None
 
 
 def did_you_mean(name: str, known: Iterable[str], similar: float = SIMILAR) -> str:
-    """The end of a message about an unknown name: "; did you mean …?", or nothing if no known name is alike enough."""
+    """Return the end of a message about an unknown name: "; did you mean …?", or "" if no known name is similar."""
     near = nearest(name, known, similar)
     return f"; did you mean {near}?" if near else ""

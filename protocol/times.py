@@ -1,4 +1,4 @@
-"""Times as they stand in all documents and recordings."""
+"""Writes times as all documents and recordings have them."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from datetime import datetime
 
 
 def time_text(moment: datetime) -> str:
-    """The moment, which must be in UTC, to the microsecond: `2026-11-21T14:46:40.123456Z`."""
+    """Return a moment in UTC as text, to the microsecond: `2026-11-21T14:46:40.123456Z`."""
     return f"{moment.replace(tzinfo=None).isoformat(timespec='microseconds')}Z"

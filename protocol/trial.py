@@ -1,4 +1,4 @@
-"""The `trial` section of config.yml: its keys, and what each may be. `protocol/trial_check.py` checks it."""
+"""The `trial` section of config.yml: its keys, and the values of each. `protocol/trial_check.py` checks it."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol import key_maps, values
-from protocol import players as who
+from protocol import players as player_checks
 from protocol import trial_keys as keyed
-from protocol.trial_sections import SceneSection, Ui, usual_ui
+from protocol.trial_sections import SceneSection, Ui, default_ui
 from protocol.values import Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
-TAKEN = frozenset({"toggle", "faster", "slower", "requestUI"})
-"""Words that a client says to the server, so no control of a project's own can be called so."""
+RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
+"""Words that clients send to the server, so none of the project's own controls can have these names."""
 MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
 SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
-"""Keys of games of several participants (`project.players`). A registration leaves out what is as by default."""
-MOST_EPISODES = 1_000_000
+"""Keys of games of several participants (`project.players`). A registration leaves out those with default values."""
+MAX_EPISODES = 1_000_000
 LONGEST_BREAK = 600
 """Seconds."""
 HIGHEST_RATE = 240
-"""Frames per second that no project may exceed."""
+"""The highest frame rate of any project, in frames per second."""
 
 
 def page(value: object) -> str:
-    """A file in the folder of pages, without `.html`. Raises ValueError with what to write."""
+    """Return the name of a file in the folder of pages, without `.html`. Raises ValueError with what to write."""
     stem = values.step_file(values.as_text(value, "the name of a file in the steps folder"))
     if stem == "game":
         raise ValueError("a page cannot be called game.html; rename it")
@@ -36,7 +36,7 @@ def page(value: object) -> str:
 
 
 def _break(value: object) -> float | str:
-    """The seconds of a break, or the page that is shown in it."""
+    """Check `betweenEpisodes` and return the seconds of a break, or the page that the break shows."""
     if isinstance(value, str) and number_in(value) is None and value.strip():
         return page(value)
     try:
@@ -51,17 +51,17 @@ def _rate(default: int, meaning: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TrialSection:
-    """What happens on the participant's server."""
+    """The section `trial`: the game and its server."""
 
     action_buffer_lifespan: int = keyed.whole(
-        1, 10_000, 1, "Environment steps for which an action stays in force unless another comes; 1 is no buffer."
+        1, 10_000, 1, "Environment steps for which an action is taken if no other action comes; 1 is no buffer."
     )
-    max_episodes: int = keyed.whole(1, MOST_EPISODES, 20, "Episodes until the trial is over.")
+    max_episodes: int = keyed.whole(1, MAX_EPISODES, 20, "Episodes until the trial is over.")
     between_episodes: float | str = keyed.key(
         _break,
         3,
-        "Seconds of the break between two episodes, with the score and a countdown; 0 is none. Or a file of steps/, "
-        "which is shown until the participant goes on.",
+        "Seconds of the break between two episodes, with the score and a countdown; 0 is no break. Or a file of "
+        "steps/, which the page shows until the participant goes on.",
         {"anyOf": [{"type": "number", "minimum": 0, "maximum": LONGEST_BREAK}, {"type": "string"}]},
     )
     instructions: str | None = keyed.key(
@@ -85,8 +85,8 @@ class TrialSection:
         default_factory=dict,
         metadata=keyed.about(
             values.section("ArrowLeft: left"),
-            "What the keys of the keyboard do: an action by KeyboardEvent.key, or several joined by +; or such a map "
-            "for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
+            "The action of each key of the keyboard, by KeyboardEvent.key, with + between keys that are held together; "
+            "or such a map for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
             {
                 "type": "object",
                 "additionalProperties": {
@@ -131,7 +131,7 @@ class TrialSection:
     max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
     starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
     ui: Ui = field(
-        default_factory=usual_ui,
+        default_factory=default_ui,
         metadata=keyed.about(
             values.section("bad: …"),
             "Controls on the game page. Default: left, right, up, down, start, pause.",
@@ -148,14 +148,14 @@ class TrialSection:
     )
     gym: str = keyed.choice(
         ("none", "watch", "advise", "environments"),
-        "What programs that have the server's token may do at its path /gym: nothing, see each step, also advise, or "
+        "What programs with the server's token may do at its path /gym: nothing, watch each step, also advise, or "
         "make environments of their own.",
     )
     scene: SceneSection | None = field(
         default=None,
         metadata=keyed.about(
             values.section("width: 600"),
-            "The game is drawn by objects that render() returns, in a picture of this size. Without it, by frames.",
+            "With this section the game is drawn by the objects that render() returns, without it by frames.",
             {"$ref": "#/$defs/SceneSection"},
             section=SceneSection,
         ),
@@ -163,10 +163,10 @@ class TrialSection:
     players: dict[str, Any] = field(
         default_factory=dict,
         metadata=keyed.about(
-            who.players,
+            player_checks.players,
             "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
-            "gym://name. One such map for each group, by its number, if groups differ. An environment with one player "
-            "needs none: it is human.",
+            "gym://name. If groups differ, one such map for each group, by its number. Default: human, in an "
+            "environment with one player.",
             {
                 "type": "object",
                 "additionalProperties": {
@@ -175,61 +175,61 @@ class TrialSection:
             },
         ),
     )
-    frame_skip: int = keyed.whole(1, 1000, 1, "Policies choose anew at one step in so many.")
+    frame_skip: int = keyed.whole(1, 1000, 1, "In real time, the steps from one choice of a policy to its next.")
     policy_seconds: float = keyed.seconds(
         600,
         10,
-        "With pace: turns, the seconds that a policy may think; then the idle action is taken.",
-        least=0.01,  # with 0, which elsewhere is no limit, each action would come late
+        "With pace: turns, the seconds that a policy has for its choice; then the idle action is taken.",
+        least=0.01,  # 0 would be no limit for other keys, and here each action would be late
     )
     substitute: str | None = keyed.key(
-        who.policy,
+        player_checks.policy,
         None,
-        "What plays in the place of a participant who is not there, if project.players is 2 or more: a policy as in "
-        "players.",
+        "The policy, as in players, that plays in the place of an absent participant, if project.players is 2 or more.",
         {"type": "string"},
     )
     absent: float = keyed.seconds(
         3600,
         30,
-        "Seconds for which the game is held when a participant's connection is gone, if others play with them.",
+        "In a game of several participants, seconds for which the game is held when a participant is disconnected.",
     )
     gather: float = keyed.seconds(
         3600,
         120,
-        "Seconds for which those who are there wait, before the game and at a page between two episodes, for a "
-        "participant who has not come or who reads on, if others play with them.",
+        "In a game of several participants, seconds for which the others wait for a participant who has not come or "
+        "is still reading, before the game and at a page between two episodes.",
     )
     after_absent: str = keyed.choice(
         ("end", "policy"),
-        "What happens then: the game ends for all, or substitute plays in the place until the participant is back.",
+        "What happens when absent or gather is over: the game ends for all, or substitute plays in the place until the "
+        "participant is back.",
     )
     countdown: float = keyed.seconds(60, 3, "Seconds from when all participants are there until the game begins.")
     max_ping: int = keyed.whole(
         0,
         10_000,
         0,
-        "Milliseconds that a participant's round trip to the server may take before a game of several participants; "
-        "0 is no limit.",
+        "The longest round trip of a participant to the server before a game of several participants, in "
+        "milliseconds; 0 is no limit.",
     )
     ping_samples: int = keyed.whole(1, 100, 5, "Round trips that are measured before the game; their median counts.")
     player_names: dict[str, str] = field(
         default_factory=dict,
         metadata=keyed.texts(
             "red: The red one",
-            "What participants who play together read instead of the players' names in the environment.",
+            "Names of players that participants who play together read, instead of the environment's names.",
             key_maps.player_names,
         ),
     )
     seed: int | None = keyed.whole(
         0,
-        2**31 - MOST_EPISODES - 1,  # the last episode's seed too is below 2**31
+        2**31 - MAX_EPISODES - 1,  # the last episode's seed too is below 2**31
         None,
-        "Seed of the first episode; each one after it has the next number. Without it, each has a random one.",
+        "Seed of the first episode; each later episode has the next number. Default: a random seed for each episode.",
     )
     pace: str = keyed.choice(
         ("realtime", "turns"),
-        "Whether a step is taken at each frame, or as soon as all have chosen who are to act.",
+        "Whether a step is taken at each frame, or as soon as all players whose turn it is have chosen.",
     )
     turn_seconds: float = keyed.seconds(
         86_400,
@@ -243,8 +243,9 @@ class TrialSection:
     idle_action: str | dict[str, str] | None = field(
         default=None,
         metadata=keyed.about(
-            who.idle_action,
-            "Name of the action of no key, or one for each player. Default: noop, if there is one, else the first.",
+            player_checks.idle_action,
+            "Name of the action that is taken without a key, or one for each player. Default: noop if there is such "
+            "an action, otherwise the first action.",
             {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
         ),
     )
@@ -252,34 +253,34 @@ class TrialSection:
         default_factory=dict,
         metadata=keyed.about(
             values.options,
-            "Whatever else the agent wants to know: a map of your own keys; at most 4 KB.",
+            "A map of your own keys for the agent; at most 4 KB.",
             {"type": "object"},
         ),
     )
 
     @property
     def between_seconds(self) -> float:
-        """The seconds of a break; infinite if the participant ends it."""
+        """The seconds of a break; infinity if the participant ends the break."""
         return math.inf if isinstance(self.between_episodes, str) else self.between_episodes
 
     @property
     def most_steps(self) -> float:
-        """Steps after which an episode is truncated if nothing holds it up; infinite without a limit."""
+        """The largest number of steps of an episode at `starting_frame_rate`; infinity without a limit."""
         timed = math.ceil(self.episode_seconds * self.starting_frame_rate) or math.inf
         return min(self.max_steps or math.inf, timed)
 
     @property
     def pages(self) -> Mapping[str, str]:
-        """The files of the folder of pages that the game page shows, by the key that names each."""
+        """The files in the folder of pages that the game page shows, by the name of the key."""
         named = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
         return {key: page for key, page in named.items() if isinstance(page, str)}
 
     def keys_of(self, player: str) -> Mapping[str, str]:
-        """The actions of a player's keys by combination (`protocol.keyboard`); empty if the actions' names decide."""
+        """Return the actions of a player's keys by combination (`protocol.keyboard`); {} for the default keys."""
         return dict(self.key_maps()).get((player,) if self.keys_differ else (), {})
 
     def labels_of(self, player: str) -> Mapping[str, str]:
-        """The texts of a player's buttons by action: not of what the keys of other players do and theirs do not."""
+        """Return the texts of a player's buttons by action, without actions that only other players have keys for."""
         own = set(self.keys_of(player).values())
         others = {action for _, keys in self.key_maps() for action in keys.values()} - own
         return {action: text for action, text in self.labels.items() if action not in others}
@@ -290,43 +291,44 @@ class TrialSection:
         return any(isinstance(each, dict) for each in self.keys.values())
 
     def key_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
-        """The maps in `keys`, each with its path below `keys`: that of all players, or one for each."""
+        """Yield the map in `keys` for all players, or the map for each player, after its path below `keys`."""
         if self.keys_differ:
             yield from (((player,), each) for player, each in self.keys.items())
         else:
             yield (), self.keys
 
     def player_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
-        """The maps in `players`, each with its path below `players`: that of all groups, or one for each."""
-        if who.by_group(self.players):
+        """Yield the map in `players` for all groups, or the map for each group, after its path below `players`."""
+        if player_checks.by_group(self.players):
             yield from (((group,), each) for group, each in self.players.items())
         else:
             yield (), self.players
 
     def humans(self) -> Iterator[tuple[Keys, list[str]]]:
-        """The players that participants play, as in `player_maps`."""
+        """Yield the players that participants play, for all groups or for each group, after the path of the map."""
         for path, players in self.player_maps():
-            yield path, [name for name, plays in players.items() if plays == who.HUMAN]
+            yield path, [name for name, plays in players.items() if plays == player_checks.HUMAN]
 
     def players_of(self, group: int | None) -> dict[str, str]:
-        """What plays each player in this group; empty if the section does not say."""
-        if who.by_group(self.players):
+        """Return what plays each player in this group; {} if the section does not say. None is the first group."""
+        if player_checks.by_group(self.players):
             return dict(self.players.get(str(self.groups()[0] if group is None else group), {}))
         return dict(self.players)
 
     def groups(self) -> tuple[int, ...]:
-        """The groups that `players` names; empty if it does not differ between groups."""
-        return tuple(map(int, self.players)) if who.by_group(self.players) else ()
+        """Return the groups that `players` names; () if it has one map for all groups."""
+        return tuple(map(int, self.players)) if player_checks.by_group(self.players) else ()
 
     def named_players(self) -> tuple[str, ...]:
-        """The players that `players` names, in any group."""
+        """Return the players that `players` names in any group, each once."""
         return tuple(dict.fromkeys(name for _, players in self.player_maps() for name in players))
 
     def document(self) -> dict[str, Any]:
-        """The section with every default filled in, as JSON has it. `check` accepts it unchanged."""
+        """Return the section as JSON, with every default filled in. `trial_check.check` accepts it unchanged."""
         return keyed.document(self)
 
     def registered(self) -> dict[str, Any]:
-        """The section as servers are told it, in few characters: without what of sessions is as by default."""
-        usual = TrialSection().document()
-        return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != usual[key]}
+        """Return the section as a registration stores it: as `document`, without SESSION_KEYS that have their default
+        values, since ECS limits the length of a server's variables."""
+        defaults = TrialSection().document()
+        return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != defaults[key]}

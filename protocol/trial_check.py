@@ -1,6 +1,6 @@
-"""The one function that checks a `trial` section: each value by itself, then how they go together (`trial_rules.py`).
+"""Checks a `trial` section: first each value by itself, then the values against each other (`trial_rules.py`).
 
-`hippodrome/config` checks a registration, `trial/settings.py` what a server is started with. Both call `check`.
+`hippodrome/config` checks the section of a registration with `check`, and `trial/settings.py` that of a server.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from protocol import trial_rules, values
-from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, TAKEN, TrialSection
+from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, RESERVED_CONTROLS, TrialSection
 from protocol.trial_keys import keys, names
 from protocol.trial_sections import SceneSection, Ui
 from protocol.values import LONGEST_NAME, Check, Keys, SectionProblem, checked
@@ -17,27 +17,27 @@ _CONTROL = values.text("the name of a control", LONGEST_NAME)
 
 
 def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
-    """The values of a `trial` section, and all that is wrong with it. Never raises.
+    """Return the values of a `trial` section, and all its problems. Raises nothing.
 
-    `section` holds what JSON can hold, or text and `values.Plain`. A key that is left empty counts as not given.
-    A value that is wrong is replaced by its default. Unknown keys are ignored.
+    `section` holds JSON values, or texts and `values.Plain`. A key without a value counts as not given. The default
+    takes the place of a wrong value. Unknown keys are ignored.
     """
     if section is None or section == "":
         return TrialSection(), []
     if not isinstance(section, dict):
         _, problems = checked(values.section("actionBufferLifespan: …"), section, ())
         return TrialSection(), problems
-    section, problems = _spelt(section)
+    section, problems = _with_one_spelling(section)
     found, wrong = _section(TrialSection, section, ())
     trial, problems = TrialSection(**found), problems + wrong
     given = {key.name for key in keys(TrialSection) if key.attribute in found}
-    bad = {path[0] for path, _, _ in problems}
-    compared = [problem for rule in trial_rules.RULES for problem in rule(trial, given)]
-    return trial, problems + [problem for problem in compared if bad.isdisjoint(problem.compared)]
+    wrong_keys = {path[0] for path, _, _ in problems}
+    between_keys = [problem for rule in trial_rules.RULES for problem in rule(trial, given)]
+    return trial, problems + [problem for problem in between_keys if wrong_keys.isdisjoint(problem.compared)]
 
 
-def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[SectionProblem]]:
-    """The section with the right spelling of a key that HIPPO's documentation spells in two ways."""
+def _with_one_spelling(section: dict[str, Any]) -> tuple[dict[str, Any], list[SectionProblem]]:
+    """The section with the right spelling of `allowFrameRateChange`, which HIPPO's documentation spells in two ways."""
     if RATE_CHANGE_MISSPELT not in section:
         return section, []
     rest = {key: value for key, value in section.items() if key != RATE_CHANGE_MISSPELT}
@@ -49,7 +49,7 @@ def _spelt(section: dict[str, Any]) -> tuple[dict[str, Any], list[SectionProblem
 def _section(
     model: type[TrialSection | Ui | SceneSection], section: dict[str, Any], path: Keys
 ) -> tuple[dict[str, Any], list[SectionProblem]]:
-    """The good values by attribute, and the problems."""
+    """The valid values by attribute, and the problems."""
     found: dict[str, Any] = {}
     problems: list[SectionProblem] = []
     for key in keys(model):
@@ -74,13 +74,13 @@ def _section(
 
 
 def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...], list[SectionProblem]]:
-    """The names of the controls in `ui` that are not ours, and are to be shown."""
+    """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
     found: list[str] = []
     problems: list[SectionProblem] = []
     for name in section.keys() - names(Ui):
         here = (*path, name)
         shown, wrong = (False, []) if section[name] in (None, "") else checked(values.flag, section[name], here)
-        if shown and name in TAKEN:
+        if shown and name in RESERVED_CONTROLS:
             wrong = [SectionProblem(here, "the game's server knows this word already; give the control another name")]
         elif shown:
             _, wrong = checked(_CONTROL, name, here)

@@ -1,6 +1,6 @@
-"""How a key of the section `trial` is declared: its check, its default, its meaning and its JSON Schema.
+"""Declares the keys of the section `trial`: each has a check, a default, a meaning and a JSON Schema.
 
-The fields of `TrialSection`, and of the sections in it, are made by these functions.
+The fields of `TrialSection` and of the sections in it call these functions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Key:
     attribute: str
     check: Check
     default: Any
-    """What it is if it is not given; None if that is no plain value."""
+    """The value if the file does not have the key; None if this value is a section or a map."""
     meaning: str
     schema: Mapping[str, Any]
     """JSON Schema of the value, for editors."""
@@ -31,62 +31,63 @@ class Key:
     section: type[Any] | None = None
     """If the value is a section of its own: the class of its keys."""
     entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]] | None = None
-    """If the value is a map of names of the project's own: what is good of it at this path, and what is wrong."""
+    """If the value is a map whose names the project chooses: gets the map and its path, returns its valid entries and
+    the problems (`protocol/key_maps.py`)."""
 
 
 def about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """What a field says of its key, as its metadata; `more` are further attributes of `Key`."""
+    """Return the metadata of a field that declares a key; `more` are further attributes of `Key`."""
     return {"check": check, "meaning": meaning, "schema": schema, **more}
 
 
 def key(check: Check, default: Any, meaning: str, schema: Mapping[str, Any], **more: Any) -> Any:
-    """A field with a plain default."""
+    """Declare a key whose default is no section and no map."""
     return field(default=default, metadata=about(check, meaning, schema, **more))
 
 
 def flag(default: bool, meaning: str) -> Any:
-    """True or false."""
+    """Declare a key that is true or false."""
     return key(values.flag, default, meaning, {"type": "boolean"})
 
 
 def whole(low: int, high: int, default: int | None, meaning: str) -> Any:
-    """A whole number between these two."""
+    """Declare a key that is a whole number from `low` to `high`."""
     schema = {"type": "integer", "minimum": low, "maximum": high}
     return key(values.whole(low, high), default, meaning, schema)
 
 
 def seconds(most: int, default: float, meaning: str, *, least: float = 0) -> Any:
-    """Seconds, from `least` on."""
+    """Declare a key that is a number of seconds from `least` to `most`."""
     return key(values.number(least, most), default, meaning, {"type": "number", "minimum": least, "maximum": most})
 
 
 def choice(words: tuple[str, ...], meaning: str) -> Any:
-    """One of these words; the first is the default."""
+    """Declare a key that is one of these words; the first is the default."""
     return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
 
 
 def texts(
     example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]]
 ) -> dict[str, Any]:
-    """As `about`: a map of names of the project's own to texts."""
+    """Return the metadata of a key that maps names, which the project chooses, to texts."""
     schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
     return about(values.section(example), meaning, schema, entries=entries)
 
 
 def document(section: Any) -> dict[str, Any]:
-    """A section with every default filled in, as JSON has it; with the project's own keys, if it has such."""
-    found = {key.name: _plain(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))}
+    """Return a section as JSON, with every default filled in, and with the project's own controls if it is `ui`."""
+    found = {key.name: _json(getattr(section, key.attribute), key.section is not None) for key in keys(type(section))}
     return found | dict.fromkeys(getattr(section, "own", ()), True)
 
 
-def _plain(value: Any, section: bool) -> Any:
+def _json(value: Any, section: bool) -> Any:
     if section and value is not None:
         return document(value)
     return list(value) if isinstance(value, tuple) else value
 
 
 def keys(section: type[Any]) -> tuple[Key, ...]:
-    """The keys of a section, in order."""
+    """Return the keys of a section, in the order of its fields."""
     found = []
     for each in dataclasses.fields(section):
         if not each.metadata:
@@ -97,7 +98,7 @@ def keys(section: type[Any]) -> tuple[Key, ...]:
 
 
 def names(section: type[Any]) -> frozenset[str]:
-    """The names of the keys as they stand in the file."""
+    """Return the names of a section's keys, as they stand in the file."""
     return frozenset(key.name for key in keys(section))
 
 

@@ -1,7 +1,7 @@
-"""How the keys of the section `trial` go together: rules between two values.
+"""Rules between the keys of the section `trial`.
 
-A rule gets the section with its defaults, and the names of the keys that are given. A problem is not told if one of the
-values that it compares is wrong by itself.
+A rule gets the section with its defaults, and the names of the keys that the file has. `trial_check.check` drops a
+problem if one of the values that it compares is wrong by itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from protocol.values import SectionProblem
 
 
 def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProblem]:
-    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is told at a key that is given."""
+    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is at a key that the file has."""
     rates = {
         "minFrameRate": trial.min_frame_rate,
         "startingFrameRate": trial.starting_frame_rate,
@@ -36,7 +36,7 @@ def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProble
 
 
 def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
-    """Keys and labels name actions of actionSpace, if that is given."""
+    """`keys` and `labels` name only actions of `actionSpace`, if the file has it."""
     names = [action.lower() for action in trial.action_space]
     if not names:
         return
@@ -50,35 +50,29 @@ def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[Secti
         yield SectionProblem((section, *path), sentence, ("actionSpace", section))
 
 
-def _players_of_keys(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
-    """Keys by player name players of `players`, if that is given."""
+def _players_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`keys` by player and `playerNames` name only players of `players`, if the file has it."""
     known = trial.named_players()
-    for player, keys in trial.keys.items():
-        if known and isinstance(keys, dict) and player not in known:
-            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
-            yield SectionProblem(("keys", player), sentence, ("players", "keys"))
-
-
-def _players_of_names(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
-    """Names name players of `players`, if that is given."""
-    known = trial.named_players()
-    for player in trial.player_names:
+    named = [("keys", player) for player, keys in trial.keys.items() if isinstance(keys, dict)]
+    named += [("playerNames", player) for player in trial.player_names]
+    for section, player in named:
         if known and player not in known:
             sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
-            yield SectionProblem(("playerNames", player), sentence, ("players", "playerNames"))
+            yield SectionProblem((section, player), sentence, ("players", section))
 
 
 def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`actionSpace` has no name twice."""
     first: dict[str, int] = {}
     for index, action in enumerate(trial.action_space):
-        name = action.lower()  # as the trial has it
+        name = action.lower()  # as the trial server has it
         if first.setdefault(name, index) != index:
             sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
             yield SectionProblem(("actionSpace", index), sentence, ("actionSpace",))
 
 
 def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
-    """A program that plays needs a way in."""
+    """A program plays only with `gym: advise`."""
     if trial.gym == "advise":
         return
     for _, players in trial.player_maps():
@@ -91,18 +85,17 @@ def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]
 
 
 def _substitute(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
-    """A policy that takes a place."""
+    """`afterAbsent: policy` needs `substitute`."""
     if trial.after_absent == "policy" and trial.substitute is None:
-        what = "afterAbsent: policy needs a policy that takes the place, such as substitute: random"
-        yield SectionProblem(("substitute",), f"missing; {what}", ("afterAbsent", "substitute"))
+        sentence = "missing; afterAbsent: policy needs a policy that takes the place, such as substitute: random"
+        yield SectionProblem(("substitute",), sentence, ("afterAbsent", "substitute"))
 
 
 RULES: tuple[Callable[[TrialSection, set[str]], Iterator[SectionProblem]], ...] = (
     _frame_rates,
     _different_actions,
     _actions_that_exist,
-    _players_of_keys,
-    _players_of_names,
+    _players_that_exist,
     _programs,
     _substitute,
 )

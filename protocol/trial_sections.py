@@ -1,4 +1,4 @@
-"""The sections in `trial` of config.yml: which controls the page shows, and how a game is drawn by objects."""
+"""The sections `ui` and `scene` in `trial` of config.yml: the page's controls, and how a game is drawn by objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _control() -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Ui:
-    """Which controls the game page shows. If the section is given, what it does not name is not shown."""
+    """The section `ui`: the controls that the game page shows. Controls that the section does not name are hidden."""
 
     left: bool = _control()
     right: bool = _control()
@@ -34,10 +34,10 @@ class Ui:
     fps_up: bool = _control()
     fps_down: bool = _control()
     own: tuple[str, ...] = ()
-    """The project's own controls: all other keys that are true. A press is a word for the agent."""
+    """The project's own controls: all other keys that are true. A press calls feedback(name) of the agent."""
 
     def shown(self) -> tuple[str, ...]:
-        """The names of all controls that are shown, the project's own last."""
+        """Return the names of all controls that are shown, the project's own last."""
         return tuple(name for name, shown in keyed.document(self).items() if shown)
 
 
@@ -46,7 +46,7 @@ _FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]
 
 
 def _color(value: object) -> str:
-    """A color of the form `#rrggbb`, in small letters."""
+    """Check a color of the form `#rrggbb`, and return it in small letters."""
     found = values.as_text(value, 'a color such as "#ffffff", in quotes')
     if not _COLOR.fullmatch(found):
         raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
@@ -54,7 +54,7 @@ def _color(value: object) -> str:
 
 
 def _folder(value: object) -> str:
-    """A folder below the project's."""
+    """Check the name of a folder in the project's folder."""
     found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
     if len(found) > 200 or not _FOLDER.fullmatch(found):
         raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
@@ -67,10 +67,10 @@ def _pixels(default: int, meaning: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class SceneSection:
-    """How a game is shown that is drawn by objects (docs/objects.md)."""
+    """The section `scene`: the picture of a game that is drawn by objects (docs/objects.md)."""
 
-    width: int = _pixels(600, "Width of the picture, in pixels of its own; the page makes it larger or smaller.")
-    height: int = _pixels(400, "Its height.")
+    width: int = _pixels(600, "Width of the picture, in its own pixels; the page makes the picture larger or smaller.")
+    height: int = _pixels(400, "Height of the picture, in its own pixels.")
     background: str = keyed.key(
         _color,
         "#ffffff",
@@ -79,7 +79,7 @@ class SceneSection:
     )
     coordinates: str = keyed.choice(
         ("relative", "pixels"),
-        "Whether x, y and points are shares of the picture, from 0 to 1, or pixels of it.",
+        "Whether x, y and points are fractions of the picture, from 0 to 1, or its pixels.",
     )
     pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
     assets: str = keyed.key(
@@ -87,6 +87,6 @@ class SceneSection:
     )
 
 
-def usual_ui() -> Ui:
-    """What is shown if the section is not given."""
+def default_ui() -> Ui:
+    """Return the controls that the game page shows if `trial` has no section `ui`."""
     return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)

@@ -1,6 +1,6 @@
-"""Checks of single values of config.yml. A check returns the value, or raises ValueError with what to write instead.
+"""Checks single values of config.yml. A check returns the value, or raises ValueError with what to write instead.
 
-A check takes anything: text, `Plain` values from YAML, or whatever JSON can hold.
+A check accepts a value of any type: texts, `Plain` values from YAML, and JSON values.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 Check = Callable[[object], object]
 Keys = tuple[str | int, ...]
-"""Where a value stands: keys and, in lists, positions from 0."""
+"""The path of a value: keys and, in lists, positions from 0."""
 LONGEST_NAME = 64
-"""Characters of the name of an action, a player, or a control of the project's own."""
+"""Characters of the name of an action, a player, or one of the project's own controls."""
 
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}(\.[0-9]{0,18})?|\.[0-9]{1,18})")
@@ -36,9 +36,9 @@ class Plain:
 
 
 class SectionProblem(NamedTuple):
-    """A mistake in the section: the path of the key below `trial`, and the sentence that says what to write.
+    """A mistake in the section: the path of the key below `trial`, and a sentence that says what to write.
 
-    `compared` are the keys of a rule between two values; it is empty if the value is wrong by itself.
+    `compared` has the keys that a rule compares (`trial_rules.py`); it is empty if the value is wrong by itself.
     """
 
     path: Keys
@@ -47,7 +47,7 @@ class SectionProblem(NamedTuple):
 
 
 def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[SectionProblem]]:
-    """What the check returns, or None and the problem at this path."""
+    """Return the result of the check and no problem, or None and the problem at this path."""
     try:
         return check(value), []
     except ValueError as error:
@@ -55,7 +55,7 @@ def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[SectionP
 
 
 def show(value: object) -> str:
-    """The value as it may stand in a message: short, in quotes if it is text, without anything invisible."""
+    """Return the value for a message: short, in quotes if it is a text, without invisible characters."""
     if isinstance(value, Plain):
         return printable(value.text)
     if isinstance(value, str) and value:
@@ -64,41 +64,43 @@ def show(value: object) -> str:
         return "empty"
     if isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**18):
         return json.dumps(value)
-    return "a map" if isinstance(value, dict) else "a list" if isinstance(value, list | tuple) else "that"
+    return "a map" if isinstance(value, dict) else "a list" if isinstance(value, list | tuple) else "such a value"
 
 
 def printable(text: str, limit: int = 60) -> str:
-    """The text cut short, with nothing invisible in it."""
+    """Return the first `limit` characters of the text, with `?` for each invisible character."""
     text = text if len(text) <= limit else text[: limit - 1] + "…"
     return "".join(char if char.isprintable() else "?" for char in text)
 
 
-def where_of(path: Keys) -> str:
-    """The path in words: `trial.actionSpace item 3`."""
+def path_text(path: Keys) -> str:
+    """Return the path as text: `trial.actionSpace item 3`."""
     words = ""
     for part in path:
         words += f" item {part + 1}" if isinstance(part, int) else f".{printable(part)}"
     return words.lstrip(".")
 
 
-def as_text(value: object, what: str) -> str:
-    """The text in a value that should be `what`. Raises ValueError."""
+def as_text(value: object, expected: str) -> str:
+    """Return a value that must be a text. Raises ValueError, which says that the value must be `expected`."""
     if isinstance(value, Plain) and isinstance(value.value, bool):
-        raise ValueError(f'must be {what}; YAML reads {value.text} as true or false, so write "{value.text}" in quotes')
+        raise ValueError(
+            f'must be {expected}; YAML reads {value.text} as true or false, so write "{value.text}" in quotes'
+        )
     if isinstance(value, Plain):
         return value.text
     if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"must be {what}, not {show(value)}")
+        raise ValueError(f"must be {expected}, not {show(value)}")
     if _CONTROL.search(value.strip()):
-        raise ValueError(f"must be {what}; without tabs, line ends and invisible characters")
+        raise ValueError(f"must be {expected}; without tabs, line ends and invisible characters")
     return value.strip()
 
 
-def text(what: str = "text", limit: int = 500) -> Check:
-    """A check for any text of up to `limit` characters."""
+def text(expected: str = "text", limit: int = 500) -> Check:
+    """Return a check for a text of up to `limit` characters; `expected` names it in messages."""
 
     def check(value: object) -> str:
-        found = as_text(value, what)
+        found = as_text(value, expected)
         if len(found) > limit:
             raise ValueError(f"must be at most {limit} characters long, not {len(found)}")
         return found
@@ -107,7 +109,7 @@ def text(what: str = "text", limit: int = 500) -> Check:
 
 
 def action_name(value: object) -> str:
-    """The name of an action. A number is a name too, in YAML as it is written. Raises ValueError."""
+    """Return the name of an action. A number is a name, too, in YAML with the digits of the file. Raises ValueError."""
     return str(_ACTION_NAME(str(value) if isinstance(value, int) and not isinstance(value, bool) else value))
 
 
@@ -115,7 +117,7 @@ _ACTION_NAME = text("the name of an action", LONGEST_NAME)
 
 
 def step_file(text: str) -> str:
-    """A file in the folder of pages, without `.html`. Raises ValueError with what to write."""
+    """Return the name of a file in the folder of pages, without `.html`. Raises ValueError with what to write."""
     stem = text.removesuffix(".html")
     if "/" in text or "\\" in text:
         raise ValueError(f"must be the name of a file in the steps folder, without folders, not {show(text)}")
@@ -126,7 +128,7 @@ def step_file(text: str) -> str:
 
 
 def number_in(value: object) -> int | float | None:
-    """The finite number in a YAML or JSON number or in text such as "30"; None if there is none."""
+    """Return the finite number in a YAML or JSON number, or in a text such as "30"; None for any other value."""
     if isinstance(value, Plain):
         value = value.value
     if isinstance(value, str) and _WHOLE.fullmatch(value.strip()):
@@ -139,7 +141,7 @@ def number_in(value: object) -> int | float | None:
 
 
 def whole(low: int, high: int | None = None) -> Check:
-    """A check for a whole number from `low` to `high` (a billion, which needs no mention), also as text."""
+    """Return a check for a whole number from `low` to `high`, also as text. Without `high`, the limit is a billion."""
     span = f"of at least {low}" if high is None else f"from {low} to {high}"
     most = high or 10**9
 
@@ -153,7 +155,7 @@ def whole(low: int, high: int | None = None) -> Check:
 
 
 def number(low: float, high: int) -> Check:
-    """A check for a number from `low` to `high`, also as text; a whole one is returned as an int."""
+    """Return a check for a number from `low` to `high`, also as text. The check returns a whole number as an int."""
 
     def check(value: object) -> float:
         found = number_in(value)
@@ -165,7 +167,7 @@ def number(low: float, high: int) -> Check:
 
 
 def flag(value: object) -> bool:
-    """true or false, also as yes/no, on/off."""
+    """Return the bool in `true` or `false`, also written as yes/no or on/off. Raises ValueError."""
     if isinstance(value, Plain):
         value = value.value if isinstance(value.value, bool) else value
     if isinstance(value, bool):
@@ -176,7 +178,7 @@ def flag(value: object) -> bool:
 
 
 def one_of(*choices: str) -> Check:
-    """A check for one of a few words."""
+    """Return a check for one of these words."""
 
     def check(value: object) -> str:
         if isinstance(value, str) and value.strip() in choices:
@@ -186,14 +188,17 @@ def one_of(*choices: str) -> Check:
     return check
 
 
-def items(what: str, limit: int, single: bool = False) -> Callable[[object], list[object]]:
-    """A check for a list of at most `limit` items; `single` takes one text for a list of one."""
+def items(item: str, limit: int, single: bool = False) -> Callable[[object], list[object]]:
+    """Return a check for a list of at most `limit` items; `item` names one in messages.
+
+    With `single`, the check takes one text for a list of one.
+    """
 
     def check(value: object) -> list[object]:
         if single and isinstance(value, str | Plain):
             return [value]
         if not isinstance(value, list | tuple):
-            raise ValueError(f"must be a list: a line with a dash for each {what}, not {show(value)}")
+            raise ValueError(f"must be a list: a line with a dash for each {item}, not {show(value)}")
         if len(value) > limit:
             raise ValueError(f"must have at most {limit} items, not {len(value)}")
         return list(value)
@@ -202,7 +207,7 @@ def items(what: str, limit: int, single: bool = False) -> Callable[[object], lis
 
 
 def section(example: str) -> Check:
-    """A check for a map of keys; `example` is one of them, with what may stand behind it."""
+    """Return a check for a map of keys; `example` is one line of it, for messages."""
 
     def check(value: object) -> object:
         if not isinstance(value, dict):
@@ -213,7 +218,7 @@ def section(example: str) -> Check:
 
 
 def options(value: object) -> dict[str, object]:
-    """A map of whatever JSON can hold, not too large."""
+    """Return a map as JSON. Raises ValueError if it holds anything else, is nested too deep, or is too long."""
     if not isinstance(value, dict):
         raise ValueError(f'must be a map: indented lines such as "difficulty: 3" below it, not {show(value)}')
     found = _json_map(value, _OPTIONS_DEPTH)
@@ -228,7 +233,7 @@ def _json_map(value: dict[object, object], depth: int) -> dict[str, object]:
 
 
 def _json(value: object, depth: int) -> object:
-    """The value as JSON has it, with at most `depth` lists and maps within each other."""
+    """The value as JSON. Raises ValueError if more than `depth` lists and maps are nested in each other."""
     if isinstance(value, Plain):
         value = value.value
     if isinstance(value, dict | list):

@@ -15,7 +15,7 @@ from protocol.keys import NAME, SERVER_NAME, recordings_folder, session_recordin
 from protocol.session import Member, is_session_id
 from protocol.trial import TrialSection
 from protocol.trial_check import check
-from protocol.values import where_of
+from protocol.values import path_text
 
 DEFAULT_GAME = "ALE/MsPacman-v5"
 """The game of a server that is started by hand without one. A study with a game step always names one."""
@@ -32,7 +32,7 @@ def trial_section(section: Mapping[str, Any]) -> TrialSection:
     """
     found, problems = check(dict(section))
     for path, sentence, _ in problems:
-        raise SettingsError(f"{where_of(('trial', *path))}: {sentence}")
+        raise SettingsError(f"{path_text(('trial', *path))}: {sentence}")
     names = tuple(name.lower() for name in found.action_space)
     return replace(found, game=found.game or DEFAULT_GAME, action_space=names)
 

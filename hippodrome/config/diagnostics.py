@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from protocol.values import Keys, printable, where_of
+from protocol.values import Keys, path_text, printable
 
-__all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "Remark", "in_order", "printable", "where_of"]
+__all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "Remark", "in_order", "path_text", "printable"]
 
 
 @dataclass(frozen=True, slots=True)

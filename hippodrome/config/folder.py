@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from hippodrome.config import hippo_pages, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Keys, Mistake, in_order, where_of
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Keys, Mistake, in_order, path_text
 from hippodrome.config.each_value import Checked
 from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
 from hippodrome.config.layout import Layout, find
@@ -55,7 +55,7 @@ class ConfigSource:
         ):
             line = line or self.parsed.lines["trial", RATE_CHANGE_MISSPELT]
         file = self.layout.label(self.layout.config)
-        return Diagnostic(file, line or self.parsed.line(origin), where_of(origin), message, remark)
+        return Diagnostic(file, line or self.parsed.line(origin), path_text(origin), message, remark)
 
 
 def read_source(folder: Path) -> ConfigSource:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hippodrome.config.diagnostics import Keys, Remark, where_of
+from hippodrome.config.diagnostics import Keys, Remark, path_text
 from hippodrome.config.project_keys import MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
@@ -381,7 +381,7 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     if not isinstance(options, dict):
         return
     if path[-1] in options:
-        adapted.remark(path, f"no effect: {where_of(('trial', 'options', path[-1]))} is there too")
+        adapted.remark(path, f"no effect: {path_text(('trial', 'options', path[-1]))} is there too")
         return
     trial["options"] = options
     options[str(path[-1])] = value

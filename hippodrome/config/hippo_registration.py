@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from hippodrome.config.diagnostics import where_of
+from hippodrome.config.diagnostics import path_text
 from hippodrome.config.hippo import adapt
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key
@@ -78,7 +78,7 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     """
     given = {key: value for key, value in event.items() if key != "trial"}
     adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
-    said = [f"{where_of(remark.path)}: {remark.message}" for remark in adapted.remarks]
+    said = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
     kept = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
     said += [f"project.{key}: {json.dumps(kept[key])} {_STAYS}" for key in kept if key in _SHOWN]

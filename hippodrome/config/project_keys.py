@@ -21,7 +21,7 @@ from hippodrome.model.matching import MATCHED_BY, MATCHINGS, SEATS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
 from protocol import values
-from protocol.session import MOST_PLAYERS
+from protocol.session import MAX_PLAYERS
 from protocol.similar import did_you_mean
 from protocol.trial import TrialSection
 from protocol.trial_keys import names
@@ -302,7 +302,7 @@ class ProjectKeys(Model):
     """Servers that are started ahead and wait, so that participants need not. Each is paid for while it waits."""
     signed_links: _Flag = False
     """Whether only links that `deploy links` has signed are let in."""
-    players: Annotated[int, whole(1, MOST_PLAYERS)] = 1
+    players: Annotated[int, whole(1, MAX_PLAYERS)] = 1
     """Participants who play together in one environment. 1: each plays alone, on a server of their own."""
     matching: Annotated[str | dict[str, str], Rule(who_with_whom, _MATCHING)] = "arrival"
     """Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py."""

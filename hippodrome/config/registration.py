@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from hippodrome.config import project_keys, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, where_of
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, path_text
 from hippodrome.config.each_value import message_of
 from hippodrome.config.key_types import Model, Rule, whole
 from hippodrome.config.project_keys import STEPS
@@ -86,7 +86,7 @@ def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
     path = mistake.path[1:] if mistake.path[:1] == ("project",) else mistake.path
     if path[:1] == ("steps",) and len(path) > 1 and path[1] in order:
         path = ("steps", order[str(path[1])], *path[2:])
-    return Diagnostic(MESSAGE, None, where_of(path), mistake.message)
+    return Diagnostic(MESSAGE, None, path_text(path), mistake.message)
 
 
 def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:

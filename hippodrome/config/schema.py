@@ -15,7 +15,7 @@ from protocol.trial_sections import SceneSection, Ui
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
     "patternProperties": {
-        f"^({'|'.join(sorted(trial.TAKEN))})$|^.{{{values.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
+        f"^({'|'.join(sorted(trial.RESERVED_CONTROLS))})$|^.{{{values.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
     },
 }
 """What other keys of `ui` may be. A pattern, since editors would propose keys that stand under `properties`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hippodrome.config.diagnostics import Keys, where_of
+from hippodrome.config.diagnostics import Keys, path_text
 from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
@@ -26,13 +26,13 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
     own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
     home = _home(key, section)
     if home is not None:
-        place = f"under {where_of(home)}" if home else "at the top of the file, not indented"
+        place = f"under {path_text(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
     for home in (section, *_ELSEWHERE):
         near = nearest(key, sorted(NAMES[home]))
         if near:
             meant = (*home, near)
-            question = f"did you mean {near if home == section else where_of(meant)}?"
+            question = f"did you mean {near if home == section else path_text(meant)}?"
             return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
     names_here = sorted(NAMES[section])
     which = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"

@@ -34,7 +34,7 @@ class FileDns:
                     del zone[record.name]
             zone.update({record.name: record.host for record in add})
             if json.dumps(zone) != before:
-                files.write_json(self._file, zone, surely=False)  # a power cut ends every server, too
+                files.write_json(self._file, zone, durable=False)  # a power cut ends every server, too
         return ""
 
     def in_sync(self, change: str) -> bool:

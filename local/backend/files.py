@@ -15,12 +15,12 @@ from protocol import disk
 PRIVATE = 0o600
 
 
-def write_json(path: Path, data: Any, *, surely: bool = True) -> None:
-    """Write a record of ours, whole, and bring it to the disk. Raises OSError.
+def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
+    """Write a whole JSON file, and bring it to the disk. Raises OSError.
 
-    If not `surely`, a power cut may bring back what stood there before.
+    Without `durable`, a power cut may bring the earlier file back.
     """
-    disk.replace(path, json.dumps(data, indent=1).encode(), surely=surely)
+    disk.replace(path, json.dumps(data, indent=1).encode(), durable=durable)
 
 
 def read_json(path: Path) -> Any:

@@ -75,7 +75,7 @@ class TaskFolder:
     def save(self, task: TaskRecord) -> None:
         """Keep the record. Raises OSError."""
         # After a power cut every process is gone: to know that there was one is enough to tell its end.
-        files.write_json(self.file(task.name), _to_json(task), surely=task.version == 0)
+        files.write_json(self.file(task.name), _to_json(task), durable=task.version == 0)
 
     def load(self) -> Iterator[TaskRecord]:
         """The records that can be read. Raises OSError."""

@@ -25,7 +25,7 @@ from local.check.outside import Outside
 from local.check.several import GameOfSeveral
 from protocol import environment as variables
 from protocol import handover
-from protocol.session import MOST_PLAYERS, SessionDocument, is_session_id
+from protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
 from protocol.trial import TrialSection
 from trial.agent import match
 from trial.agent.agent import AgentAdapter, AgentError
@@ -174,7 +174,7 @@ def _whose(document: str) -> assignment.Found:
     given = handover.parse(document.encode())
     if not is_session_id(given.user_id):
         return given
-    return SessionDocument(given.user_id, MOST_PLAYERS, (), given.group)
+    return SessionDocument(given.user_id, MAX_PLAYERS, (), given.group)
 
 
 def _group(document: str) -> int | None:

@@ -19,7 +19,7 @@ def found(**section: Any) -> trial.TrialSection:
 
 def said(**section: Any) -> list[str]:
     _, problems = trial_check.check(section)
-    return [f"{trial.values.where_of(problem.path)}: {problem.sentence}" for problem in problems]
+    return [f"{trial.values.path_text(problem.path)}: {problem.sentence}" for problem in problems]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protocol.keys import NAME
 from protocol.session import (
-    MOST_PLAYERS,
+    MAX_PLAYERS,
     BadSession,
     Member,
     SessionDocument,
@@ -50,7 +50,7 @@ HOSTILE = {
     "an id with a line more": changed(id=SID + "\n"),
     "no players": changed(players=0),
     "players like true": changed(players=True),
-    "too many players": changed(players=MOST_PLAYERS + 1),
+    "too many players": changed(players=MAX_PLAYERS + 1),
     "no members": changed(members=[]),
     "members that are none": changed(members=["anna"]),
     "members like a map": changed(members={"anna": 0}),
@@ -69,7 +69,7 @@ HOSTILE = {
 
 
 @given(
-    st.integers(1, MOST_PLAYERS).flatmap(
+    st.integers(1, MAX_PLAYERS).flatmap(
         lambda players: st.tuples(
             st.just(players),
             st.lists(
@@ -158,7 +158,7 @@ def test_whatever_stands_there_is_read_or_refused(body: bytes) -> None:
     except BadSession:
         return
     assert is_session_id(found.id)
-    assert len({member.seat for member in found.members}) == len(found.members) <= found.players <= MOST_PLAYERS
+    assert len({member.seat for member in found.members}) == len(found.members) <= found.players <= MAX_PLAYERS
 
 
 @given(IDS, IDS, st.text(min_size=1), st.text(min_size=1))

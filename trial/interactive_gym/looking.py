@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from protocol.session import MOST_PLAYERS
+from protocol.session import MAX_PLAYERS
 from trial.interactive_gym import onnx_inference_utils
 from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
 from trial.interactive_gym.playing import ExperimentAgent, Unplayable, humans_of, mapping_of, space_of
@@ -110,9 +110,9 @@ def _check(config: RemoteConfig) -> None:
     mapping, humans = mapping_of(config), humans_of(config)
     if not humans:
         raise Unplayable("policy_mapping has no PolicyTypes.Human: say which player the participant plays")
-    if len(humans) > MOST_PLAYERS:
+    if len(humans) > MAX_PLAYERS:
         raise Unplayable(
-            f"policy_mapping has {len(humans)} humans; at most {MOST_PLAYERS} participants play together: give the "
+            f"policy_mapping has {len(humans)} humans; at most {MAX_PLAYERS} participants play together: give the "
             "others a policy or PolicyTypes.Random"
         )
     for player, plays in mapping.items():

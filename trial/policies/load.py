@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from protocol.players import AGENT_PLAYER, SAMPLE, WHO, files_there
+from protocol.players import AGENT_PLAYER, ALL_KINDS, SAMPLE, files_there
 from trial.policies.policy import Policy, PolicyError, PolicyFileMissing
 from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
 
@@ -37,7 +37,7 @@ def load(
 
         name = spec.removeprefix(SAMPLE)
         return onnx.load(spec, _file(folder, name), action_count, observation_space, sample=spec != name)
-    raise PolicyError(f"{spec!r} is no player; write {WHO}")
+    raise PolicyError(f"{spec!r} is no player; write {ALL_KINDS}")
 
 
 def _file(folder: Path, name: str) -> Path:

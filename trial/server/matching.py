@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol.keys import QUESTION_ID, groups_key, waiting_key
-from protocol.session import MOST_PLAYERS
+from protocol.session import MAX_PLAYERS
 from trial.agent import match
 from trial.agent.match import BadGroups
 from trial.agent.tracebacks import report
@@ -106,7 +106,7 @@ def read(body: bytes) -> dict[str, Any] | None:
     name, players, waiting = found.get("id"), found.get("players"), found.get("waiting")
     if not (isinstance(name, str) and QUESTION_ID.fullmatch(name)) or not isinstance(waiting, list):
         return None
-    if not isinstance(players, int) or not 2 <= players <= MOST_PLAYERS:
+    if not isinstance(players, int) or not 2 <= players <= MAX_PLAYERS:
         return None
     good = all(isinstance(each, dict) and isinstance(each.get("id"), str) for each in waiting)
     return {"id": name, "players": players, "waiting": waiting} if good else None

@@ -228,7 +228,7 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
         ({"id": "../etc"}, 'id: may hold only letters, digits, dashes and underscores, not "../etc"; write for example "etc"'),
         ({"id": {"$ne": ""}}, "id: must be letters, digits, dashes and underscores, not a map"),
         ({"secret": "x"}, "secret: unknown key; docs/config.md lists all keys"),
-        ({"maxRuntime": 10**400}, "maxRuntime: must be a whole number from 1 to 1440, not that"),
+        ({"maxRuntime": 10**400}, "maxRuntime: must be a whole number from 1 to 1440, not such a value"),
         ({"maxRuntime": float("nan")}, "maxRuntime: must be a whole number from 1 to 1440, not NaN"),
         ({"allowedHosts": ["https://a.example; script-src *"]}, 'allowedHosts item 1: must be an address such as https://example.org, without path and without *, not "https://a.example; script-src *"'),
         ({"events": {"stopServerStep": "7"}}, "events.stopServerStep: there is no step 7; the steps are 1 to 3 and finalStep"),
