@@ -1,7 +1,7 @@
-"""The trial server: runs one participant's trial and talks to their browser. Stands alone; see docs/wire.md.
+"""The trial server: runs the trial of one participant or one session, and talks to the browsers (docs/wire.md).
 
-The names of `_INTERACTIVE_GYM` are for experiments written for Interactive Gym (docs/interactive-gym.md). They are
-imported when they are asked for, so that importing this package stays cheap.
+Experiments that were written for Interactive Gym import its modules from this package (docs/interactive-gym.md). Each
+module is loaded at its first use, so that importing the package stays cheap.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _INTERACTIVE_GYM = {
 
 
 def __getattr__(name: str) -> Any:
-    """`from trial import RemoteConfig`, and the other words of Interactive Gym."""
+    """Load a name of Interactive Gym: `from trial import RemoteConfig`."""
     if name not in _INTERACTIVE_GYM:
         raise AttributeError(f"module 'trial' has no attribute {name!r}")
     module, _, attribute = _INTERACTIVE_GYM[name].partition(".")
@@ -39,26 +39,26 @@ def __getattr__(name: str) -> Any:
     return getattr(found, attribute) if attribute else found
 
 
-class _Words:
-    """`from trial.remote_game import RemoteGame`: the modules of Interactive Gym under their own names.
+class _InteractiveGymFinder:
+    """Finds the modules of Interactive Gym as modules of `trial`: `from trial.remote_game import RemoteGame`.
 
-    They are found after all else, so that no module of this package is hidden.
+    It is the last finder of `sys.meta_path`, so it hides no module of this package.
     """
 
     @staticmethod
     def find_spec(name: str, _path: Any = None, _target: Any = None) -> Any:
-        word = name.removeprefix("trial.")
-        if word in (name, "RemoteConfig") or word not in _INTERACTIVE_GYM:
+        module = name.removeprefix("trial.")
+        if module in (name, "RemoteConfig") or module not in _INTERACTIVE_GYM:
             return None
-        return importlib.machinery.ModuleSpec(name, _Words)  # type: ignore[arg-type]
+        return importlib.machinery.ModuleSpec(name, _InteractiveGymFinder)  # type: ignore[arg-type]
 
     @staticmethod
     def create_module(_spec: Any) -> None:
-        """The usual empty one, which `exec_module` replaces."""
+        """Return None: Python makes the usual empty module, which `exec_module` replaces."""
 
     @staticmethod
     def exec_module(module: Any) -> None:
         sys.modules[module.__name__] = __getattr__(module.__name__.removeprefix("trial."))
 
 
-sys.meta_path.append(_Words)
+sys.meta_path.append(_InteractiveGymFinder)

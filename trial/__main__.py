@@ -1,4 +1,4 @@
-"""`python -m trial`: the server of a participant or a session, as its environment says (protocol/environment.py)."""
+"""`python -m trial`: the server of a participant or a session. protocol/environment.py lists its variables."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ async def _serve(settings: TrialSettings) -> tuple[int, bool]:
 
     loop = asyncio.get_running_loop()
     serving = asyncio.create_task(server.run())
-    await asyncio.sleep(0)  # run has begun: it can be ended
+    await asyncio.sleep(0)  # lets `run` begin: before that, `end` would find nothing to end
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, server.end, "asked to")
     return await serving, server.stuck
 
 
 def main() -> int:
-    """Run until the trial is over. 0: ended as it should; 1: could not serve; 2: wrong settings.
+    """Run the server, and return the process's exit status.
 
-    3 and 4: no agent; 5: no port; see `protocol/exits.py`.
+    0: the server ended without an error; 1: with an error; 2: wrong settings; 3 to 5: see `protocol/exits.py`.
     """
-    os.umask(0o077)  # recordings and answers, and what the agent writes, are the owner's alone
+    os.umask(0o077)  # only this user may read recordings, answers, and the files that the agent writes
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
-    sys.dont_write_bytecode = (
-        True  # for a changed agent.py of the same size and second Python would take the older code
-    )
-    sys.setswitchinterval(0.001)  # the agent's thread must not hold up the connection's for longer
+    # Python takes cached bytecode for current if the source has the same size and second. An agent.py that was edited
+    # within that second would run as it was before.
+    sys.dont_write_bytecode = True
+    sys.setswitchinterval(0.001)  # seconds for which the agent's thread may keep the event loop's thread waiting
     try:
         settings = TrialSettings.from_env(os.environ)
         for secret in environment.SECRETS:
-            os.environ.pop(secret, None)  # the researcher's code has no use for them
+            os.environ.pop(secret, None)  # so that the researcher's code cannot read them there
         if not settings.assigned:
             assignment.set_environment(os.environ, None)
         status, stuck = asyncio.run(_serve(settings))
@@ -56,7 +56,7 @@ def main() -> int:
     if stuck:
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(status)  # an ordinary exit could wait for code that never returns
+        os._exit(status)  # an ordinary exit would wait for the researcher's code, which may never return
     return status
 
 

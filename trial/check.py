@@ -1,13 +1,13 @@
-"""`python -m trial.check FILE [SECONDS]`: whether the image holds what the agent needs; a step of its Dockerfile.
+"""`python -m trial.check FILE [SECONDS]` checks that the image holds what the agent needs. Its Dockerfile runs this.
 
-FILE holds what of the section `trial` the agent is started with, as JSON. The agent is loaded, starts its game, begins
-an episode, draws it and takes one step, as in a server, but in a process of its own that is ended after SECONDS.
+FILE holds the keys of the section `trial` with which the agent is started, as JSON. The agent is loaded, starts its
+game, begins an episode, draws it and takes one step, as in a server, but in a process of its own, which is killed after
+SECONDS. In a game of several players, each policy is also asked for one action.
 
-Where several play, each policy is asked for one action too.
-
-Exit status 1 and a line that begins with `LACKS` if that fails because a package, a module, a system library or the
-file of a policy is not there: it will not be there for any participant. All else is a warning and status 0, since a
-server may have what a build has not: a participant, a group, the rest of the section, more time and memory.
+If this fails because a package, a module, a system library or a policy's file is missing, no participant could play:
+the exit status is 1, and a line that begins with `LACKS` says what is missing. Any other failure is a warning with
+status 0, since a build lacks what a server has: a participant, a group, the other keys of the section, more time and
+memory.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from trial.agent.joint import JointAdapter
 
 LACKS = "MISSING IN THE IMAGE: "
-"""Begins the line that says what is missing."""
+"""The beginning of the line that says what is missing."""
 REMEDY = " => "
-"""Stands in that line between what is missing and what to do about it."""
+"""Separates, in that line, the missing thing from the advice what to do about it."""
 PACKAGE = "the package that brings "
-"""Stands in what to do before the name of a module whose package is not known here."""
+"""Precedes, in the advice, the name of a module: the image does not know which package has it."""
 
 _SECONDS = 60.0
-_LIMIT = 300  # characters of an error's own words
+_LIMIT = 300  # characters of an error's message
 _ENVIRONMENT = {
     environment.PROJECT_ID: "check",
     environment.USER_ID: "check",
@@ -53,9 +53,9 @@ _MISSING = {"ImportError", "DependencyNotInstalled", "UnregisteredEnv"}  # the l
 
 
 def main(file: Path, seconds: float) -> int:
-    """Try the agent; the exit status."""
-    with tempfile.TemporaryDirectory(prefix="check-", ignore_cleanup_errors=True) as place:
-        report = Path(place) / "report"
+    """Try the agent, and return the exit status."""
+    with tempfile.TemporaryDirectory(prefix="check-", ignore_cleanup_errors=True) as folder:
+        report = Path(folder) / "report"
         status = _run(file, report, seconds)
         try:
             found = json.loads(report.read_text())
@@ -76,12 +76,12 @@ def main(file: Path, seconds: float) -> int:
 
 
 def _run(file: Path, report: Path, seconds: float) -> int | None:
-    """The exit status of the agent's process, None if it had to be killed."""
+    """Try the agent in a process, and return the process's exit status; None if it had to be killed."""
     return process_group.run(
         [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
         seconds,
         env={**os.environ, **_ENVIRONMENT, environment.TRIAL: file.read_text()},
-        stdout=subprocess.DEVNULL,  # a builder cuts off what says too much, and our line would be lost
+        stdout=subprocess.DEVNULL,  # a builder truncates a long log, and our line would be lost
         stderr=subprocess.DEVNULL,
     )
 
@@ -90,22 +90,22 @@ def _run(file: Path, report: Path, seconds: float) -> int | None:
 
 
 def _try(file: Path, report: Path) -> None:
-    """Let the agent play a step, and write down what came of it."""
+    """Let the agent play one step, and write the result to the file `report`."""
     folder = Path(os.environ[environment.AGENT_DIR]).resolve()
     try:
         _play(folder, json.loads(file.read_text()))
         found: dict[str, Any] = {"well": True}
     except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-        said = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
+        failure = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
         remedy = _remedy(error)
-        found = {"lacks": f"{said}{REMEDY}{remedy}"} if remedy else {"failed": said}
+        found = {"lacks": f"{failure}{REMEDY}{remedy}"} if remedy else {"failed": failure}
     part = report.with_suffix(".part")
     part.write_text(json.dumps(found))
     part.replace(report)
 
 
 def _play(folder: Path, section: Mapping[str, Any]) -> None:
-    from trial.agent.agent import AgentAdapter  # noqa: PLC0415 - a process that only reads the report needs none of it
+    from trial.agent.agent import AgentAdapter  # noqa: PLC0415 - the process that only reads the report needs no agent
     from trial.agent.starting import start  # noqa: PLC0415
     from trial.pictures import assets  # noqa: PLC0415
     from trial.pictures.reader import PictureReader  # noqa: PLC0415
@@ -114,80 +114,80 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
     config, _ = check(dict(section))
     scene = config.scene
     reader = PictureReader(scene, assets.load(folder, scene.assets) if scene is not None else assets.Assets())
-    # One player takes the first action alone, which every game has.
+    # A single player takes action 0, which every game has.
     adapter = AgentAdapter(folder, config.game or DEFAULT_GAME, config.action_space or ("noop",), reader)
-    player = start(adapter, config.named_players())
-    if isinstance(player, AgentAdapter):
-        player.reset(1)
-        player.render()
-        player.step(0)
-        player.render()
+    started = start(adapter, config.named_players())
+    if isinstance(started, AgentAdapter):
+        started.reset(1)
+        started.render()
+        started.step(0)
+        started.render()
     else:
-        _play_jointly(player, config, folder)
+        _play_jointly(started, config, folder)
 
 
 def _play_jointly(adapter: JointAdapter, config: TrialSection, folder: Path) -> None:
-    """One step, in which all who are to act take their first action and each policy is asked for one."""
+    """Ask each policy that is to act for one action; then take one step with each player's first legal action."""
     from trial.core.players import who_plays  # noqa: PLC0415 - as above
     from trial.policies.places import load_policies  # noqa: PLC0415
 
-    now, _ = adapter.reset(1)
+    first, _ = adapter.reset(1)
     adapter.pictures()
     for group in config.groups() or (None,):
         players = who_plays(config, adapter.action_spaces, group)
         policies = load_policies(players, folder, adapter.agent_module, adapter.observation_spaces)
         for player, policy in policies.items():
             policy.reset(1)
-            if player in now.to_act:
-                policy.act(now.observations.get(player), now.infos.get(player, {}), now.masks.get(player))
+            if player in first.to_act:
+                policy.act(first.observations.get(player), first.infos.get(player, {}), first.masks.get(player))
             policy.close()
     adapter.step({})
     adapter.pictures()
 
 
 def _remedy(error: BaseException) -> str:
-    """What to do about an error that tells of something that is not in the image; empty for all others."""
+    """Return the advice for an error whose cause is something missing in the image; empty for all other errors."""
     errors = list(_causes(error))
-    for one in errors:
-        library = _LIBRARY.search(str(one)) if isinstance(one, OSError | ImportError) else None
+    for each in errors:
+        library = _LIBRARY.search(str(each)) if isinstance(each, OSError | ImportError) else None
         if library:
             return (
                 f"{library[1]} is a system library: name a package in requirements.txt that does without it "
                 "(opencv-python-headless instead of opencv-python), or a base image that has it with --base"
             )
-    for one in reversed(errors):
-        if isinstance(one, ModuleNotFoundError) and one.name:
-            return f"write {PACKAGE}{one.name.partition('.')[0]} into requirements.txt beside agent.py"
-    if any(type(one).__name__ == "PolicyFileMissing" for one in errors):
+    for each in reversed(errors):
+        if isinstance(each, ModuleNotFoundError) and each.name:
+            return f"write {PACKAGE}{each.name.partition('.')[0]} into requirements.txt beside agent.py"
+    if any(type(each).__name__ == "PolicyFileMissing" for each in errors):
         return "put the file there, and do not name it in .dockerignore"
-    kinds = {kind.__name__ for one in errors for kind in type(one).__mro__} & _MISSING
+    kinds = {kind.__name__ for each in errors for kind in type(each).__mro__} & _MISSING
     if "UnregisteredEnv" in kinds:
         return "write the package with this game into requirements.txt and import it in agent.py, or correct its name"
     return "correct the packages and versions in requirements.txt beside agent.py" if kinds else ""
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    """The error, and those from which it was raised (`raise … from …`)."""
-    seen: list[BaseException] = []
-    one: BaseException | None = error
-    while one is not None and one not in seen:
-        seen.append(one)
-        yield one
-        one = one.__cause__
+    """Yield the error, then the chain of errors that caused it (`raise … from …`)."""
+    causes: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in causes:
+        causes.append(cause)
+        yield cause
+        cause = cause.__cause__
 
 
 def _words(error: BaseException) -> str:
-    """The error in its own words, on one line."""
-    said = " ".join(f"{type(error).__name__}: {error}".split())
-    plain = "".join(letter for letter in said if letter.isprintable())
-    return plain if len(plain) <= _LIMIT else f"{plain[:_LIMIT]}…"
+    """Return the error's type and message on one line, of at most `_LIMIT` characters."""
+    line = " ".join(f"{type(error).__name__}: {error}".split())
+    printable = "".join(letter for letter in line if letter.isprintable())
+    return printable if len(printable) <= _LIMIT else f"{printable[:_LIMIT]}…"
 
 
 def _agent(file: Path, report: Path) -> None:
-    thread = threading.Thread(target=_try, args=[file, report], daemon=True)  # as in a server, not the main thread
+    thread = threading.Thread(target=_try, args=[file, report], daemon=True)  # a server's agent has such a thread, too
     thread.start()
     thread.join()
-    os._exit(0)  # whatever threads the agent has left
+    os._exit(0)  # does not wait for threads that the agent has started
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a trial server is started with: environment variables (`protocol/environment.py`) and the section `trial`."""
+"""The settings of a trial server: its environment variables (`protocol/environment.py`), and the section `trial`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from protocol.trial_check import check
 from protocol.values import path_text
 
 DEFAULT_GAME = "ALE/MsPacman-v5"
-"""The game of a server that is started by hand without one. A study with a game step always names one."""
+"""The game of a server that is started by hand and whose settings name none. A registered study always names one."""
 
 
 class SettingsError(ValueError):
-    """The environment or the `trial` section cannot be used; the message says which key and why."""
+    """The environment or the section `trial` cannot be used. The message names the key and says what is wrong."""
 
 
 def trial_section(section: Mapping[str, Any]) -> TrialSection:
-    """The section `trial`, checked: with a game, and with the names of actions in small letters.
+    """Check the section `trial`, and return it with a game and with the names of actions in lower case.
 
-    Unknown keys are left alone. Raises SettingsError with the first problem.
+    Unknown keys are ignored. Raises SettingsError with the first problem.
     """
     found, problems = check(dict(section))
     for path, sentence, _ in problems:
@@ -39,10 +39,11 @@ def trial_section(section: Mapping[str, Any]) -> TrialSection:
 
 @dataclass(frozen=True, slots=True)
 class TrialSettings:
-    """Everything that one trial server is started with. Durations are seconds; `deadline` is seconds since the epoch.
+    """The settings of one trial server. Most fields are variables of `protocol/environment.py`, which explains them.
 
-    A warm server without a participant has no `user_id` and no `group`, and `server` is its own name. The server of a
-    session has no `user_id`; its `group` is the session's.
+    Durations are seconds; `deadline` is in seconds since the epoch. A warm server without a participant has no
+    `user_id` and no `group`, and `server` is its own name. The server of a session has no `user_id`; its `group` is the
+    session's.
     """
 
     project_id: str
@@ -57,11 +58,11 @@ class TrialSettings:
     session: str = ""
     """The id of the session whose members play here; empty if one participant plays."""
     players: int = 1
-    """How many seats there are for participants."""
+    """The number of seats for participants."""
     members: tuple[Member, ...] = ()
-    """The session's members, as its document says; none before it was read, and if one participant plays."""
+    """The session's members, from its document. Empty until the document was read, and if one participant plays."""
     match: bool = False
-    """The function `match` of agent.py says who plays with whom, and this server asks it."""
+    """The function `match` of agent.py decides who plays with whom, and this server calls it."""
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
     port: int = 5000
     tls: bool = True
@@ -81,24 +82,24 @@ class TrialSettings:
     credential: str = field(default="", repr=False)
     warm_server_seconds: float = 20.0
     plain_origins: frozenset[str] = frozenset()
-    """Pages of these origins need no token (plainClients)."""
+    """The origins whose pages need no token (plainClients)."""
 
     @property
     def assigned(self) -> bool:
-        """It is known who plays here. A warm server, and one whose session is not formed yet, learn it later."""
+        """Whether the server knows who plays here. A warm server, and one without its members yet, learn it later."""
         return not self.warm_server and (not self.session or bool(self.members))
 
     @property
     def seats(self) -> Mapping[str, int]:
         """The seat of each member of the session, by their id; empty if one participant plays.
 
-        `trial.substitute` plays in the seats of `range(players)` that are not among them.
+        `trial.substitute` plays in each of the `players` seats that no member has.
         """
         return {member.user_id: member.seat for member in self.members if member.user_id}
 
     @property
     def private(self) -> tuple[str, ...]:
-        """The ids of those who play, which stand in no log."""
+        """The ids of the participants who play here. No log may contain them."""
         return tuple(self.seats) if self.session else (self.user_id,)
 
     @property
