@@ -1,1 +1,1 @@
-"""Every decision of a trial. Pure: no I/O, no threads, no clock."""
+"""The core of a trial: every decision about a game step. Pure: no I/O, no threads, no clock."""

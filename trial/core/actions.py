@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 By = Literal["human", "policy", "advice", "none", "late", "random"]
-"""Who chose an action. none: nothing was chosen, and it is the idle one; late: the player's policy has not answered in
-time; random: drawn because a turn's time was over."""
+"""Who chose an action. none: no one did, so it is the idle action or a legal one in its place; late: the player's
+policy has not answered in time; random: it was drawn, because the time of the turn was over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,13 +18,13 @@ class Action:
     name: str
     by: By = "none"
     observed: int | None = None
-    """If a policy was asked for it: the steps of the episode that were taken when it observed."""
+    """If a policy was asked: how many steps of the episode had been taken at the observation that it was given."""
     acts: bool = True
-    """False if it is not the player's turn, or the player has left: the environment may want an action all the same."""
+    """Whether the player is to act in this step. Some environments want an action of the other players, too."""
     pressed_at: int | None = None
-    """In a session: the time of the message by which the participant chose it, in nanoseconds."""
+    """In a session: when the message came by which the participant chose the action, in nanoseconds."""
 
     @property
     def human(self) -> bool:
-        """Whether a human asked for it."""
+        """Whether a participant chose it."""
         return self.by == "human"

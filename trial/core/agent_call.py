@@ -1,4 +1,4 @@
-"""The call that the agent has: one at a time. Pure; the clock is passed in."""
+"""The call that the agent's thread is making now, one at a time. Pure; the clock is passed in."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from trial.core.effects import Call, Effect
 class AgentCall:
     """Gives the agent one call at a time.
 
-    A call that does not come back may still run on the agent's thread: then the agent gets no other call any more.
+    A call that does not return in time may still run on the agent's thread. The agent gets no further call then.
     """
 
     def __init__(self, emit: Callable[[Effect], None]) -> None:
         self._emit = emit
         self.call: Call | None = None
-        """What the agent has to do now."""
+        """The call that has not ended yet; None if there is none."""
         self.give_up_at: float | None = None
-        """When the present call is given up; None: it has as long as its own limit."""
+        """When the trial gives the present call up; None: only the call's own limit counts."""
         self.hangs = False
-        """A call has not come back."""
+        """Whether a call has not returned in time."""
 
     def make(self, call: Call) -> None:
         """Give the agent this call."""
@@ -28,9 +28,9 @@ class AgentCall:
         self._emit(call)
 
     def has_ended(self, call: Call, *, hangs: bool = False) -> bool:
-        """The shell says that a call has ended. Return whether it is the call that the agent has.
+        """A call has ended. Return whether it is the present call, and not one that was given up.
 
-        `hangs`: it has not come back within its limit.
+        `hangs`: it has not returned within its limit.
         """
         if call is not self.call:
             return False
@@ -39,6 +39,6 @@ class AgentCall:
         return True
 
     def give_up(self, now: float) -> None:
-        """Give the call up if its time is over. If it comes back later, that changes nothing."""
+        """Give the present call up if its time is over. Its result, if one comes later, changes nothing."""
         if self.give_up_at is not None and now >= self.give_up_at:
             self.call, self.give_up_at, self.hangs = None, None, True

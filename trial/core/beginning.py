@@ -1,4 +1,4 @@
-"""How an episode begins: its seed, its recording, then a reset, or the steps that an earlier server recorded. Pure."""
+"""Begins episodes: chooses the seed, opens the recording, then resets the environment or replays an episode. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trial.settings import TrialSettings
 
 
 class Beginning:
-    """Begins one episode after the other; the caller makes the calls of the agent that this returns."""
+    """Begins one episode after the other. Its methods return calls of the agent, which the caller makes."""
 
     def __init__(
         self,
@@ -37,13 +37,13 @@ class Beginning:
         self._emit = emit
         self._seed = 0  # of the episode
         self.unfinished: UnfinishedEpisode | None = None
-        """An earlier server began the episode that comes next."""
+        """The next episode, if an earlier server has begun it."""
         self.begun_again: int | None = None
-        """This episode begins anew, because it could not be replayed."""
+        """The number of the episode that began anew because it could not be replayed."""
 
     def begin(self, progress: TrialProgress, participants: Participants) -> Call | None:
-        """Return the call that begins the next episode; None if a recording must be opened first."""
-        self._timing.begin_episode()  # what pages are told before the reset is the new episode's time
+        """Return the call that begins the next episode; None if a recording must be opened first (`opened`)."""
+        self._timing.begin_episode()  # now, so that states before the reset have the new episode's times
         unfinished = self.unfinished
         self._seed = self._next_seed(progress) if unfinished is None or unfinished.seed is None else unfinished.seed
         if self._recording.is_open:
@@ -56,7 +56,7 @@ class Beginning:
         return self._new_seed() if first is None else first + progress.episode - 1
 
     def opened(self, progress: TrialProgress, participants: Participants, ns: int) -> Call:
-        """Return the call that begins the episode, now that its recording is open. `ns` is the time, for messages."""
+        """The recording is open: return the call that begins the episode. `ns` is the present time in nanoseconds."""
         unfinished, self.unfinished = self.unfinished, None
         if unfinished is not None and unfinished.steps:
             progress.choices.begins(self._seed)
@@ -79,7 +79,7 @@ class Beginning:
             episode=progress.episode,
             seed=self._seed,
             asked=frozenset(player.name for player in progress.choices.policies.asked),
-            fields=participants.of_reset(),
+            fields=participants.reset_fields(),
         )
 
     def _reset_policies(self, progress: TrialProgress, observed: Mapping[str, Sequence[Observed]]) -> None:
@@ -88,14 +88,14 @@ class Beginning:
             self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
 
     def replayed(self, progress: TrialProgress, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
-        """The episode stands where the earlier server left it."""
+        """The replay is done: the episode is where the earlier server left it."""
         steps = len(unfinished.steps)
         self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
         self._reset_policies(progress, replayed.observed)
         self._timing.resume_episode(steps / progress.frame_rate)
         progress.replayed(steps, unfinished.scores or {progress.first: unfinished.score})
-        progress.choices.policies.go_on(unfinished.going_on, unfinished.failures)
+        progress.choices.policies.resume(unfinished.last_actions, unfinished.failures)
 
     def repeat_feedback(self, unfinished: UnfinishedEpisode, ns: int) -> None:
-        """Keep the feedback that an earlier server's agent did not hear, so that the agent hears it now."""
+        """Give the agent the feedback that the agent of an earlier server did not hear. `ns` as in `opened`."""
         self._message_log.repeat(unfinished.unheard, ns)

@@ -1,7 +1,7 @@
-"""What each player does at the next step: by keys and buttons, by a policy, or as a program says. Pure.
+"""Decides which action each player takes at the next step. Pure; the clock is passed in.
 
-A human's keys are in `controls.py`, what policies were asked and answered in `policies.py`, the choices of a turn in
-`turns.py`. This decides which of them counts, and what is taken if nothing was chosen or the choice is forbidden.
+`controls.py` keeps the keys of humans, `policies.py` the answers of policies, `turns.py` the choices of a turn.
+`Choices` decides which of them counts, and which action is taken if nothing was chosen or the choice is illegal.
 """
 
 from __future__ import annotations
@@ -20,14 +20,18 @@ from trial.core.turns import Turns
 
 _NO_ACTION = "that action is not in this game's actionSpace"
 NOT_POSSIBLE = "that move is not possible now"
-"""What a participant is told who, turn by turn, chooses an action that the environment's mask forbids."""
+"""The sentence for a participant who, turn by turn, chooses an action that the environment's mask forbids."""
 
 
 class Choices:
-    """The choices of all players, by player. The caller says whether the game is on, and how many steps were taken."""
+    """The choices of all players in one trial.
+
+    The caller says whether the game is `on` (playing, and past the first picture), and how many `steps` of the episode
+    were taken.
+    """
 
     def __init__(self, config: TrialSection, players: Mapping[str, Player], humans: Sequence[str]) -> None:
-        """`players` are those of the environment, in its order; `humans` are those of them that humans play."""
+        """`players` are the environment's, in its order; `humans` are the names of those that humans play."""
         self._config = config
         self._players = players
         self._humans = humans
@@ -41,28 +45,28 @@ class Choices:
             )
             for name in humans
         }
-        """The keys of each human."""
+        """By player, the keys and buttons of each human."""
         turns = config.pace == "turns"
         self.turns = Turns(config.turn_seconds) if turns else None
         self.policies = Policies(
             (player for player in players.values() if not player.human),
             frame_skip=config.frame_skip,
             seconds=config.policy_seconds if turns else None,
-            goes_on=config.input != "single",  # an action that is taken once is not taken again between two choices
+            repeats_last=config.input != "single",
         )
         self._advice: dict[str, int] = {}
-        self._usual = {  # made once: a step of a single human takes one of these
+        self._usual = {  # made once, since most steps take one of these: by action, chosen by no one or by the human
             name: tuple(
                 (Action(index, action), Action(index, action, "human"))
                 for index, action in enumerate(players[name].action_space)
             )
             for name in humans
         }
-        self._view: View | None = None  # None: all act, and may do all
+        self._view: View | None = None  # None: all players are to act, and all actions are legal
         self.seed = 0
-        """Of the episode."""
+        """The seed of the episode."""
         self.timed_keys = False
-        """Actions say when the participant chose them."""
+        """Whether actions say when the participant chose them (`Action.pressed_at`)."""
 
     # ---- an episode
 
@@ -76,7 +80,7 @@ class Choices:
         self._advice.clear()
 
     def see(self, view: View | None, now: float) -> None:
-        """The players see this now. None: all of them act, and all actions are possible."""
+        """The players see `view` now: a turn begins. None: all players are to act, and all actions are legal."""
         self._view = view
         if self.turns is not None:
             to_act = frozenset(self._players) if view is None else view.to_act & self._players.keys()
@@ -89,10 +93,10 @@ class Choices:
     # ---- keys and buttons of humans
 
     def act(self, player: str, name: str, held: bool | None, *, lasts: bool, on: bool) -> None:
-        """As `TrialProgress.act`, which says whether the game is `on`: played, and past its first picture."""
+        """A human presses a key or a button: see `TrialProgress.act`."""
         controls = self.controls[player]
         if self.turns is not None:
-            if controls.knows(name) or not lasts:  # a client of HIPPO's says by another name that nothing is pressed
+            if controls.knows(name) or not lasts:  # HIPPO's clients send an unknown name when nothing is pressed
                 self._choose(player, name, held, on)
             return
         if lasts:
@@ -102,7 +106,7 @@ class Choices:
         if lasts:
             return
         if held is None:
-            if on:  # a press while the game is held would act later than it was meant
+            if on:  # a press while the game is held would act only when it goes on
                 controls.press(name)
         elif held:
             controls.hold(name)
@@ -112,7 +116,7 @@ class Choices:
             controls.release(name)
 
     def _choose(self, player: str, name: str, held: bool | None, on: bool) -> None:
-        """A press, or a key going down or up, turn by turn. Raises CommandRefused."""
+        """Turn by turn: a human presses a button, or a key goes down or up. Raises CommandRefused."""
         assert self.turns is not None
         controls = self.controls[player]
         if not controls.knows(name):
@@ -124,24 +128,27 @@ class Choices:
             raise CommandRefused(NOT_POSSIBLE)
         self.turns.choose(player, Action(index, controls.names[index], "human", pressed_at=controls.time))
 
-    def said_at(self, player: str, ns: int) -> None:
-        """Note when the present message came. With `timed_keys`, an action that it chooses has this time."""
+    def set_message_time(self, player: str, ns: int) -> None:
+        """Set the time of the message that is being read, in nanoseconds. An action that it chooses gets this time."""
         self.controls[player].time = ns
 
     def let_go(self, player: str | None = None) -> None:
-        """Let go of all keys of this human, or of all humans."""
+        """Release all keys and forget all presses of this human; of all humans if `player` is None."""
         for name in self._humans if player is None else (player,):
             self.controls[name].clear()
 
     def forget_taps(self) -> None:
-        """Forget presses that no step has acted on. Keys that are held stay."""
+        """Forget presses that no step has taken yet. Keys that are held down stay."""
         for controls in self.controls.values():
             controls.forget_taps()
 
     # ---- a step
 
-    def next_actions(self, steps: int) -> Mapping[str, Action]:
-        """Each player's action of the step that begins now. `advice` is for this step; it counts if no key acts."""
+    def next_actions(self) -> Mapping[str, Action]:
+        """Return each player's action for the step that begins now, and drop the advice that was given for it.
+
+        Advice for a human counts if no key does.
+        """
         view, turns = self._view, self.turns
         actions: dict[str, Action] = {}
         for name, player in self._players.items():
@@ -150,15 +157,15 @@ class Choices:
             elif turns is not None:
                 actions[name] = turns.chosen[name]
             elif name in self.policies:
-                actions[name] = self.policies.take(name, self._mask(name), steps)
+                actions[name] = self.policies.take(name, self._mask(name))
             else:
-                actions[name] = self._asked_for(player)
+                actions[name] = self._by_human(player)
         if self._advice:
             self._advice.clear()
         return actions
 
-    def _asked_for(self, player: Player) -> Action:
-        """The action of a human in real time. One that is not possible now is not taken."""
+    def _by_human(self, player: Player) -> Action:
+        """Return the action of a human in real time; a legal one instead of an action that is illegal now."""
         name = player.name
         index, human = self.controls[name].take()
         advice = self._advice.get(name) if self._advice and not human else None
@@ -174,16 +181,16 @@ class Choices:
     # ---- policies
 
     def asks(self, steps: int, now: float) -> Sequence[AskPolicy]:
-        """What to ask the policies, now that the players see something."""
+        """Return the questions to policies that are due after `see`."""
         return self.policies.asks(self._view, steps, now) if self._view is not None and self.policies else ()
 
     def take_place(self, player: str, plays: str) -> None:
-        """From now on a policy plays in the place of a human."""
+        """From now on the policy `plays` takes the place of the human who plays this player."""
         self.let_go(player)
         self.policies.take_place(replace(self._players[player], plays=plays))
 
     def ask(self, player: str, steps: int, now: float) -> AskPolicy | None:
-        """What to ask the policy that has taken a place; None if it is not to act now."""
+        """Return the question to the policy that has taken this place; None if the player is not to act now."""
         view = self._view
         return self.policies.ask(player, view, steps, now) if view is not None and player in view.to_act else None
 
@@ -201,7 +208,7 @@ class Choices:
     def turn_over(self, steps: int) -> bool:
         """The time of the turn is over: choose for the humans who did not, and return whether the episode ends.
 
-        What a program has advised is taken first; else `turnEnds` decides.
+        The advice of a program comes first; without it, `turnEnds` decides.
         """
         turns = self.turns
         for name in self._waiting():
@@ -227,45 +234,44 @@ class Choices:
 
     @property
     def waits_for(self) -> tuple[str, ...]:
-        """The humans for whom the game waits; none in real time."""
+        """The players of the humans for whom the turn waits; none in real time."""
         turns, policies = self.turns, self.policies
         if turns is None:
             return ()
         return tuple(name for name in self._players if turns.waits_for(name) and name not in policies)
 
     def policies_until(self) -> float | None:
-        """When the time of a policy for which the game waits is over; None if it waits for none."""
+        """Return when the first policy for which the turn waits runs out of time; None if it waits for none."""
         return self.policies.until(self._waiting())
 
     # ---- programs
 
     def advise(self, action: int, player: str | None = None) -> None:
-        """A program advises this action for the next step, or chooses it for a player that it plays.
+        """A program advises an action for the next step of a human, or chooses it for a player that it plays.
 
-        Without `player` it is the first player that a program plays, or else the first human. Raises CommandRefused if
-        there is no such action or player.
+        `action` is the number of an action. If `player` is None, the first player that a program plays is meant, or
+        else the first human. Raises CommandRefused if there is no such action or player, or another policy plays it.
         """
-        known = self._player_of_program(player)
-        player = known.name
-        if not known.human and not known.by_program:
-            raise CommandRefused(f"the project has another policy for {player}")
-        if not 0 <= action < len(known.action_space):
-            raise CommandRefused(f"there is no action {action}; there are 0 to {len(known.action_space) - 1}")
-        if known.human:
-            self._advice[player] = action
+        target = self._player_of_program(player)
+        if not target.human and not target.by_program:
+            raise CommandRefused(f"the project has another policy for {target.name}")
+        if not 0 <= action < len(target.action_space):
+            raise CommandRefused(f"there is no action {action}; there are 0 to {len(target.action_space) - 1}")
+        if target.human:
+            self._advice[target.name] = action
         else:
-            self.policies.advise(player, action)
+            self.policies.advise(target.name, action)
 
     def action_space_of(self, player: str | None) -> tuple[str, ...]:
-        """The names of the actions that `advise` takes. Raises CommandRefused if there is no such player."""
+        """Return the names of the actions of `player`, which is as in `advise`. Raises CommandRefused."""
         return self._player_of_program(player).action_space
 
     def _player_of_program(self, player: str | None) -> Player:
-        """The player that a program names, or the one that it means if it names none. Raises CommandRefused."""
+        """Return the player that a program means; `player` is as in `advise`. Raises CommandRefused."""
         if player is None:
             by_program = (each.name for each in self._players.values() if each.by_program)
             player = next(by_program, self._humans[0])
-        known = self._players.get(player)
-        if known is None:
+        target = self._players.get(player)
+        if target is None:
             raise CommandRefused(f"there is no such player; there are {', '.join(self._players)}")
-        return known
+        return target

@@ -1,4 +1,4 @@
-"""The connections of all humans, and what they have been sent. Pure: it emits effects."""
+"""The clients of all humans, and what is sent to them. Pure: it emits effects."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ REPLACED = "the game was opened in another tab or device, and goes on there"
 
 @dataclass(slots=True)
 class Client:
-    """A human's connection, and the player of the environment that they play."""
+    """A human's connection, and the player that the human plays."""
 
     connection: Hashable
     window: Window
     player: str
     sent: tuple[object, ...] = ()
-    """The state that was sent last."""
+    """The values of the state that was sent last (`state_of`)."""
 
 
 class Clients:
-    """The connections of all humans, one at most for each. Each shows the picture, score and turn of their player."""
+    """The clients of all humans, at most one for each. A client shows the picture, score and turn of its player."""
 
     def __init__(
         self,
@@ -38,24 +38,25 @@ class Clients:
         emit: Callable[[Effect], None],
         assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        """`assets` are the images of a game that is drawn by objects."""
+        """`assets` describe the images of a game that is drawn by objects."""
         self._timing = timing
         self._emit = emit
         self._scene = _scene_of(config, assets)
         self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
-        """Clients are told of times also while the game goes on."""
+        """Whether states have times also while the game is on."""
         self._by_human: dict[str, Client] = {}
         self.pictures: Pictures | None = None
-        """What is shown."""
+        """The pictures that clients show now; None before the first ones."""
         self.frame_id = 0
+        """The id of these pictures."""
 
     def add(self, human: str, connection: Hashable, window: Window, player: str) -> Client:
-        """Add a connection of the human who plays this player. An earlier connection must have been removed before."""
+        """Add a client of the human who plays this player. The human's earlier client must have been removed."""
         client = self._by_human[human] = Client(connection, window, player)
         return client
 
     def replace(self, human: str) -> Client | None:
-        """Close the connection of a human who opens another one, and return it; None if they have none."""
+        """Close and remove the client of a human who opens another one. Return it; None if they have none."""
         client = self._by_human.pop(human, None)
         if client is not None:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
@@ -67,11 +68,11 @@ class Clients:
         return None if human is None else self._by_human.pop(human)
 
     def of(self, connection: Hashable) -> Client | None:
-        """The client with this connection; None if another has replaced it."""
+        """Return the client with this connection; None if another has replaced it."""
         return next((each for each in self._by_human.values() if each.connection == connection), None)
 
     def stalled(self, now: float) -> list[Client]:
-        """The clients that have stopped acknowledging frames."""
+        """Return the clients that have stopped acknowledging frames."""
         return [client for client in self._by_human.values() if client.window.stalled(now)]
 
     def send(self, client: Client, text: str) -> None:
@@ -84,20 +85,20 @@ class Clients:
             self.send(client, text)
 
     def say_each(self, words_for: Callable[[str], str | None]) -> None:
-        """Send each client, by its player, these words as an error; None: send nothing."""
+        """Send each client the sentence that `words_for` returns for its player; nothing if that is None."""
         for client in self._by_human.values():
             words = words_for(client.player)
             if words is not None:
                 self.send(client, messages.error(words))
 
     def send_controls(self, client: Client, progress: TrialProgress, participants: Participants, now: float) -> None:
-        """Send a client everything about the game and its controls."""
-        times = self._timing.told(progress, now, participants.told(now))
+        """Send a client the message with everything about the game and its controls (`messages.controls`)."""
+        times = self._timing.state_times(progress, now, participants.session_fields(now))
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
     def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
-        """Send the state, with all seconds that are left, to each client whose last state was another one."""
-        progress.told = participants.state()
+        """Send each client its state, if that differs from the one that was sent last."""
+        progress.session_version = participants.session_version()
         for client in self._by_human.values():
             player = client.player
             state = state_of(progress, player)
@@ -105,8 +106,8 @@ class Clients:
                 continue
             client.sent = state
             times = None
-            if self._timed or progress.on_break or progress.told is not None:
-                times = self._timing.told(progress, now, participants.told(now))
+            if self._timed or progress.on_break or progress.session_version is not None:
+                times = self._timing.state_times(progress, now, participants.session_fields(now))
             text = messages.state(
                 progress.state.value,
                 progress.episode,
@@ -118,50 +119,51 @@ class Clients:
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
     def show(self, pictures: Pictures) -> None:
-        """Show each client its new picture."""
+        """Send each client its new picture, under a new frame id."""
         self.pictures = pictures
         self.frame_id = (self.frame_id + 1) & 0xFFFFFFFF
         for client in self._by_human.values():
             self.show_again(client)
 
     def show_again(self, client: Client) -> None:
-        """Show a client its present picture, if there is one."""
+        """Send a client its present picture, if there is one."""
         picture = self.pictures.get(client.player) if isinstance(self.pictures, dict) else self.pictures
         if picture is not None:
             self._emit(SendPicture(client.connection, picture, self.frame_id))
 
     def by_human(self) -> list[tuple[str, Client]]:
-        """All connected clients, each with the human whose it is."""
+        """Return all connected clients, each with its human."""
         return list(self._by_human.items())
 
     def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Tell a client that the trial is over and stored. `outcome` says how a session has ended for its member."""
+        """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for the member."""
         self._emit(SendDone(client.connection, episodes, score, outcome))
 
 
 def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
-    """What the clients' state shows. When one of these values changes, the state is sent again."""
+    """Return the values that the client's state depends on. When one of them changes, the state is sent again."""
     score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
-    return progress.state, progress.episode, score, progress.frame_rate, progress.stands, progress.told, to_act
+    members, frozen = progress.session_version, progress.shows_first_picture
+    return progress.state, progress.episode, score, progress.frame_rate, frozen, members, to_act
 
 
 def _of_state(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
-    """What a client is told of the times and of its turn."""
+    """Return the arguments of `messages.state` for the times, the player's turn and the session."""
     turn = _turn_of(progress, player, times.turn_ends_in)
-    said = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
-    return said if times.session is None else {**said, "session": {**times.session, "you": player}}
+    arguments = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
+    return arguments if times.session is None else {**arguments, "session": {**times.session, "you": player}}
 
 
 def _turn_of(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
-    """What a client is told of the turn: nothing in real time."""
+    """Return the arguments for the player's turn; none in real time."""
     if progress.turns is None:
         return {}
-    mine = progress.to_act(player)
-    return {"to_act": mine, "turn_ends_in": ends_in if mine else None}
+    to_act = progress.to_act(player)
+    return {"to_act": to_act, "turn_ends_in": ends_in if to_act else None}
 
 
 def _controls_of(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
-    """The message that tells a client all of the game and of its controls. `scene` as `_scene_of` has it."""
+    """Build the message about the game and its controls for this player's client. `scene` is from `_scene_of`."""
     config, action_space = progress.config, progress.players[player].action_space
     return messages.controls(
         ui=config.ui.shown(),
@@ -186,15 +188,15 @@ def _controls_of(progress: TrialProgress, player: str, times: StateTimes, scene:
 
 
 def _scene_of(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    """What a client is told of a game that is drawn by objects; None if it is not."""
+    """Return the fields of a game that is drawn by objects; None for other games."""
     if config.scene is None:
         return None
-    told = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
-    return {"scene": told, "assets": list(assets)}
+    scene = {key: value for key, value in config.document()["scene"].items() if key != "assets"}
+    return {"scene": scene, "assets": list(assets)}
 
 
 def _input(config: TrialSection, player: str) -> dict[str, Any]:
-    """What a client is told of the project's keys and buttons; nothing where the actions' names decide."""
+    """Return the fields about the project's `keys`, `labels` and `input`, as far as the project has them."""
     keys, labels = config.keys_of(player), config.labels_of(player)
-    said = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
-    return {name: value for name, value in said.items() if value}
+    fields = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}
+    return {name: value for name, value in fields.items() if value}

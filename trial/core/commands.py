@@ -1,4 +1,4 @@
-"""What a client asks for: whether it may, what that does to the game, and what it is told if it may not. Pure."""
+"""The commands of clients: checks whether they are offered, carries them out, or tells the client why not. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trial.core.progress import TrialProgress
 from trial.core.timing import Timing
 
 ALWAYS_ALLOWED = frozenset({"start", "requestUI"})
-"""Commands that no project's `ui` can take away: without `start` a game could not be played."""
+"""The commands that a client may send whatever the project's `ui` says: without `start`, no game could be played."""
 _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
 
@@ -30,14 +30,14 @@ class Commands:
         self._clients = clients
         self._message_log = message_log
         self.waiting: list[str] = []
-        """Those that wait for the end of a step."""
+        """The commands that wait for the end of a step."""
         self.closed = False
-        """The server must end: commands do nothing any more."""
+        """Whether the server must end: then commands have no effect any more."""
 
     def receive(
         self, client: Client, message: Message, progress: TrialProgress, participants: Participants, now: float
     ) -> None:
-        """Record a client's message and do what it asks for. If that is refused, tell the client why."""
+        """Record a client's message and carry it out. If it is refused, tell the client why."""
         try:
             self._check(message, progress, participants)
             self._message_log.add(message, int(now * 1e9), participants.name_of(client.player))
@@ -48,7 +48,7 @@ class Commands:
             self._clients.send(client, messages.error(str(refused)))
 
     def _check(self, message: Message, progress: TrialProgress, participants: Participants) -> None:
-        """Raise CommandRefused if the project does not offer what is asked for. Then nothing of it is recorded."""
+        """Raise CommandRefused if the project does not offer what the message asks for. It is not recorded then."""
         if message.hidden is not None and isinstance(participants, Alone):
             raise CommandRefused("unknown field 'hidden'")
         if message.frame_rate is not None and not self._config.allow_frame_rate_change:
@@ -62,7 +62,7 @@ class Commands:
     def _carry_out(
         self, message: Message, player: str, progress: TrialProgress, participants: Participants, now: float
     ) -> None:
-        """Do what the human who plays `player` asks for. Raises CommandRefused if it is not possible now."""
+        """Carry out a message of the human who plays `player`. Raises CommandRefused if it is not possible now."""
         if message.command is not None and not self.closed:
             self._command(message.command, player, participants, now)
         if message.frame_rate is not None:
@@ -95,7 +95,10 @@ class Commands:
 
 
 def not_offered(message: Message, ui: Collection[str]) -> str | None:
-    """The control that this message needs, if the project's `ui` leaves it out; else None."""
+    """Return the control that this message needs and `ui` does not have; None if `ui` has all that it needs.
+
+    `ui` are the names of the controls that the project shows.
+    """
     command, wish, name = message.command, message.frame_rate, message.action
     if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
         return command

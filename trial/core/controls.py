@@ -1,4 +1,4 @@
-"""The action that the human asks for at each step: keys held down and single presses. Pure; no clock."""
+"""Turns a human's keys and buttons into the action of each step. Pure; no clock."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from protocol import keyboard
 from trial.core.players import NOOP
 
 ARROWS = ("up", "down", "left", "right")
-"""The controls of `ui` that show actions."""
+"""The controls of `ui` that are names of actions."""
 DIRECTIONS = frozenset({*ARROWS, "fire"})
-"""Keys that may be pressed even if they act only together with others ("up" + "right" = "upright")."""
+"""Names that may be pressed even if they are actions only in combination ("up" + "right" = "upright")."""
 
 KEY = "\0"
-"""Stands before the name of a key, where the project says what each key does: no action is called so."""
+"""The prefix of the names of keys, in a project with `keys`. It tells them from the names of actions."""
 PRESSES = 4
-"""Presses that wait for their step where each press is one action; more are dropped."""
-_COMBINED = 4  # keys that are combined at most; people do not hold more on purpose
+"""With `single`, the most presses that may wait for a step; more are dropped."""
+_COMBINED = 4  # the most keys that are combined; people do not hold more on purpose
 
 
 class Controls:
-    """Held keys and the press buffer of one player.
+    """The held keys and the presses of one player.
 
-    `action_space` are the names of the environment's actions in their order; `lifespan` is the number of steps
-    that a single press acts for. `default` is the action of no key: NOOP or the first, if it is not given.
-    `keys` are the project's own, an action for each combination (`protocol.keyboard`); those of actions that do not
-    exist do nothing. With `single` each press of a key is one action, for one step.
+    `action_space` are the names of the player's actions in their order. `lifespan` is the number of steps for which a
+    press acts. `default` is the number of the idle action; None: NOOP, or the first action.
+    `keys` are the project's own, an action for each combination of keys (`protocol.keyboard`); those of actions that
+    do not exist do nothing. With `single`, each press is one action, for one step.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Controls:
         self._lifespan = lifespan
         self._held: list[str] = []  # newest first
         self._tapped: list[str] = []  # pressed and released again between two steps
-        self._unseen: set[str] = set()  # held, but no step has acted on them yet
+        self._untaken: set[str] = set()  # held, but no step has taken them yet
         self._press: int | None = None
         self._press_left = 0.0
         self._keys = {
@@ -55,26 +55,26 @@ class Controls:
         }
         self._key_names = frozenset().union(*self._keys) if self._keys else frozenset()
         self._combined: tuple[list[str], int | None] = [], None
-        """The keys that acted last, and their action: most keys are held for many steps."""
+        """The last keys that were combined, and their action. Kept because most keys are held for many steps."""
         self._single = single
-        self._presses: deque[tuple[int, int | None]] = deque()  # with `single`, those that wait for their step
+        self._presses: deque[tuple[int, int | None]] = deque()  # with `single`: actions that wait, and their times
         self.time: int | None = None
-        """The time of the message that is being read, if the caller says it."""
+        """The time of the message that is being read, in nanoseconds, if the caller sets it."""
         self.pressed_at: int | None = None
-        """The time of the message that chose the action which was taken last, if a human asked for it."""
+        """The time of the message that chose the last action taken, if the human chose it."""
         self.default = self._index.get(NOOP, 0) if default is None else default
 
     def knows(self, name: str) -> bool:
-        """Whether the name is that of an action, or of a key that can be part of one."""
+        """Whether `name` is an action, or a key that can be part of one."""
         return name in self._index or name in DIRECTIONS or name in self._key_names
 
     def keep(self, name: str) -> None:
-        """Let this action act until another one is chosen. NOOP and unknown names end the action that acts."""
+        """Choose an action that acts until another one is chosen. NOOP and unknown names only end the one before."""
         self._press = self._index.get(name) if name != NOOP else None
         self._press_left = math.inf if self._press is not None else 0
 
     def press(self, name: str) -> None:
-        """Choose an action by one press. It acts for `lifespan` steps (`single`: for one), or until another action."""
+        """Choose an action by one press. It acts for `lifespan` steps (`single`: one), or until another is chosen."""
         index = self._combined_with(name, ())
         if self._single:
             self._wait(index)
@@ -84,19 +84,19 @@ class Controls:
         self._press_left = self._lifespan if self._press is not None else 0
 
     def hold(self, name: str) -> None:
-        """A key went down. It takes over from a press that is still acting."""
-        if name in self._held:  # the keyboard repeats; the key is no newer for it
+        """A key went down. It ends a press that still acts."""
+        if name in self._held:  # the keyboard repeats it: its place in the order stays
             return
         self._held.insert(0, name)
         if self._single:
             self._wait(self._combined_with(name, self._held[1:_COMBINED]))
             return
         self.pressed_at = self.time
-        self._unseen.add(name)
+        self._untaken.add(name)
         self._press_left = 0
 
     def _wait(self, index: int | None) -> None:
-        """With `single`: the action waits for its step."""
+        """With `single`: let an action wait for its step. None, and more than PRESSES actions, are dropped."""
         if index is not None and len(self._presses) < PRESSES:
             self._presses.append((index, self.time))
 
@@ -105,22 +105,22 @@ class Controls:
         if name not in self._held:
             return
         self._held.remove(name)
-        if name not in self._unseen:
-            self.pressed_at = self.time  # what is held besides acts from now on
+        if name not in self._untaken:
+            self.pressed_at = self.time  # the other held keys choose the action from now on
         else:
-            self._unseen.discard(name)
+            self._untaken.discard(name)
             self._tapped.insert(0, name)
 
     def clear(self) -> None:
-        """Let go of all keys and presses, as when the player's connection is lost."""
+        """Release all keys and forget all presses, for instance when the player's connection is lost."""
         self._held.clear()
         self._tapped.clear()
-        self._unseen.clear()
+        self._untaken.clear()
         self._presses.clear()
         self._press_left = 0
 
     def forget_taps(self) -> None:
-        """Forget the press, and keys released before a step acted on them; not held keys, nor `keep`'s action."""
+        """Forget presses, and keys that were released before a step took them. Held keys and `keep`'s action stay."""
         self._tapped.clear()
         self._presses.clear()
         if self._press_left < math.inf:
@@ -132,7 +132,7 @@ class Controls:
         return tuple(self._held)
 
     def take(self) -> tuple[int, bool]:
-        """The action of the step that begins now: its index, and whether a human asked for it."""
+        """Return the action for the step that begins now: its number, and whether the human chose it."""
         if self._presses:
             pressed, self.pressed_at = self._presses.popleft()
             return pressed, True
@@ -142,7 +142,7 @@ class Controls:
         if self._tapped:
             keys = [*self._tapped, *(key for key in keys if key not in self._tapped)]
         self._tapped.clear()
-        self._unseen.clear()
+        self._untaken.clear()
         if self._press_left > 0 and self._press is not None:
             self._press_left -= 1
             return self._press, True
@@ -150,9 +150,9 @@ class Controls:
         return (self.default, False) if index is None else (index, True)
 
     def choice(self, name: str, held: bool | None) -> int | None:
-        """What a press (`held` is None), or a key that goes down (True) or up (False), chooses turn by turn.
+        """Return the action that a press (`held` is None) or a key going down (True) or up (False) chooses in a turn.
 
-        None if that is no action: keys that go up, that the keyboard repeats, or that act only together with others.
+        None if it chooses none: the key goes up, the keyboard repeats it, or it acts only together with others.
         """
         if held is None:
             return self._combined_with(name, ())
@@ -166,9 +166,9 @@ class Controls:
         return self._combined_with(name, self._held[1:_COMBINED])
 
     def _combine(self, keys: list[str]) -> int | None:
-        """The action named by the newest key and as many other held keys as possible.
+        """Return the action of the newest key combined with as many other held keys as possible.
 
-        If there is none, try the next older key. None if no key is part of an action.
+        If it is part of no action, the next older key is tried. None if no key is.
         """
         keys = keys[:_COMBINED]
         if keys != self._combined[0]:

@@ -1,8 +1,8 @@
-"""What the core of a trial (`trial/core/trial.py`) asks its shell to do. Pure records.
+"""The effects: what the core of a trial (`trial/core/trial.py`) asks its shell to do. Pure records.
 
-A connection is whatever the shell uses to name one; the core only compares it. A line is whatever it writes of a step
-or a reset; the core passes it on. Texts are messages of docs/wire.md.
-Records that are made at each step are named tuples, since frozen dataclasses take several times as long to make.
+`connection` is any object with which the shell identifies a connection; the core only compares it. `line` is the line
+of the recording that the shell has made of a step or a reset; the core only hands it back. `text` is a message of
+docs/wire.md. Effects of every step are named tuples: a frozen dataclass takes several times as long to make.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from trial.core.unfinished import UnfinishedEpisode
 from trial.pictures.picture import Picture
 
 Pictures = Picture | dict[str, Picture]
-"""One picture for all, or one for each human."""
+"""One picture for all humans, or one for each player that a human plays, by player."""
 
 # ---- to a client
 
@@ -35,7 +35,7 @@ class SendMessage:
 
 @dataclass(frozen=True, slots=True)
 class SendState:
-    """Send the trial's state. It replaces a state that has not been sent yet."""
+    """Send the trial's state, instead of one that still waits to be sent. `frame_rate` is the game's from now on."""
 
     connection: Hashable
     text: str
@@ -43,7 +43,7 @@ class SendState:
 
 
 class SendPicture(NamedTuple):
-    """Send a picture. It replaces a picture that has not been sent yet."""
+    """Send a picture, instead of one that still waits to be sent."""
 
     connection: Hashable
     picture: Picture
@@ -74,7 +74,7 @@ class Close:
 
 
 class AgentTimeout(Exception):
-    """The researcher's code has not returned in time. It still runs, so its thread can do nothing else."""
+    """The researcher's code has not returned in time. It still runs, and its thread can do nothing else meanwhile."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -91,9 +91,9 @@ class ResetCall(Call):
     episode: int
     seed: int
     asked: frozenset[str] = frozenset()
-    """Players whose policies begin the episode too."""
+    """The players whose policies begin the episode too: all policies but programs."""
     fields: Mapping[str, Any] = field(default_factory=dict)
-    """More for the line of the recording, if there are several players."""
+    """Further fields of the reset's line in the recording, in a session."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -102,21 +102,22 @@ class ReplayCall(Call):
 
     unfinished: UnfinishedEpisode
     default_actions: Mapping[str, int]
-    """What was taken where nothing was chosen, by player."""
+    """By player, the action for steps in which none was recorded for it."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class FeedbackCall(Call):
-    """Give the agent these words of feedback. `heard`: how many words count as heard afterwards. Returns None."""
+    """Give the agent these words of feedback. Returns None."""
 
     feedback: tuple[Word, ...]
     messages: int
-    """So many of the participant's messages came before this call."""
+    """The number of messages in the message log when the call was made: the line of this call records them."""
     heard: int = 0
+    """The number of words given to the agent so far. The agent's thread counts, so it is right also after an error."""
     over: Episode | Break | None = None
-    """What has ended, for the agent's callbacks."""
+    """The episode or the break that has ended, for the agent's callbacks; None in a `StepCall`."""
     last: bool = False
-    """The trial is over too."""
+    """Whether the trial is over with it."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -126,9 +127,9 @@ class StepCall(FeedbackCall):
     actions: Mapping[str, Action]
     """By player."""
     fields: Mapping[str, Any]
-    """More for the step's line of the recording."""
+    """Further fields of the step's line in the recording."""
     truncated_by: str | None = None
-    """The key of `trial` that makes this step the episode's last one: it is recorded as truncated."""
+    """The key of `trial` whose limit makes this step the episode's last; the line records it as truncated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ class TellMoved:
 class Begun:
     """The result of a reset: the line of the recording, the first picture, and what the players see.
 
-    `view` is None if all players act and may do everything.
+    `view` is None if all players are to act and all actions are legal.
     """
 
     line: Any
@@ -167,9 +168,9 @@ class StepTaken(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """The result of a replay: the present picture, and what the players see.
+    """The result of a replay: the present picture, and what the players see (`view` as in `Begun`).
 
-    `observed` is what each policy acted upon in the steps that were taken again, in their order.
+    `observed` holds, by player, what its policy had observed for each action in the steps taken again, in their order.
     """
 
     pictures: Pictures
@@ -177,12 +178,12 @@ class Replayed:
     observed: Mapping[str, Sequence[Observed]] = field(default_factory=dict)
 
 
-# ---- to the policies of players that are no humans
+# ---- to the policies
 
 
 @dataclass(frozen=True, slots=True)
 class ResetPolicy:
-    """Begin an episode for the player's policy. It observes again what it acted upon, and its actions are dropped."""
+    """Begin an episode for the player's policy; then ask it about each of `observed` again, and drop its actions."""
 
     player: str
     seed: int
@@ -201,7 +202,7 @@ class OpenRecording:
     frame_rate: int
     action_space: tuple[str, ...]
     players: tuple[Player, ...] = ()
-    """Who plays whom, if there are several players."""
+    """All players of the environment, if there are several; else empty."""
 
 
 class WriteLine(NamedTuple):
@@ -225,26 +226,26 @@ class CloseRecording:
 
 @dataclass(frozen=True, slots=True)
 class SaveAnswer:
-    """Wait until all recordings are stored, then store the answers, if there are some.
+    """Wait until all recordings are stored, then store the answers, if there are any.
 
-    Answered with `member_saved` for each member's, and with `answer_saved` when all are stored, also those of earlier
-    `SaveMember`.
+    Answered with `member_saved` for each member's answer, and with `answer_saved` once all answers are stored, those of
+    earlier `SaveMember` included.
     """
 
     answers: Mapping[str, Any] | None
-    """The participant's; None in a session."""
+    """The participant's answer; None in a session, or if there is none."""
     by_human: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """In a session: the answers of each member, by their id."""
+    """In a session: the answer of each member, by their id."""
 
 
 @dataclass(frozen=True, slots=True)
 class SaveMember:
-    """Store a member's answer; answered with `member_saved`. For a member who is out while the others play."""
+    """Store the answer of a member who is refused while the others play on. Answered with `member_saved`."""
 
     human: str
     answers: Mapping[str, Any]
     later: Mapping[str, Any] | None = None
-    """The answer of each later game step, in which they do not play either; None: they do."""
+    """The answer of each later game step, if the member does not play those either; None if they do."""
 
 
 # ---- the log
@@ -252,7 +253,7 @@ class SaveMember:
 
 @dataclass(frozen=True, slots=True)
 class WriteLog:
-    """Write a line into the log, at a level of `logging`."""
+    """Write a line to the log. `level` is one of the module `logging`."""
 
     level: int
     text: str
@@ -260,7 +261,7 @@ class WriteLog:
 
 @dataclass(frozen=True, slots=True)
 class LogAgentError:
-    """Write an error of the researcher's code into the log, with its traceback unless that was logged already."""
+    """Write an error of the researcher's code to the log, with its traceback unless that was logged before."""
 
     error: Exception
 

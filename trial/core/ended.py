@@ -1,4 +1,4 @@
-"""What is over: an episode or a break. Pure records."""
+"""Episodes and breaks that are over. Pure records."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ PARTNER_LEFT = "partnerLeft"
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """An episode that is over. `why`: terminated, truncated, reset, stopped, failed, turnSeconds (a turn's), or
-    partnerLeft (a member of the session).
+    """An episode that is over. `score` is that of the first human; `scores` are those of all players, if several.
 
-    `score` is that of the first human; `scores` are those of all players, if there are several.
+    `why`: terminated, truncated, reset or stopped (a command), failed (the researcher's code), turnSeconds (the time of
+    a turn was over) or partnerLeft (a member of the session stays away).
     """
 
     number: int
@@ -23,14 +23,15 @@ class Episode:
     why: str
     scores: Mapping[str, float] = field(default_factory=dict)
     limit: str | None = None
-    """The key of `trial` whose limit truncated it: maxSteps or episodeSeconds."""
+    """The key of `trial` whose limit truncated it, maxSteps or episodeSeconds; None if no limit did."""
 
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """A break that is over. `after`: the number of the episode before it.
+    """A break that is over. `after` is the number of the episode before it.
 
-    `why`: over (its time), start, pause or stop (the player's command), left (the player), failed, partnerLeft.
+    `why`: over (its time), start, pause or stop (a participant's command), left (the participant has left), failed,
+    shutdown (the server had to end) or partnerLeft (a member of the session stays away).
     """
 
     after: int

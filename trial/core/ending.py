@@ -1,4 +1,4 @@
-"""How an episode, a break and the trial end: the last feedback, the lines of the recording, then the answer. Pure."""
+"""Ends episodes, breaks and the trial: the last feedback, the last lines of the recording, then the answer. Pure."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from trial.core.timing import Timing
 from trial.settings import TrialSettings
 
 LAST_CALL_SECONDS = 2.0
-"""The time that a call of the agent has to come back once the server must end."""
+"""The time in which a call of the agent must return once the server must end."""
 
 
 class Ending:
-    """Records the ends of episodes and breaks (`TrialProgress.ended`) in turn, and the end of the trial."""
+    """Records the episodes and breaks that are over (`TrialProgress.ended`) in their order, and the trial's end."""
 
     def __init__(
         self,
@@ -38,12 +38,15 @@ class Ending:
         self._emit = emit
         self._break_shut_down = False
         self.closing = False
-        """The server must end."""
+        """Whether the server must end."""
         self.all_written = False
-        """The last lines are written, and the answer was given to the store."""
+        """Whether the last lines are written, and the shell was asked to store the answer."""
 
     def last_feedback(self, progress: TrialProgress) -> FeedbackCall:
-        """The call before the first end is recorded: the agent hears the feedback, its callbacks what has ended."""
+        """Return the call that precedes the record of the first end in `TrialProgress.ended`.
+
+        It gives the agent the feedback that is left, and its callbacks the end.
+        """
         return FeedbackCall(
             limit=LAST_CALL_SECONDS if self.closing else self._settings.step_seconds,
             feedback=self._message_log.feedback,
@@ -53,7 +56,7 @@ class Ending:
         )
 
     def record(self, call: FeedbackCall, progress: TrialProgress, participants: Participants) -> None:
-        """Record the first end of an episode or a break that is not recorded, with the messages before it."""
+        """Record the first end in `TrialProgress.ended`, with the messages before `call`, and remove it there."""
         over = progress.ended.pop(0)
         if isinstance(over, Episode):
             for player, late in progress.choices.policies.late().items():
@@ -61,19 +64,19 @@ class Ending:
         outcomes = participants.outcomes() if progress.over and not progress.ended else None
         self._emit(records.end(over, self._message_log.messages[: call.messages], outcomes))
         self._message_log.recorded(call.messages, len(call.feedback))
-        # The break after an episode belongs to its file.
-        more = isinstance(progress.ended[0], Break) if progress.ended else progress.on_break
-        if self._settings.trial.data_file == "episode" and not more:
+        # The break after an episode is recorded in the episode's file.
+        break_follows = isinstance(progress.ended[0], Break) if progress.ended else progress.on_break
+        if self._settings.trial.data_file == "episode" and not break_follows:
             self._close_recording(participants)
 
     def shut_down_break(self, progress: TrialProgress) -> None:
-        """End the break, if the server must end during one."""
+        """If the server must end during a break, add the break to `TrialProgress.ended`."""
         if self.closing and progress.on_break and not self._break_shut_down:
             self._break_shut_down = True
             progress.ended.append(Break(progress.episode, "shutdown"))
 
     def write_last(self, progress: TrialProgress, participants: Participants, *, broken: bool) -> None:
-        """Write the last lines and store the answer. No answer if the game was `broken`, or is not over."""
+        """Write the last lines, and ask the shell to store the answer; none if the game is `broken` or not over."""
         self.all_written = True
         if self.closing and not progress.over and not progress.on_break:
             self._emit(records.shutdown(progress, self._message_log.messages))

@@ -1,49 +1,47 @@
-"""How long the first picture of an episode stands, and how long the episode is played. Pure; the clock is passed in.
+"""Measures how long an episode's first picture stands still (`resetFreeze`) and how long the episode is played. Pure.
 
-All times are seconds of one monotonic clock.
+All times are seconds of one monotonic clock, which is passed in.
 """
 
 from __future__ import annotations
 
 
 class EpisodeTime:
-    """The times of one episode after the other.
+    """The times of the present episode.
 
-    `freeze` is how long the first picture stands; `limit` is how long an episode may be played, 0 for no limit.
+    `freeze`: how long its first picture stands still. `limit`: how long it may be played, 0 for no limit.
     """
 
     def __init__(self, freeze: float, limit: float) -> None:
         self._freeze, self._limit = freeze, limit
-        self._stands_since: float | None = None
-        self._moves = freeze == 0
+        self.begin()
+
+    def begin(self) -> None:
+        """An episode begins, with its first picture."""
+        self._frozen = self._freeze > 0
+        self._frozen_since: float | None = None
         self._played = 0.0
         self._runs_since: float | None = None
 
-    def begin(self) -> None:
-        """An episode begins: its first picture stands for a while."""
-        self._moves = self._freeze == 0
-        self._played = 0.0
-        self._stands_since = self._runs_since = None
-
-    def go_on(self, played: float) -> None:
-        """The episode goes on. It was played for so many seconds on an earlier server."""
+    def resume(self, played: float) -> None:
+        """The episode goes on. It was played for `played` seconds on an earlier server."""
         self.begin()
-        self._moves, self._played = True, played
+        self._frozen, self._played = False, played
 
     def rest(self, now: float) -> None:
-        """The game is held. A first picture that was standing stands for its whole time again afterwards."""
+        """The game is held. If its first picture stands still, it does so for its whole time again afterwards."""
         if self._runs_since is not None:
             self._played += now - self._runs_since
-        self._stands_since = self._runs_since = None
+        self._frozen_since = self._runs_since = None
 
     def starts_in(self, now: float) -> float:
-        """Seconds for which the first picture still stands. They are counted from the first call on."""
-        if self._moves:
+        """Return the seconds for which the first picture still stands still. They run from the first call on."""
+        if not self._frozen:
             return 0.0
-        if self._stands_since is None:
-            self._stands_since = now
-        left = max(0.0, self._stands_since + self._freeze - now)
-        self._moves = left == 0.0
+        if self._frozen_since is None:
+            self._frozen_since = now
+        left = max(0.0, self._frozen_since + self._freeze - now)
+        self._frozen = left > 0.0
         return left
 
     def run(self, now: float) -> None:
@@ -52,7 +50,7 @@ class EpisodeTime:
             self._runs_since = now
 
     def left(self, now: float) -> float | None:
-        """Seconds of play that are left in the episode; None if it has no limit."""
+        """Return the seconds of play that are left in the episode; None if it has no limit."""
         if not self._limit:
             return None
         running = 0.0 if self._runs_since is None else now - self._runs_since

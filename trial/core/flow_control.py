@@ -1,4 +1,4 @@
-"""How many frames may be under way to a client. Pure; the clock is passed in."""
+"""Limits the number of frames that are under way to a client. Pure; the clock is passed in."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import math
 from collections import deque
 
 STALLED_SECONDS = 3.0
-"""A client that acknowledged before, and has not for this time, is lost or hidden."""
+"""A client that has acknowledged frames, and has then left one without for so many seconds, is lost or hidden."""
 
-_WIDEST = 15  # frames under way, however long the round trip
+_WIDEST = 15  # the most frames under way, however long the round trip is
 
 
 class Window:
-    """The frames that were sent and not acknowledged: at most two more than fit into the round trip.
+    """The frames that were sent and are not acknowledged: at most two more than the game shows in one round trip.
 
-    To a client that acknowledges two frames at once it is one more, since the first of them waits for the other. A
-    client that has never acknowledged a frame is not held back here, but by its write buffer.
+    One more is allowed if the client acknowledges two frames at once, since the first of them waits for the second. A
+    client that has never acknowledged a frame is limited by its write buffer alone.
     """
 
     def __init__(self) -> None:
-        self._under_way: deque[tuple[int, float, bool]] = deque()  # id, when, whether the first message with this id
-        self._round_trip = math.inf
-        self._together = False  # the last acknowledgement was that of several frames
+        self._under_way: deque[tuple[int, float, bool]] = deque()  # id, time, and whether it is the id's first message
+        self._round_trip = math.inf  # the shortest so far
+        self._together = False  # whether the last acknowledgement was that of several frames
         self._sent_at = -math.inf
         self.newest = -1
-        """Id of the newest frame sent."""
+        """The id of the last frame sent; -1 before the first."""
 
     @property
     def acknowledging(self) -> bool:
@@ -32,7 +32,7 @@ class Window:
         return self._round_trip < math.inf
 
     def sent(self, frame_id: int, now: float) -> None:
-        """A frame, or rows of it, were sent."""
+        """A message with this frame, or with rows of it, was sent."""
         self._under_way.append((frame_id, now, frame_id != self.newest))
         self._sent_at = now
         self.newest = frame_id
@@ -43,22 +43,25 @@ class Window:
         """The client has shown this frame, and so all frames before it."""
         frames = 0
         while self._under_way and self._under_way[0][0] <= frame_id:
-            seen, at, first = self._under_way.popleft()
+            sent_id, at, first = self._under_way.popleft()
             frames += first
-            if seen == frame_id and first:  # of rows, the acknowledgement may be that of an earlier message
+            if sent_id == frame_id and first:  # for rows, it may be the acknowledgement of an earlier message
                 self._round_trip = min(self._round_trip, now - at)
         if frames:
             self._together = frames > 1
 
     def wait(self, now: float, rate: int) -> float:
-        """Seconds until another frame may be sent; 0 for at once. An acknowledgement may come before that."""
+        """Return the seconds until another frame may be sent; 0 for at once. `rate`: the game's frames per second.
+
+        Ask again after each acknowledgement: it may make the time shorter.
+        """
         under_way = len(self._under_way)
         if under_way < 2 or not self.acknowledging:  # the first is the usual case
             return 0.0
         if under_way < min(2 + self._together + math.ceil(self._round_trip * rate), _WIDEST):
             return 0.0
-        return max(0.0, self._sent_at + 1.0 - now)  # even then one frame a second: an acknowledgement may be lost
+        return max(0.0, self._sent_at + 1.0 - now)  # one frame a second in any case: an acknowledgement may be lost
 
     def stalled(self, now: float) -> bool:
-        """Whether the client has acknowledged frames, and has stopped doing so."""
+        """Whether the client has stopped acknowledging frames, after it has acknowledged some."""
         return bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS and self.acknowledging

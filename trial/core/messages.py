@@ -1,4 +1,4 @@
-"""Messages of docs/wire.md: reading what a client says, building what the server answers. Pure."""
+"""The messages of docs/wire.md: reads those of clients, and builds those of the server. Pure."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from protocol.trial import TrialSection
 PLAIN_COMMANDS = frozenset({"start", "pause", "reset", "stop", "requestUI"})
 FEEDBACK = frozenset({"good", "bad", "trainOnline", "trainOffline"})
 FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
-"""The keys of `ui` that offer these changes; a number is offered by `fpsSet`."""
+"""The control of `ui` that allows each of these changes. The control `fpsSet` allows a change to a number."""
 _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
-"""HIPPO's front end presses an action with these controls."""
+"""Further controls that are actions in HIPPO's front end, also if the action space has none of that name."""
 
 _FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden"})
 
 
 class NotAMessage(ValueError):
-    """The message is no JSON, or no object. Three of these close a connection (4400)."""
+    """The message is not a JSON object. The third one on a connection closes it (4400)."""
 
 
 class BadMessage(ValueError):
-    """The object is no message that is known here. The words are sent back to the client."""
+    """The JSON object has an unknown field or a wrong value. The client is sent the text of this error."""
 
 
 class CommandRefused(ValueError):
-    """What a client asked for is not possible now. The words are sent back to it."""
+    """A client asked for something that is not possible now. The client is sent the text of this error."""
 
 
 class CloseConnection(Exception):
@@ -49,9 +49,9 @@ class Hello:
     token: str | None
     step: str | None
     names_project: bool = False
-    """It has a `projectId`, as that of HIPPO's front end has."""
+    """The message has a field `projectId`, as HIPPO's front end sends it."""
     project_id: str | None = None
-    """That project, if it is a text."""
+    """The value of that field, if it is a text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,40 +64,40 @@ class Message:
     frame_rate: str | float | None = None
     ack: int | None = None
     asset: str | None = None
-    """The client asks for this image."""
+    """The name of the image that the client asks for."""
     lasts: bool = False
-    """The action acts until the next one, as HIPPO's clients expect."""
+    """The action acts until the client's next action, as HIPPO's clients expect."""
     fields: Mapping[str, Any] | None = None
-    """What a client without a subprotocol has sent along. It is recorded and changes nothing."""
+    """Unknown fields of a client without a subprotocol. They are recorded, and have no other effect."""
     fields_dropped: int = 0
-    """How many fields it has sent along that were too long to be recorded."""
+    """The number of unknown fields that are not recorded because they are too long."""
     key: str | None = None
-    """A key of the keyboard, where the project says what each does."""
+    """The name of a key of the keyboard, in a project with `keys`."""
     hidden: bool | None = None
-    """Whether the participant looks at another page. Only members of a session say it."""
+    """Whether the participant looks at another tab or application. Only clients of a session send it."""
 
     def record(self) -> dict[str, Any]:
-        """The fields for the recording: all but acknowledgements, requestUI and `hidden`."""
-        said: dict[str, Any] = {}
+        """Return the fields for the recording: all but `ack`, `asset`, `hidden` and the command `requestUI`."""
+        fields: dict[str, Any] = {}
         if self.command is not None and self.command != "requestUI":
-            said["command"] = self.command
+            fields["command"] = self.command
         if self.action is not None:
-            said["action"] = self.action
+            fields["action"] = self.action
         if self.key is not None:
-            said["key"] = self.key
+            fields["key"] = self.key
         if self.held is not None:
-            said["held"] = self.held
+            fields["held"] = self.held
         if self.frame_rate is not None:
-            said["changeFrameRate"] = self.frame_rate
+            fields["changeFrameRate"] = self.frame_rate
         if self.fields:
-            said["fields"] = self.fields
+            fields["fields"] = self.fields
         if self.fields_dropped:
-            said["fieldsDropped"] = self.fields_dropped
-        return said
+            fields["fieldsDropped"] = self.fields_dropped
+        return fields
 
 
 def object_of(data: str | bytes) -> dict[str, Any]:
-    """The JSON object that a message is. Raises NotAMessage."""
+    """Parse a message, which is a JSON object. Raises NotAMessage."""
     if not isinstance(data, str):
         raise NotAMessage("messages are JSON text, not bytes")
     try:
@@ -110,7 +110,7 @@ def object_of(data: str | bytes) -> dict[str, Any]:
 
 
 def parse_hello(data: str | bytes) -> Hello:
-    """Read a first message. Raises NotAMessage or BadMessage; fields it does not know are ignored."""
+    """Read a client's first message. Unknown fields are ignored. Raises NotAMessage or BadMessage."""
     value = object_of(data)
     for key in ("userId", "token"):
         if not isinstance(value.get(key), str | None):
@@ -130,23 +130,23 @@ def parse_hello(data: str | bytes) -> Hello:
 
 
 def words_of(trial: TrialSection) -> tuple[str, ...]:
-    """The words that the project's own controls give the agent: those controls that have no action's name."""
+    """Return the feedback words of the project's own controls: their names, but for those that name an action."""
     actions = {*trial.action_space, *_BUTTONS_OF_ACTIONS}
     return tuple(name for name in trial.ui.own if name.lower() not in actions)
 
 
 def is_feedback(command: str | None) -> bool:
-    """Whether the command of a message is a word of feedback: one of FEEDBACK, or of the project's own."""
+    """Whether the command of a message is a word of feedback: one of FEEDBACK or of the project's own words."""
     return command is not None and command not in PLAIN_COMMANDS
 
 
 def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
-    """Read a later message. `words` are the project's own. Raises NotAMessage or BadMessage, never anything else."""
+    """Read a later message. `words` are the project's own words (`words_of`). Raises NotAMessage or BadMessage."""
     return message_of(object_of(data), words)
 
 
 def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message:
-    """The message with these fields. Raises BadMessage."""
+    """Check the fields of a message, and return it. `words` as in `parse`. Raises BadMessage."""
     unknown = value.keys() - _FIELDS
     if unknown:
         raise BadMessage(f"unknown field {_short(min(unknown))}")
@@ -181,7 +181,7 @@ def _frame_rate(value: Any) -> str | float:
     if value in ("faster", "slower"):
         return str(value)
     if isinstance(value, int | float) and not isinstance(value, bool):
-        # Far beyond any limit is the same as the limit, and an int may be too long to be a float.
+        # An int may be too large for a float. No project's limit comes near these bounds.
         value = max(-1e6, min(1e6, value)) if isinstance(value, int) else value
         if math.isfinite(value):
             return float(value)
@@ -237,13 +237,11 @@ def controls(
     input_of_project: Mapping[str, Any] | None = None,
     session: Mapping[str, Any] | None = None,
 ) -> str:
-    """The answer to a hello and to `requestUI`.
+    """Build the answer to a hello and to `requestUI`. docs/wire.md explains its fields.
 
-    It names the project's own controls only if there are some, players only if there are several, and `to_act` only
-    turn by turn.
-
-    `scene` is what a client is told that draws objects: of the picture, and of the images in it. `input_of_project` is
-    what the project says of keys and buttons. `starts_in`, `time_left` and `session` as in `state`.
+    It has `words` only if the project has words of its own, the players only if there are several, and `toAct` only
+    turn by turn. `scene` are the fields of a game that is drawn by objects. `input_of_project` are the project's keys,
+    labels and kind of input. The arguments that `state` has, too, mean the same.
     """
     return json.dumps(
         {
@@ -284,16 +282,16 @@ def state(
     time_left: float | None = None,
     session: Mapping[str, Any] | None = None,
 ) -> str:
-    """The message that says how the trial stands.
+    """Build the message with the state of the trial. Times are seconds; a time of None is left out.
 
-    `starts_in`: seconds for which the first picture still stands. `time_left`: seconds of play of the episode.
-    `next_in`: seconds of a break that are left. Turn by turn, `to_act`: whether it is the client's turn, and
-    `turn_ends_in`: seconds of it that are left. `session`: what members are told of each other.
+    `starts_in`: until the first picture of the episode gives way to the game. `time_left`: of play in the episode.
+    `next_in`: until the break ends. `to_act`: turn by turn, whether it is the client's turn; `turn_ends_in`: until that
+    turn ends. `session`: in a session, the fields about its members.
     """
     scores = _scores(score, episode_score, next_in)
     turn, times = _turn(to_act, turn_ends_in), _times(starts_in, time_left)
-    said = {"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times}
-    return json.dumps({**said, **session} if session else said)
+    fields = {"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times}
+    return json.dumps({**fields, **session} if session else fields)
 
 
 def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]:
@@ -304,8 +302,8 @@ def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]
 
 
 def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:
-    said: dict[str, Any] = {} if to_act is None else {"toAct": to_act}
-    return said if ends_in is None else said | {"turnEndsIn": round(ends_in, 3)}
+    fields: dict[str, Any] = {} if to_act is None else {"toAct": to_act}
+    return fields if ends_in is None else fields | {"turnEndsIn": round(ends_in, 3)}
 
 
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:
@@ -314,18 +312,18 @@ def _scores(score: float, episode_score: float, next_in: float | None) -> dict[s
 
 
 def done(episodes: int, score: float, outcome: str | None = None) -> str:
-    """The message that the trial is over; in a session, with its outcome for this client."""
-    said = {"done": True, "episodes": episodes, "score": tidy(score)}
-    return json.dumps(said if outcome is None else {**said, "outcome": outcome})
+    """Build the message that the trial is over. `outcome`: in a session, how it has ended for this member."""
+    fields = {"done": True, "episodes": episodes, "score": tidy(score)}
+    return json.dumps(fields if outcome is None else {**fields, "outcome": outcome})
 
 
 def error(words: str) -> str:
-    """The message that says in words what was wrong."""
+    """Build the message that shows a sentence to the participant, such as what went wrong."""
     return json.dumps({"error": words})
 
 
 def tidy(score: float) -> float | int:
-    """A score as JSON shows it best: 340, not 340.0; never NaN or an infinity, which are not JSON."""
+    """Return a score for JSON: 340 instead of 340.0, six decimals at most, and 0 for NaN and infinities."""
     if not math.isfinite(score):
         return 0
     return int(score) if float(score).is_integer() else round(score, 6)

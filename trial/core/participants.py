@@ -1,6 +1,6 @@
-"""Who takes part in a trial, and what follows from it: one participant alone, or the members of a session.
+"""The participants of a trial: `Alone` for one, `TrialSession` (`trial/core/session.py`) for several. Pure.
 
-`Alone` is for one participant, `TrialSession` (`trial/core/session.py`) for several. Both have the same calls.
+Both have the same methods. They decide when the game is held and goes on, and what is answered for whom.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from trial.core.session import TrialSession
 
 
 class Alone:
-    """The one participant of a trial: who comes and goes, and what follows from it."""
+    """The only participant of a trial."""
 
     def __init__(self, progress: TrialProgress, trial_id: str) -> None:
         self._progress = progress
         self._trial_id = trial_id
 
     def place_of(self, human: str) -> str:
-        """The player whom this human plays."""
+        """Return the player whom this human plays."""
         return self._progress.first
 
     def name_of(self, player: str) -> str | None:
-        """The name in the recording for the participant who plays this player: None, since there is one participant."""
+        """Return the player's name for the recorded messages: None, since one participant sends them all."""
         return None
 
     # ---- what happens
 
     def come(self, player: str, now: float) -> None:
-        """The participant has connected. They begin, or go on, by `start`."""
+        """The participant has connected. The game is not on before they send `start`."""
 
     def go(self, player: str, now: float, *, closing: bool) -> None:
-        """The participant has left: hold the game, unless the server is `closing`, which has ended the game itself."""
+        """The participant has left: hold the game. Not if the server is `closing`: it has ended the game already."""
         if not closing:
             self._progress.leave(player)
 
@@ -47,7 +47,7 @@ class Alone:
         return True
 
     def receive(self, player: str, message: Message, window: Window, now: float) -> bool:
-        """A message has come. Return whether it is read: always."""
+        """A message has come. Return whether it has an effect: always."""
         return True
 
     def start(self, player: str, now: float) -> None:
@@ -59,65 +59,65 @@ class Alone:
         self._progress.pause()
 
     def stop(self, player: str) -> None:
-        """End the game for the participant, after the step that is being taken."""
+        """The participant ends the game. There is nothing to remember: `Commands` ends it after the present step."""
 
     def stopped(self) -> None:
-        """The game has ended because the participant has stopped it."""
+        """The game has ended because the participant has stopped it. No one else is to be told."""
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The participant's browser has answered a ping. Only sessions measure it."""
+        """The participant's browser has answered a ping: no effect, since only sessions limit round trips."""
 
     def saved(self, human: str) -> None:
-        """A member's answer is stored. Alone, there is none."""
+        """A member's answer is stored: no effect, since there are no members."""
 
     # ---- what follows
 
     def attend(self, now: float, seconds: float) -> None:
-        """Hold the game, or let it go on, as the members are there. Alone, only commands decide."""
+        """Hold the game, or let it go on, depending on who is here: no effect, since commands alone decide that."""
 
     def wake_at(self, now: float) -> float | None:
-        """When to call `attend` again if nothing happens: never."""
+        """Return when to call `attend` again if nothing happens: never."""
         return None
 
     # ---- recordings and answers
 
-    def of_reset(self) -> Mapping[str, Any]:
-        """Further fields for the line of a reset: none."""
+    def reset_fields(self) -> Mapping[str, Any]:
+        """Return further fields for the line of a reset: none."""
         return {}
 
     def outcomes(self) -> Mapping[str, str | None] | None:
-        """How the trial has ended for each member: None, since there are no members."""
+        """Return how the trial has ended for each member: None, since there are no members."""
         return None
 
     def write_lines(self) -> None:
-        """Write the lines that wait for an open recording: there are none."""
+        """Write the lines that wait for an open recording: none do."""
 
     def answer(self, seconds: float, *, played: bool) -> SaveAnswer:
-        """What to store; `seconds` were played. Without an answer if the game could not be `played`."""
+        """Return what to store, after `seconds` of play: the answer if the game could be `played`, else none."""
         return SaveAnswer(records.answers(self._progress, seconds, self._trial_id) if played else None)
 
     # ---- what the participant is told
 
-    def state(self) -> None:
-        """A value that changes when members are to be told of each other: always None."""
+    def session_version(self) -> None:
+        """Return a value that changes when the fields about members do: always None."""
         return None
 
-    def told(self, now: float) -> Mapping[str, Any] | None:
-        """What all members are told of each other: None."""
+    def session_fields(self, now: float) -> Mapping[str, Any] | None:
+        """Return the fields about members in the messages to clients: None."""
         return None
 
     def sentence(self, player: str) -> str | None:
-        """The words that tell a member why the game is over: None."""
+        """Return the sentence that tells a member why the game is over: None."""
         return None
 
     def has_answered(self, human: str) -> bool:
-        """Whether a member's answer is stored: no."""
+        """Whether a member's own answer is stored: no, since there are no members."""
         return False
 
     def answer_of(self, human: str) -> Mapping[str, Any] | None:
-        """A member's own answer: None."""
+        """Return a member's own answer: None."""
         return None
 
 
 Participants = Alone | TrialSession
-"""Those of one trial, however many they are."""
+"""The participants of one trial."""

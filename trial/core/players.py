@@ -1,4 +1,4 @@
-"""Who plays whom: the players of an environment, and who or what chooses the actions of each. Pure."""
+"""The players of an environment, and who or what chooses the actions of each. Pure."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from protocol.trial import TrialSection
 from protocol.values import show
 
 PLAYER = "player_0"
-"""The player of an environment that has one."""
+"""The name of the player of an environment that has a single one."""
 
 NOOP = "noop"
-"""The action of no key, if the environment has one of this name and `idleAction` names no other."""
+"""The name of the idle action, unless `idleAction` names another or the environment has no action of this name."""
 
 ALL = "__all__"
-"""In what an environment returns, a key beside the players: the value for all of them (RLlib's `MultiAgentEnv`)."""
+"""A key that an environment may return beside its players: its value holds for all (RLlib's `MultiAgentEnv`)."""
 
 ACTION_MASK = "action_mask"
 """Under this key an info or an observation says which actions are legal now."""
@@ -27,21 +27,22 @@ Mask = Sequence[Any]
 
 
 class PlayersError(ValueError):
-    """The section `trial` and the environment's players do not fit. The message is for the researcher."""
+    """The section `trial` does not fit the environment's players. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
 class Player:
-    """A place of the environment. `plays` is what `trial.players` says: human, or who else chooses its actions."""
+    """A player of the environment. `plays` is its value in `trial.players`: `human`, or the policy that plays it."""
 
     name: str
     action_space: tuple[str, ...]
     plays: str = HUMAN
     idle: int = 0
-    """The action of a step in which nothing was chosen."""
+    """The number of its idle action, which it takes in a step for which nothing was chosen."""
 
     @property
     def human(self) -> bool:
+        """Whether a participant chooses its actions."""
         return self.plays == HUMAN
 
     @property
@@ -50,31 +51,31 @@ class Player:
         return self.plays.startswith(GYM_PLAYER)
 
 
-_NOTHING: Mapping[str, Any] = {}  # the type forbids changes
+_NOTHING: Mapping[str, Any] = {}  # may be a default value: its type forbids changes
 
 
 class View(NamedTuple):
-    """What the players see after a reset or a step, by player. The core reads `to_act` and `masks` only."""
+    """What the players see after a reset or a step, by player. The core reads only `to_act` and `masks`."""
 
     to_act: frozenset[str]
     """The players whose actions the next step takes."""
     observations: Mapping[str, Any] = _NOTHING
     infos: Mapping[str, Any] = _NOTHING
     masks: Mapping[str, Mask] = _NOTHING
-    """Which actions are possible now, for those players for which the environment says so."""
+    """The actions that are legal now, for those players for which the environment gives a mask."""
 
 
 def alone(action_space: tuple[str, ...]) -> tuple[Player, ...]:
-    """The players of an environment that has one, who is a human."""
+    """Return the players of an environment with a single player, whom a human plays."""
     return (Player(PLAYER, action_space, HUMAN, _idle(PLAYER, action_space, None)),)
 
 
 def who_plays(
     config: TrialSection, action_spaces: Mapping[str, tuple[str, ...]], group: int | None
 ) -> tuple[Player, ...]:
-    """The players of the environment, in its order, each with what plays it in this group.
+    """Return the environment's players, in its order, each with the human or policy that plays it in this group.
 
-    `action_spaces` has the environment's players in their order. Raises PlayersError.
+    `action_spaces` are the names of each player's actions, in the environment's order. Raises PlayersError.
     """
     if not action_spaces:
         raise PlayersError("the environment has no players")
@@ -84,18 +85,18 @@ def who_plays(
     unknown = [name for name in named if name not in action_spaces]
     if unknown:
         raise PlayersError(f"trial.players names {_listed(unknown)}, but {has}")
-    lacking = [name for name in names if name not in named]
-    if (named and lacking) or (len(names) > 1 and not named):
-        missing = lacking if named else names[1:]
+    unnamed = [name for name in names if name not in named]
+    if (named and unnamed) or (len(names) > 1 and not named):
+        missing = unnamed if named else names[1:]
         raise PlayersError(f"trial.players must say who plays {_listed(missing)}; {has}")
     plays = {name: named.get(name, HUMAN) for name in names}
     if HUMAN not in plays.values():
         raise PlayersError("trial.players must name a human: at least one player")
     idles = config.idle_action
     if isinstance(idles, Mapping):
-        strange = [name for name in idles if name not in action_spaces]
-        if strange:
-            raise PlayersError(f"trial.idleAction names {_listed(strange)}, but {has}")
+        unknown = [name for name in idles if name not in action_spaces]
+        if unknown:
+            raise PlayersError(f"trial.idleAction names {_listed(unknown)}, but {has}")
     return tuple(
         Player(name, space, plays[name], _idle(name, space, idles.get(name) if isinstance(idles, Mapping) else idles))
         for name, space in action_spaces.items()
@@ -103,7 +104,7 @@ def who_plays(
 
 
 def _idle(player: str, action_space: Sequence[str], name: str | None) -> int:
-    """The action of no key. Raises PlayersError."""
+    """Return the number of the idle action. `name` is its name in `idleAction`, if given. Raises PlayersError."""
     if name is None:
         return action_space.index(NOOP) if NOOP in action_space else 0
     if name.lower() not in action_space:
@@ -117,17 +118,20 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def is_legal(action: int, mask: Mask | None) -> bool:
-    """Whether the mask allows the action. A mask that is too short, or allows no action at all, forbids nothing."""
+    """Whether the mask allows the action. A mask that allows no action at all is ignored.
+
+    An action beyond the end of the mask is legal.
+    """
     return mask is None or action >= len(mask) or bool(mask[action]) or not any(mask)
 
 
 def legal_actions(count: int, mask: Mask | None) -> list[int]:
-    """Those of `count` actions that are legal."""
+    """Return the numbers of the legal actions, out of `count` actions."""
     return [action for action in range(count) if is_legal(action, mask)]
 
 
 def legal_or_idle(action: int, player: Player, mask: Mask | None) -> int:
-    """The action if it is legal; else the idle action if that is legal; else the first legal one."""
+    """Return the action if it is legal; else the idle action if that is legal; else the first legal action."""
     if is_legal(action, mask):
         return action
     if is_legal(player.idle, mask):
@@ -136,6 +140,6 @@ def legal_or_idle(action: int, player: Player, mask: Mask | None) -> int:
 
 
 def random_action(player: Player, mask: Mask | None, seed: int) -> int:
-    """A random legal action: the same one for the same seed."""
-    choice = legal_actions(len(player.action_space), mask)
-    return choice[seed % len(choice)] if choice else player.idle
+    """Return a random legal action: the same one for the same seed."""
+    legal = legal_actions(len(player.action_space), mask)
+    return legal[seed % len(legal)] if legal else player.idle

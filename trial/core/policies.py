@@ -1,9 +1,9 @@
-"""Players that are no humans: what each of them was asked, and the action that it takes. Pure; the clock is passed in.
+"""The policies: what each was asked, and which action its player takes. Pure; the clock is passed in.
 
-In real time a policy is asked after each step at which it is to act (every `frameSkip` steps) and has until the next
-one; one that is late takes its last action again, and what comes late counts at the step after. Turn by turn it has
-`policySeconds`, then the idle action is taken. A policy that fails idles for the step, one that fails `FAILURES` times
-in a row for the rest of the episode.
+In real time a policy is asked every `frameSkip` steps, if it is to act, and should answer before the next step. If it
+is late, its player takes the last action again, and a late answer counts at the following step. Turn by turn a policy
+has `policySeconds`; after them, its player takes the idle action. The player of a policy that fails takes the idle
+action in that step; after `FAILURES` failures in a row, in all steps until the episode is over.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FAILURES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What a policy saw when it chose its action."""
+    """What a policy is given when it chooses an action: observation, info and action mask."""
 
     observation: Any
     info: Any
@@ -41,23 +41,23 @@ class AskPolicy:
 
 
 class _Place:
-    """One player's place, and how far its policy is."""
+    """A player that a policy plays, and the state of that policy in this episode."""
 
     def __init__(self, player: Player) -> None:
         self.player = player
         self.begin()
 
     def begin(self) -> None:
-        self.asked: int | None = None  # the ask that has not been answered
+        self.asked: int | None = None  # the `ask_id` of the question that is not answered yet
         self.asked_at = 0.0
-        self.asked_after = 0  # steps
-        self.due = False  # it is to be asked as soon as it is to act
+        self.asked_after = 0  # the number of steps before the last question
+        self.due = False  # to be asked as soon as the player is to act
         self.mask: Mask | None = None
-        self.answer: int | None = None
+        self.answer: int | None = None  # the action that no step has taken yet
         self.failed = False  # since the last step
-        self.failures = 0
-        self.last: int | None = None
-        self.late = 0
+        self.failures = 0  # in a row
+        self.last: int | None = None  # the last action that the policy chose
+        self.late = 0  # the number of steps at which it was late
 
     @property
     def idles(self) -> bool:
@@ -65,16 +65,19 @@ class _Place:
 
 
 class Policies:
-    """All players of a trial that are no humans. `goes_on`: between two turns of `frame_skip` the last action acts."""
+    """The policies of all players that no human plays."""
 
     def __init__(
-        self, players: Iterable[Player], *, frame_skip: int = 1, seconds: float | None = None, goes_on: bool = True
+        self, players: Iterable[Player], *, frame_skip: int = 1, seconds: float | None = None, repeats_last: bool = True
     ) -> None:
+        """`players` are those that policies play. `seconds`: turn by turn, how long a policy may take; None: real time.
+
+        `repeats_last`: at steps for which `frame_skip` asks for no action, the last action is taken again.
+        """
         self._places = {player.name: _Place(player) for player in players}
         self._frame_skip = frame_skip
         self._seconds = seconds
-        """With turns: how long a policy may think."""
-        self._goes_on = goes_on
+        self._repeats_last = repeats_last
         self._asks = 0
 
     def __bool__(self) -> bool:
@@ -85,7 +88,7 @@ class Policies:
 
     @property
     def asked(self) -> tuple[Player, ...]:
-        """The players whose policies are asked: all but those that a program plays."""
+        """The players whose policies are asked by `AskPolicy`: all but those that a program plays."""
         return tuple(place.player for place in self._places.values() if not place.player.by_program)
 
     def begin(self) -> None:
@@ -93,11 +96,11 @@ class Policies:
         for place in self._places.values():
             place.begin()
 
-    def go_on(self, actions: Mapping[str, int], failures: Mapping[str, int]) -> None:
+    def resume(self, actions: Mapping[str, int], failures: Mapping[str, int]) -> None:
         """The episode goes on where an earlier server left it.
 
-        `actions`: what each policy chose last, which is taken until it chooses again. `failures`: how often each has
-        failed in a row.
+        By player: `actions` are the last choices of policies, which act until these choose again; `failures` is how
+        often each policy has failed in a row.
         """
         for player, count in failures.items():
             if player in self._places:
@@ -111,17 +114,17 @@ class Policies:
         self._places[player.name] = _Place(player)
 
     def give_back(self, player: str) -> None:
-        """The policy does not play for this player any more; its late answers change nothing."""
+        """A human plays this player again. Late answers of the policy change nothing."""
         self._places.pop(player, None)
 
     def late(self) -> dict[str, int]:
-        """By player, in how many steps of the episode its policy was late."""
+        """Return, by player, the number of steps of the episode at which its policy was late, if there are any."""
         return {name: place.late for name, place in self._places.items() if place.late}
 
     def asks(self, view: View, steps: int, now: float) -> list[AskPolicy]:
-        """What to ask the policies after `steps` steps of the episode."""
+        """Return the questions to policies that are due after `steps` steps of the episode."""
         due = self._seconds is not None or steps % self._frame_skip == 0
-        found = []
+        questions = []
         for name, place in self._places.items():
             if place.player.by_program or place.idles:
                 continue
@@ -130,12 +133,12 @@ class Policies:
                 continue
             place.due = False
             if self._seconds is None and (place.asked is not None or place.answer is not None):
-                continue  # it still thinks, or what came late is taken first
-            found.append(self.ask(name, view, steps, now))
-        return found
+                continue  # it has not answered yet, or the next step takes its late answer first
+            questions.append(self.ask(name, view, steps, now))
+        return questions
 
     def ask(self, player: str, view: View, steps: int, now: float) -> AskPolicy:
-        """What to ask this player's policy now."""
+        """Return a question to this player's policy. An earlier question does not count any more."""
         place = self._places[player]
         self._asks += 1
         place.asked, place.asked_at, place.asked_after, place.answer = self._asks, now, steps, None
@@ -143,7 +146,7 @@ class Policies:
         return AskPolicy(player, self._asks, view.observations.get(player), view.infos.get(player), place.mask)
 
     def acted(self, player: str, ask_id: int, action: Any) -> str | None:
-        """The policy has answered. Return what is wrong with the answer; None if it is right, or came too late."""
+        """The policy has answered. Return what is wrong with the answer; None if it is valid, or to an old question."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return None
@@ -163,7 +166,7 @@ class Policies:
         return None
 
     def failed(self, player: str, ask_id: int) -> bool:
-        """The policy has raised an error. Return whether its answer was awaited."""
+        """The policy has raised an error. Return whether the question was its present one."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return False
@@ -173,21 +176,20 @@ class Policies:
         return True
 
     def idles(self, player: str) -> bool:
-        """Whether the policy is not asked any more in this episode."""
+        """Whether the policy has failed `FAILURES` times in a row, and is not asked any more in this episode."""
         return self._places[player].idles
 
     def advise(self, player: str, action: int) -> None:
-        """A program chooses the action of the next step."""
-        place = self._places[player]
-        place.answer = action
+        """The program that plays this player chooses the action of the next step."""
+        self._places[player].answer = action
 
-    def take(self, name: str, mask: Mask | None, steps: int) -> Action:
-        """The player's action of the step that begins now, in real time; `steps` were taken before."""
+    def take(self, name: str, mask: Mask | None) -> Action:
+        """Return the player's action for the step that begins now, in real time."""
         place = self._places[name]
         player, failed = place.player, place.failed
         place.failed = False
         by: By
-        looked = place.asked_after if failed else None
+        observed = place.asked_after if failed else None
         if place.answer is not None:
             return self._answered(place, mask)
         if failed or place.idles or (player.by_program and place.last is None):
@@ -196,12 +198,12 @@ class Policies:
             place.late += 1
             index, by = self._last(place), "late"
         else:
-            index, by = self._last(place), "policy" if self._goes_on and place.last is not None else "none"
+            index, by = self._last(place), "policy" if self._repeats_last and place.last is not None else "none"
         index = legal_or_idle(index, player, mask)
-        return Action(index, player.action_space[index], by, looked)
+        return Action(index, player.action_space[index], by, observed)
 
     def _last(self, place: _Place) -> int:
-        return place.last if self._goes_on and place.last is not None else place.player.idle
+        return place.last if self._repeats_last and place.last is not None else place.player.idle
 
     def _answered(self, place: _Place, mask: Mask | None) -> Action:
         player, chosen = place.player, place.answer
@@ -213,14 +215,14 @@ class Policies:
         return Action(index, player.action_space[index], by, None if player.by_program else place.asked_after)
 
     def choice(self, name: str, mask: Mask | None, now: float) -> Action | None:
-        """The player's action of this turn; None if the game waits for it."""
+        """Return the player's action in this turn; None if its policy may still choose."""
         place = self._places[name]
         player = place.player
         if place.answer is not None:
             return self._answered(place, mask)
         if place.failed or place.idles:
-            looked, place.failed = place.asked_after if place.failed else None, False
-            return _idle(player, mask, "none", looked)
+            observed, place.failed = place.asked_after if place.failed else None, False
+            return _idle(player, mask, "none", observed)
         if now < self._until(place):
             return None
         place.late += 1
@@ -228,16 +230,16 @@ class Policies:
             return _idle(player, mask, "late")
         place.asked = None
         place.failures += 1
-        return _idle(player, mask, "late", place.asked_after)  # it has observed this all the same, and may remember it
+        return _idle(player, mask, "late", place.asked_after)  # it has seen the observation, and may remember it
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
-        """A turn begins: programs have their time from now on. What was chosen before does not count."""
+        """A turn begins: the time of programs runs from now on, and what they chose before does not count."""
         for name, place in self._places.items():
             if name in to_act and place.player.by_program:
                 place.asked_at, place.answer = now, None
 
     def until(self, waiting: Sequence[str]) -> float | None:
-        """When the time for the answers of these players is over; None if none of them is a policy."""
+        """Return when the first of these players' policies runs out of time; None if no policy plays any of them."""
         return min((self._until(self._places[name]) for name in waiting if name in self._places), default=None)
 
     def _until(self, place: _Place) -> float:

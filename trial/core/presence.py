@@ -1,10 +1,10 @@
-"""Who of a session's members is here, how long the others wait for the rest, and when the game may go on. Pure.
+"""Which members of a session are here, how long the others wait for the missing ones, and when the game is on. Pure.
 
-The game goes on while every member is here, or a policy plays in their place. Otherwise it is held. A member may be
-missing for `gather` seconds before the game, and then for `absent` seconds. This time runs while another member waits,
-and stops while all are gone, or while the member is here and their round trip is measured. A member who plays gets used
-time back little by little, so a member who comes and goes cannot hold the others for ever. Before the game begins, and
-after each hold, there is a countdown. All times are seconds of one monotonic clock, which is passed in.
+The game is on while every member is here or a policy plays in their place. Otherwise it is held. A member may be
+missing for `gather` seconds before the game, and for `absent` seconds during it. This time runs while the member is
+gone and another member waits. It does not run while all are gone, or while a connected member's round trip is measured.
+A member who plays gets used time back, but slowly: a member who comes and goes uses their time up. Before the game
+begins, and after each hold, there is a countdown. All times are seconds of one monotonic clock, which is passed in.
 """
 
 from __future__ import annotations
@@ -16,34 +16,35 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Where = Literal["here", "reads", "awaited", "away", "policy"]
-"""What the others are told of a player. reads: here, but still at the page before the game or between two episodes;
-awaited: has not come yet; away: was here."""
+"""Where a player is, as clients show it. reads: connected, and still at the page before the game or between two
+episodes; awaited: has not come yet, or is still being measured; away: was here; policy: a policy plays in the place."""
 LEAST_ABSENCE = 3.0
-"""An absence uses at least so many seconds, or a third of `absent` (before the game: of `gather`) if that is less.
-After it the countdown begins anew."""
+"""The least time that one absence uses up, in seconds; a third of `absent` (before the game: of `gather`) if that is
+less. So short absences cannot go on for ever, although each makes the countdown begin anew."""
 GIVEN_BACK = 0.25
-"""For each second of play, a member gets so many seconds of used time back."""
+"""The used time that a member gets back for each second of play, in seconds."""
 MEASURED_SECONDS = 20.0
-"""The most seconds in which a member's round trip is measured. Then the samples so far decide."""
+"""The most seconds for which a member's round trip is measured. After them, the samples so far decide."""
 Over = Literal["absent", "ping"]
-"""Why a member does not play any more: their time is over, or their round trip is too long."""
+"""Why a member does not play any more. absent: missing for too long; ping: their round trip is too long."""
 
 
 @dataclass(slots=True)
 class _Countdown:
-    """Seconds that count down while it runs."""
+    """A number of seconds that count down while the countdown runs."""
 
     left: float
+    """The seconds that were left when it last stopped."""
     until: float | None = None
-    """When they are over; None: it does not run. Meanwhile `left` stays what it was."""
+    """When the countdown is over; None: it does not run."""
 
     def run(self, now: float, seconds: float) -> None:
-        """So many seconds count down from now on, unless it runs already."""
+        """Count down `seconds` from now on. It changes nothing if the countdown runs already."""
         if self.until is None:
             self.until = now + seconds
 
     def stop(self, now: float, least: float = 0.0) -> None:
-        """Keep what is left. Having run uses up `least` seconds at least."""
+        """Stop, and keep the seconds that are left. A countdown that has run uses up at least `least` seconds."""
         if self.until is not None:
             self.left, self.until = max(0.0, min(self.until - now, self.left - least)), None
 
@@ -56,19 +57,25 @@ class _Member:
     player: str
     samples: deque[float]
     waiting: _Countdown
-    """How long the others wait for them. It runs while they do."""
+    """How long the others still wait for the member. It runs while they do."""
     measured: bool
+    """Whether the member's round trip is known, or need not be."""
     measuring: _Countdown = field(default_factory=lambda: _Countdown(MEASURED_SECONDS))
-    """How long their round trip may be measured. It runs while it is."""
+    """How long the member's round trip may still be measured. It runs meanwhile."""
     connected: bool = False
     stalled: bool = False
+    """Their page has stopped answering."""
     hidden: bool = False
-    met: bool = False
+    """They look at another tab or application."""
+    has_come: bool = False
+    """They have connected at least once."""
     gone_on: bool = False
+    """They have gone on from the page before the game or between two episodes."""
     over: Over | None = None
 
     @property
     def takes_part(self) -> bool:
+        """Whether the member is connected, with a page that answers and that they look at, and is not refused."""
         return self.connected and not self.stalled and not self.hidden and self.over != "ping"
 
     @property
@@ -81,18 +88,18 @@ class _Member:
 
     @property
     def gone(self) -> bool:
-        """The others wait for them, at most while `waiting` runs. Who is here and is still measured is not gone."""
+        """Whether the others wait for the member to come or come back. A member who is being measured is not gone."""
         return self.over is None and not self.takes_part
 
     @property
     def is_measured_now(self) -> bool:
-        """They are here, and their round trip is not known yet. That takes `MEASURED_SECONDS` at most."""
+        """Whether the member is connected and their round trip is being measured."""
         return self.over is None and self.takes_part and not self.measured
 
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """The project's numbers for presence, in the units of config.yml: seconds and milliseconds."""
+    """The project's keys about presence: `max_ping` in milliseconds, `ping_samples` a number, the others in seconds."""
 
     absent: float
     gather: float
@@ -107,20 +114,20 @@ class Presence:
 
     rules: Rules
     players: Sequence[str]
-    """Those of the members, in their order."""
+    """The players of the members, in the environment's order."""
     reads: bool
-    """There is a page to read: the game begins when all have gone on from it."""
+    """Whether there is a page before the game: the game begins when all members have gone on from it."""
     begun: bool
-    """The game has begun, here or on an earlier server: round trips are not compared with `max_ping` any more."""
+    """Whether the game has begun, here or on an earlier server. Then round trips are not compared with `max_ping`."""
     paused: bool = False
-    """A member has paused the game."""
+    """Whether a member has paused the game."""
     version: int = 0
-    """Changes whenever something changes that members are told."""
+    """A number that changes whenever the fields about members in clients' messages change."""
     _members: dict[str, _Member] = field(init=False)
     _counts_until: float | None = None
     _page_until: float | None = None
     _on_since: float | None = None
-    """The game is on since then."""
+    """When the game went on, or when used time was last given back, whichever is later; None while it is held."""
 
     def __post_init__(self) -> None:
         left, samples = self.rules.absent if self.begun else self.rules.gather, self.rules.ping_samples
@@ -132,10 +139,13 @@ class Presence:
     # ---- what happens
 
     def come(self, player: str, now: float) -> Literal["joined", "returned"]:
-        """The member has connected. If their time was over, they play again."""
+        """The member has connected. They play again if they had been missing for too long.
+
+        Return whether it was their first connection (`joined`) or not (`returned`).
+        """
         self._give_time_back(now)
         member = self._members[player]
-        returned, member.met = member.met, True
+        returned, member.has_come = member.has_come, True
         member.connected, member.stalled, member.hidden = True, False, False
         if member.over == "absent":
             member.over = None
@@ -151,34 +161,34 @@ class Presence:
     def stalls(self, player: str, now: float) -> bool:
         """The member's page has stopped answering. Return whether they were here until now."""
         member = self._members[player]
-        return self._turns_away(member, now, stalled=True, hidden=member.hidden)
+        return self._mark_away(member, now, stalled=True, hidden=member.hidden)
 
     def hides(self, player: str, now: float) -> bool:
-        """The member looks at another page. Return whether they were here until now."""
+        """The member looks at another tab or application. Return whether they were here until now."""
         member = self._members[player]
-        return self._turns_away(member, now, stalled=member.stalled, hidden=True)
+        return self._mark_away(member, now, stalled=member.stalled, hidden=True)
 
-    def _turns_away(self, member: _Member, now: float, *, stalled: bool, hidden: bool) -> bool:
+    def _mark_away(self, member: _Member, now: float, *, stalled: bool, hidden: bool) -> bool:
         self._give_time_back(now)
-        new = not member.stalled and not member.hidden
+        was_here = not member.stalled and not member.hidden
         member.stalled, member.hidden = stalled, hidden
-        if new:
+        if was_here:
             self._changed(now)
-        return new
+        return was_here
 
     def answers_again(self, player: str) -> bool:
-        """The member's page answers. Return whether they were away because it did not: then call `come`."""
+        """The member's page answers. Return whether they were away only because it did not: then call `come`."""
         member = self._members[player]
         if member.hidden:
             member.stalled = False
         return member.stalled
 
     def hidden(self, player: str) -> bool:
-        """Whether the member looks at another page."""
+        """Whether the member looks at another tab or application."""
         return self._members[player].hidden
 
     def goes_on(self, player: str, now: float) -> None:
-        """The member goes on from the page, and from a pause."""
+        """The member goes on from the page before the game or between two episodes, or from a pause."""
         self._members[player].gone_on = True
         self.paused = False
         if self._page_until is None:
@@ -186,13 +196,14 @@ class Presence:
         self._changed(now)
 
     def pauses(self) -> None:
-        """A member pauses the game, until any of them goes on."""
+        """A member pauses the game, until any member goes on."""
         self.paused = True
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The member's browser has answered a ping. Before the game, the first samples decide whether they may play.
+        """The member's browser has answered a ping after `seconds`.
 
-        Whoever has more than half of them too long is refused at once.
+        Before the game, the median of the first `ping_samples` decides whether the member may play. A member is refused
+        as soon as more than half of the samples must be too long.
         """
         member, rules = self._members[player], self.rules
         member.samples.append(seconds)
@@ -206,45 +217,45 @@ class Presence:
             self._changed(now)
 
     def _too_long(self, member: _Member) -> int:
-        return sum(each * 1000 > self.rules.max_ping for each in member.samples)
+        return sum(sample * 1000 > self.rules.max_ping for sample in member.samples)
 
-    def page(self) -> None:
-        """A break begins: no member has gone on from it yet."""
+    def begin_break(self) -> None:
+        """A break begins: no member has gone on from its page yet."""
         self._page_until = None
         for member in self._members.values():
             member.gone_on = False
         self._tell()
 
-    def refused(self, player: str) -> None:
-        """An earlier server has refused the member, because their round trip took too long."""
+    def mark_refused(self, player: str) -> None:
+        """The member is refused, because an earlier server or game has found their round trip too long."""
         self._members[player].over = "ping"
 
-    def has_left(self, player: str) -> None:
-        """An earlier server has ended the game, because the member stayed away."""
+    def mark_absent(self, player: str) -> None:
+        """The member does not play any more: they stayed away on an earlier server, or their data were erased."""
         self._members[player].over = "absent"
 
     # ---- what follows
 
     def look(self, now: float) -> None:
-        """The others wait no longer for those whose time is over, nor for a round trip that takes too long to measure.
+        """Mark the members who have been missing for too long, and decide about those who were measured for too long.
 
-        Whoever has more than half of the samples so far too long, or none at all, is refused: one slow answer of
-        several refuses nobody.
+        A member whose measurement takes too long is refused if more than half of their samples so far are too long, or
+        if there are none. So one slow answer of several refuses no one.
         """
         members = self._members.values()
-        over = [one for one in members if one.waiting.is_over(now)]
-        for member in over:
+        absent = [member for member in members if member.waiting.is_over(now)]
+        for member in absent:
             member.over = "absent"
-        decided = [one for one in members if one.measuring.is_over(now)]
+        decided = [member for member in members if member.measuring.is_over(now)]
         for member in decided:
             member.measured = True
             if not member.samples or self._too_long(member) > len(member.samples) // 2:
                 member.over = "ping"
-        if over or decided:
+        if absent or decided:
             self._changed(now)
 
     def may_play(self, now: float, *, on: bool) -> bool:
-        """Whether the game may be on now. If it was not `on`, the countdown begins with this call."""
+        """Return whether the game may be on now. If it is not `on` and no member is missing, the countdown begins."""
         if not self.complete or self.paused or self._held_by_page(now):
             self._give_time_back(now)
             self._on_since = None
@@ -270,82 +281,89 @@ class Presence:
 
     @property
     def complete(self) -> bool:
-        """Whether no member is waited for, and at least one is here."""
+        """Whether at least one member is here, and none is missing."""
         members = self._members.values()
-        return any(one.here for one in members) and not any(one.missing for one in members)
+        return any(member.here for member in members) and not any(member.missing for member in members)
 
     @property
     def waits(self) -> bool:
-        """Whether a member waits for the game."""
-        return any(one.takes_part for one in self._members.values())
+        """Whether at least one member takes part, and so may be waiting for the others."""
+        return any(member.takes_part for member in self._members.values())
 
     def all_gone_on(self, now: float) -> bool:
-        """Whether all who are here have gone on from the page, or have been waited for long enough."""
+        """Whether all members who are here have gone on from the page, or `gather` seconds are over since the first."""
         if self._page_until is None:
             return False
-        return now >= self._page_until or all(one.gone_on for one in self._members.values() if one.here)
+        return now >= self._page_until or all(member.gone_on for member in self._members.values() if member.here)
 
     def _held_by_page(self, now: float) -> bool:
         return self.reads and not self.all_gone_on(now)
 
     def time_left(self, player: str) -> float:
-        """Seconds for which the others would wait for the member from now on; 0 if the member has used them up."""
+        """Return the seconds for which the others would wait for the member from now on; 0 if they are used up."""
         left = self._members[player].waiting.left
         return left if left >= self._least else 0.0
 
     def over(self, player: str) -> Over | None:
-        """Why the member does not play any more; None if they play."""
+        """Return why the member does not play any more; None if they play."""
         return self._members[player].over
 
     def all_refused(self) -> bool:
-        """Whether no member is left who may play."""
-        return all(one.over == "ping" for one in self._members.values())
+        """Whether every member is refused because of their round trip."""
+        return all(member.over == "ping" for member in self._members.values())
 
-    # ---- what is told
+    # ---- what clients are told
 
     def people(self, vacant: Iterable[str], *, reads: bool, plays_on: bool) -> dict[str, Where]:
-        """Where each member is. In the places of `vacant` a policy plays from the start.
+        """Return where each player is. `vacant` are the players that policies play from the start.
 
-        `reads`: there is a page between two episodes. Without `plays_on` no policy takes the place of a member.
+        `reads`: members are at a page between two episodes. `plays_on`: a policy takes the place of a member who is
+        absent or refused.
         """
         page = reads or self.reads
         return {
-            **{one.player: _where(one, page, plays_on) for one in self._members.values()},
+            **{member.player: _where(member, page, plays_on) for member in self._members.values()},
             **dict.fromkeys(vacant, "policy"),
         }
 
     def begins_in(self, now: float) -> float | None:
-        """Seconds of the countdown that are left; None if it does not run."""
+        """Return the seconds of the countdown that are left; None if it does not run."""
         return None if self._counts_until is None else max(0.0, self._counts_until - now)
 
     def held_for(self, now: float, *, reads: bool) -> float | None:
-        """Seconds until the others wait no longer; None if they do not wait. `reads` as in `people`."""
+        """Return the seconds until the members stop waiting for one another; None if no one waits.
+
+        `reads` as in `people`.
+        """
         until = self._until(now, reads=reads)
         return None if until == math.inf else max(0.0, until - now)
 
     def wake_at(self, now: float, *, on_break: bool) -> float:
-        """When to call `look` again if nothing happens; infinite if there is no need to."""
+        """Return when to call `look` and `may_play` again if nothing happens before; infinity if there is no need."""
         counts = math.inf if self._counts_until is None else self._counts_until
-        measuring = [one.measuring.until for one in self._members.values() if one.measuring.until is not None]
+        members = self._members.values()
+        measuring = [member.measuring.until for member in members if member.measuring.until is not None]
         return min(self._until(now, reads=on_break), counts, *measuring)
 
     def round_trips(self) -> dict[str, int]:
-        """By player, the median of the member's last samples in milliseconds, for those who have samples."""
-        return {one.player: round(_median(one.samples) * 1000) for one in self._members.values() if one.samples}
+        """Return, by player, the median of the last `ping_samples` round trips in milliseconds, if there are any."""
+        members = self._members.values()
+        return {member.player: round(_median(member.samples) * 1000) for member in members if member.samples}
 
     def _until(self, now: float, *, reads: bool) -> float:
-        ends = [one.waiting.until for one in self._members.values() if one.waiting.until is not None]
+        members = self._members.values()
+        ends = [member.waiting.until for member in members if member.waiting.until is not None]
         page = self._page_until
         if (reads or self.reads) and page is not None and not self.all_gone_on(now):
             ends.append(page)
         return min(ends, default=math.inf)
 
     def _tell(self) -> None:
-        """Something has changed that members are told."""
+        """The fields about members have changed: clients are sent them again."""
         self.version += 1
 
     def _changed(self, now: float) -> None:
-        """Let the clocks of those who are missing run while another one waits."""
+        """A member's presence has changed: start and stop the countdowns of all members."""
         self._tell()
         waits = self.waits
         for member in self._members.values():
@@ -363,7 +381,7 @@ class Presence:
         return min(LEAST_ABSENCE, (self.rules.absent if self.begun else self.rules.gather) / 3)
 
     def _give_time_back(self, now: float) -> None:
-        """Members who have played since the last call get some of their time back. Call it before a change."""
+        """Give members who have played since the last call some of their used time back. Call it before a change."""
         if self._on_since is None:
             return
         played, self._on_since = now - self._on_since, now
@@ -377,11 +395,11 @@ def _where(member: _Member, page: bool, plays_on: bool) -> Where:
         return "policy" if plays_on else "away"
     if member.here:
         return "reads" if page and not member.gone_on else "here"
-    return "away" if member.met and not member.takes_part else "awaited"
+    return "away" if member.has_come and not member.takes_part else "awaited"
 
 
 def outcomes(presence: Presence, outcome: str | None) -> Mapping[str, str | None]:
-    """By player, how the trial has ended for each member; `outcome` is that of the trial."""
+    """Return, by player, how the trial has ended for each member. `outcome` is that of the trial."""
     names: dict[Over | None, str | None] = {"absent": "left", "ping": "ping", None: outcome}
     return {player: names[presence.over(player)] for player in presence.players}
 

@@ -1,7 +1,6 @@
-"""How far a trial is, and the rules of it: playing, pausing, episodes, breaks, frame rate, scores. Pure; no clock.
+"""The progress of a trial: playing, pausing, episodes, breaks, frame rate, scores. Pure; no clock.
 
-What each player does at the next step is in `trial/core/choices.py`. Choices and scores are kept by player
-(`trial/core/players.py`).
+`trial/core/choices.py` decides what each player does at the next step.
 """
 
 from __future__ import annotations
@@ -16,13 +15,14 @@ from trial.core.ended import PARTNER_LEFT, Break, Episode
 from trial.core.players import Player
 
 FAILURES_ALLOWED = 3
-"""Episodes in a row that may end in an error of the researcher's code before the trial ends as failed."""
+"""The trial ends as failed when the researcher's code has failed so often since an episode last ended by itself."""
 
 
 class PlayState(Enum):
-    """What clients are shown. BREAK: an episode is over, and the next begins when the break is over.
+    """The state of a trial, as clients see it. READY: not begun yet. PAUSED: the game is held.
 
-    ENDED: the trial is over, and its recordings are being saved; `done` follows.
+    BREAK: an episode is over, and the next begins when the break is over. ENDED: the trial is over, and recordings and
+    answers are being stored; the message `done` follows.
     """
 
     READY = "ready"
@@ -33,51 +33,53 @@ class PlayState(Enum):
 
 
 class TrialProgress:
-    """One trial's progress. The caller steps and resets the environment and reports the results.
+    """The progress of one trial. The caller steps and resets the environment, and reports the results.
 
-    After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) look at `needs_reset` and `state`.
-    Between two episodes is a break of `betweenEpisodes`, unless the game is held: the caller measures the time,
-    takes no step meanwhile, and calls `go_on`.
+    After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) the caller looks at `needs_reset` and
+    `state`. Between two episodes there is a break of `betweenEpisodes`, unless the game is held. The caller measures
+    its time, takes no step in it, and then calls `go_on`.
     """
 
     def __init__(self, config: TrialSection, players: Iterable[Player]) -> None:
-        """`players` are those of the environment, in its order; one of them at least is a human."""
+        """`players` are the environment's, in its order. A human plays at least one of them."""
         self.config = config
         self.players = {player.name: player for player in players}
         self.humans = tuple(name for name, player in self.players.items() if player.human)
         self.first = self.humans[0]
-        """The human whose action and score stand first in the records."""
+        """The first player that a human plays. Records name its action and score before those of the others."""
         self.action_space = self.players[self.first].action_space
-        """Of the first human."""
+        """The names of the first human's actions."""
         self.choices = Choices(config, self.players, self.humans)
-        """What each player does at the next step."""
+        """Decides what each player does at the next step."""
         self.controls = self.choices.controls
-        """The keys of each human."""
+        """By player, the keys and buttons of each human."""
         self.turns = self.choices.turns
-        """Turn by turn: who is to act, and the time they have; None in real time."""
+        """The present turn; None in real time."""
         self.state = PlayState.READY
         self.outcome: str | None = None
+        """How the trial has ended: finished, stopped, failed or partnerLeft; None while it goes on."""
         self.frame_rate = config.starting_frame_rate
         self.episode = 1
-        """In a break: the episode that is over."""
+        """The number of the present episode; in a break, of the one that is over."""
         self.steps = 0
-        """Steps taken in this episode."""
+        """The number of steps in this episode."""
         self.total_steps = 0
         self.episodes_played = 0
-        """Episodes in which at least one step was taken and that are over."""
+        """The number of episodes that are over and had at least one step."""
         self.scores = dict.fromkeys(self.players, 0.0)
-        """Each player's rewards of the whole trial."""
+        """By player, the sum of rewards in the trial."""
         self.episode_scores = dict.fromkeys(self.players, 0.0)
+        """By player, the sum of rewards in the episode."""
         self.needs_reset = True
-        """The environment must be reset before the next step."""
+        """Whether the environment must be reset before the next step."""
         self.frozen = config.reset_freeze > 0
-        """The episode's first picture stands, or is to: no step is taken, and keys do nothing."""
+        """Whether the episode's first picture stands still, or will (`resetFreeze`): keys do nothing meanwhile."""
         self.ended: list[Episode | Break] = []
-        """Episodes and breaks that are over, in order; for the caller to take out."""
+        """Episodes and breaks that are over and not recorded, in order. The caller removes them."""
         self._failures = 0
         self._good_episodes = 0
-        self.told: Hashable = None
-        """In a session: changes whenever members are to be told of each other again."""
+        self.session_version: Hashable = None
+        """In a session: a value that changes whenever the fields about members do (`TrialSession.session_version`)."""
 
     @property
     def several(self) -> bool:
@@ -86,16 +88,16 @@ class TrialProgress:
 
     @property
     def score(self) -> float:
-        """The first human's rewards of the whole trial."""
+        """The first human's score in the trial."""
         return self.scores[self.first]
 
     @property
     def episode_score(self) -> float:
-        """The first human's rewards of this episode."""
+        """The first human's score in this episode."""
         return self.episode_scores[self.first]
 
     def resume(self, ended: Sequence[Episode]) -> None:
-        """Begin after these episodes, which an earlier server has seen. Called before anything is played."""
+        """Go on after these episodes, which were played on an earlier server. Call it before anything is played."""
         for episode in ended:
             self.episodes_played += episode.steps > 0
             self.total_steps += episode.steps
@@ -114,7 +116,7 @@ class TrialProgress:
                 scores[player] += score
 
     def replayed(self, steps: int, scores: Mapping[str, float]) -> None:
-        """The episode has reached the step at which the earlier server left it."""
+        """The episode of an earlier server was replayed: `steps` steps, with these scores by player."""
         self.needs_reset = self.frozen = False
         self.steps = steps
         self.total_steps += steps
@@ -126,8 +128,8 @@ class TrialProgress:
         return self.state is PlayState.PLAYING
 
     @property
-    def stands(self) -> bool:
-        """Whether the episode's first picture is shown and still stands."""
+    def shows_first_picture(self) -> bool:
+        """Whether the episode's first picture is shown and stands still (`resetFreeze`)."""
         return self.frozen and self.playing and not self.needs_reset
 
     @property
@@ -139,7 +141,7 @@ class TrialProgress:
         return self.state is PlayState.BREAK
 
     def start(self) -> None:
-        """Begin, or go on. In a break: begin the next episode without waiting for it."""
+        """Begin, or go on. In a break: end it, and begin the next episode."""
         if self.on_break:
             self._end_break("start", PlayState.PLAYING)
         elif not self.over:
@@ -151,19 +153,19 @@ class TrialProgress:
             self._end_break("over", PlayState.PLAYING)
 
     def pause(self) -> None:
-        """Hold the game. In a break: the next episode waits for `start` at its first picture."""
+        """Hold the game. In a break: end it, and hold the next episode at its first picture until `start`."""
         self._hold("pause")
 
     def leave(self, player: str | None = None) -> None:
-        """The human has gone, or another page of theirs plays now: hold the game, let go of their keys.
+        """The human's connection is closed or replaced: hold the game as `pause` does, and release their keys.
 
-        Without `player`, all humans.
+        If `player` is None, the keys of all humans are released.
         """
         self._hold("left")
         self.choices.let_go(player)
 
     def hold(self) -> None:
-        """A member of the session is missing: take no step. A break goes on."""
+        """Hold the game of a session, because a member is missing. A break goes on."""
         if self.playing:
             self.state = PlayState.PAUSED
 
@@ -178,7 +180,7 @@ class TrialProgress:
             self.state = PlayState.PAUSED
 
     def reset(self) -> None:
-        """End this episode and begin the next. An episode in which nothing happened stays, and so does a break."""
+        """End this episode and begin the next. It changes nothing in a break, or before the episode's first step."""
         if not self.over and not self.on_break and self.steps > 0:
             self._good_episodes += 1
             self._end_episode("reset")
@@ -188,7 +190,7 @@ class TrialProgress:
         self._end_all("stop", "stopped")
 
     def change_frame_rate(self, wish: str | float) -> None:
-        """Go faster, slower or to a number of frames per second, within the project's limits."""
+        """Change the frame rate to `faster`, `slower` or a number of frames per second, within the project's limits."""
         config = self.config
         if wish == "faster":
             rate = float(self.frame_rate + config.frame_rate_step_size)
@@ -199,18 +201,18 @@ class TrialProgress:
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
     def act(self, name: str, held: bool | None, *, lasts: bool = False, player: str | None = None) -> None:
-        """A press (`held` is None), a key going down (True) or up (False). Raises CommandRefused for unknown names.
+        """A human presses a button (`held` is None), or a key goes down (True) or up (False). Raises CommandRefused.
 
-        With `lasts` it is an action that acts until the next one, also over pauses and episodes; one of an unknown
-        name ends the one before. Turn by turn, each press and each key that goes down is a choice; it does nothing if
-        it is not the player's turn. `player` is the first human if it is not given.
+        `name` is that of an action or a key. With `lasts`, the action acts until the next one, also over pauses and
+        episodes; an unknown name ends it. Turn by turn, each press and each key that goes down is a choice, which has
+        no effect if it is not the player's turn. `player` is the first human if None.
         """
         on = self.playing and not self.frozen
         self.choices.act(player or self.first, name, held, lasts=lasts, on=on)
 
     def next_actions(self) -> Mapping[str, Action]:
-        """Each player's action of the step that begins now."""
-        return self.choices.next_actions(self.steps)
+        """Return, by player, the actions of the step that begins now."""
+        return self.choices.next_actions()
 
     # ---- turn by turn
 
@@ -221,18 +223,18 @@ class TrialProgress:
             self._end_episode("turnSeconds")
 
     def to_act(self, player: str) -> bool:
-        """Turn by turn: whether it is this player's turn, and they have not chosen."""
+        """Turn by turn: whether the game waits for this player's choice now."""
         return self.playing and self.turns is not None and self.turns.waits_for(player)
 
     # ---- steps
 
     def began(self) -> None:
-        """The environment has been reset: the episode stands at its first picture."""
+        """The environment has been reset: the episode is at its first picture."""
         self.choices.began()
         self.needs_reset = False
 
     def thaw(self) -> None:
-        """The first picture has stood long enough: from now on keys act, also those that are held already."""
+        """The time of the first picture is over: from now on keys act, also those that are held down already."""
         self.frozen = False
         self.choices.forget_taps()
 
@@ -244,7 +246,7 @@ class TrialProgress:
     def stepped(
         self, rewards: Mapping[str, float], terminated: bool, truncated: bool, limit: str | None = None
     ) -> None:
-        """A step was taken. `limit`: the key of `trial` that ends the episode with this step, if there is one."""
+        """A step was taken. `limit`: the key of `trial` whose limit ends the episode with this step, if one does."""
         if self.over:
             return
         self.steps += 1
@@ -260,7 +262,7 @@ class TrialProgress:
             self._end_episode("terminated" if terminated else "truncated", None if own else limit)
 
     def failed(self, *, fatal: bool = False) -> None:
-        """The researcher's code raised an error. `fatal`: it will never answer."""
+        """The researcher's code raised an error: end the episode. `fatal`: end the trial, since it cannot go on."""
         if self.over:
             return
         self._failures += 1
@@ -302,7 +304,7 @@ class TrialProgress:
         self.frozen = self.config.reset_freeze > 0
 
     def _end_all(self, break_why: str, outcome: str) -> None:
-        """End the trial, and the episode or the break that is on."""
+        """End the trial, and the present episode or break."""
         if self.on_break:
             self.ended.append(Break(self.episode, break_why))
         elif not self.over:

@@ -1,4 +1,4 @@
-"""The recording that is open, and the lines that say what went wrong. Pure: it emits effects."""
+"""Opens and closes recordings, and records what went wrong. Pure: it emits effects."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from trial.core.effects import CloseRecording, Effect, LogAgentError, OpenRecord
 from trial.core.policies import FAILURES
 from trial.core.progress import TrialProgress
 
-_POLICY_FAILURES_SAID = 20
-_LONGEST_ERROR = 2000
+_MOST_POLICY_FAILURES = 20  # different ones that are reported in a trial
+_LONGEST_ERROR = 2000  # characters
 
 
 class Recordings:
@@ -21,11 +21,11 @@ class Recordings:
         self._emit = emit
         self.is_open = False
         self.is_awaited = False
-        """One is being opened."""
-        self._said: set[str] = set()  # of policies
+        """Whether the shell is opening a recording."""
+        self._reported: set[str] = set()  # failures of policies
 
     def ask(self, progress: TrialProgress, seed: int) -> None:
-        """Ask the shell to open a recording, which begins with the present episode."""
+        """Ask the shell to open a recording that begins with the present episode. `seed` is the episode's."""
         self.is_awaited = True
         players = tuple(progress.players.values()) if progress.several else ()
         self._emit(OpenRecording(progress.episode, seed, progress.frame_rate, progress.action_space, players))
@@ -44,28 +44,28 @@ class Recordings:
             self.is_open = False
             self._emit(CloseRecording())
 
-    # ---- what went wrong
+    # ---- errors
 
     def agent_failed(self, error: Exception, episode: int, step: int) -> None:
-        """The researcher's code raised this error: say so in the log and in the recording."""
+        """The researcher's code raised this error: write it to the log and to the recording."""
         self._emit(LogAgentError(error))
         self._emit(RecordLine("error", {"episode": episode, "step": step, "error": words_of(error)}))
 
     def policy_failed(self, progress: TrialProgress, player: str, words: str) -> None:
-        """A policy has failed, as `words` say: say so in the log and in the recording, once for each reason."""
+        """The player's policy has failed, as `words` say: write that to the log and the recording, each text once."""
         plays = progress.players[player].plays
-        said = [f"the policy of {player} ({plays}) failed: {words}"]
+        texts = [f"the policy of {player} ({plays}) failed: {words}"]
         if progress.choices.policies.idles(player):
-            said.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")
-        for text in said:
-            if text in self._said or len(self._said) >= _POLICY_FAILURES_SAID:
+            texts.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")
+        for text in texts:
+            if text in self._reported or len(self._reported) >= _MOST_POLICY_FAILURES:
                 continue
-            self._said.add(text)
+            self._reported.add(text)
             self._emit(WriteLog(logging.ERROR, text))
             where = {"episode": progress.episode, "step": progress.steps, "player": player}
             self._emit(RecordLine("error", {**where, "error": text}))
 
 
 def words_of(error: Exception) -> str:
-    """The type of an error and its message, shortened to what a line may hold."""
+    """Return the type and the message of an error, of at most `_LONGEST_ERROR` characters."""
     return "".join(traceback.format_exception_only(error)).strip()[:_LONGEST_ERROR]

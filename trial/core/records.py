@@ -1,4 +1,4 @@
-"""What the core writes of how far a trial is: the ends of episodes and breaks, and the answer. Pure."""
+"""Builds the lines that end episodes and breaks, and the answers. Pure."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from trial.core.progress import TrialProgress
 
 
 def end(
-    over: Episode | Break, said: Sequence[Mapping[str, Any]], outcomes: Mapping[str, str | None] | None = None
+    over: Episode | Break, received: Sequence[Mapping[str, Any]], outcomes: Mapping[str, str | None] | None = None
 ) -> RecordLine:
-    """The line that ends an episode or a break. `said`: the participant's messages since the line before.
+    """Build the line that ends an episode or a break. `received`: the clients' messages since the line before.
 
-    `outcomes`: in a session, by player, how the trial has ended with it for each member.
+    `outcomes`: if the trial of a session ends with it, how it has ended for each member, by player.
     """
     fields: dict[str, Any] = {"episode": number(over)}
     if not isinstance(over, Break):
         fields |= {"steps": over.steps, **_scores(over.score, over.scores)}
         fields |= {} if over.limit is None else {"limit": over.limit}
-    fields |= {"why": over.why, "messages": said}
+    fields |= {"why": over.why, "messages": received}
     fields |= {} if outcomes is None else {"outcomes": outcomes}
     return RecordLine("break" if isinstance(over, Break) else "end", fields)
 
 
-def shutdown(progress: TrialProgress, said: Sequence[Mapping[str, Any]]) -> RecordLine:
-    """The line that ends the present episode because the server must end. `said` as in `end`."""
+def shutdown(progress: TrialProgress, received: Sequence[Mapping[str, Any]]) -> RecordLine:
+    """Build the line that ends the present episode because the server must end. `received` as in `end`."""
     fields: dict[str, Any] = {"episode": progress.episode, "steps": progress.steps, "why": "shutdown"}
     fields |= _scores(progress.episode_score, progress.episode_scores if progress.several else {})
-    return RecordLine("end", {**fields, "messages": said})
+    return RecordLine("end", {**fields, "messages": received})
 
 
 def answers(progress: TrialProgress, seconds: float, trial_id: str) -> dict[str, Any]:
-    """The answer of the step. `seconds`: how long was played."""
+    """Build the answer of the step. `seconds`: the time that was played."""
     return {
         "episodes": progress.episodes_played,
         **_scores(progress.score, progress.scores if progress.several else {}),
@@ -49,7 +49,7 @@ def answers(progress: TrialProgress, seconds: float, trial_id: str) -> dict[str,
 def member_answers(
     progress: TrialProgress, player: str, outcome: str | None, seconds: float, trial_id: str
 ) -> dict[str, Any]:
-    """The answer of a member of a session, with their own score."""
+    """Build the answer of a member of a session, with their own score and outcome. `seconds` as in `answers`."""
     own = {"score": messages.tidy(progress.scores[player]), "player": player, "outcome": outcome}
     return answers(progress, seconds, trial_id) | own
 
@@ -57,9 +57,9 @@ def member_answers(
 def result(
     progress: TrialProgress, player: str, answers: Mapping[str, Any] | None, *, in_session: bool
 ) -> tuple[int, float, str | None]:
-    """What a client is told when the trial is over: episodes, the player's score, and in a session the outcome.
+    """Return the values of a client's last message: episodes, the player's score, and in a session the outcome.
 
-    `answers` is the answer, if it is known: of the participant, or of the member.
+    `answers` is the stored answer of the participant or member; None if there is none.
     """
     if answers is None:
         return progress.episodes_played, progress.scores[player], None
@@ -69,11 +69,11 @@ def result(
 
 
 def number(over: Episode | Break) -> int:
-    """The number of the episode that is over; of a break, that of the episode before it."""
+    """Return the number of the episode that is over; for a break, that of the episode before it."""
     return over.after if isinstance(over, Break) else over.number
 
 
 def _scores(score: float, scores: Mapping[str, float]) -> dict[str, Any]:
-    """A score for the records, and those of all players if there are several."""
+    """Return the fields of a score, and of the scores of all players if there are several."""
     several = {player: messages.tidy(value) for player, value in scores.items()}
     return {"score": messages.tidy(score), **({"scores": several} if several else {})}

@@ -1,4 +1,4 @@
-"""A step of the environment: what the agent is told to take, and what came of it. Pure."""
+"""Takes steps of the environment: builds the agent's call, and applies its result. Pure: it emits effects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trial.settings import TrialSettings
 
 
 class Stepper:
-    """Takes steps, one after the other. The caller says when, and makes the calls of the agent that are returned."""
+    """Takes steps, one after the other. Its methods return calls of the agent, which the caller makes."""
 
     def __init__(
         self,
@@ -34,27 +34,27 @@ class Stepper:
 
     def take(self, progress: TrialProgress, now: float) -> StepCall:
         """Return the call that takes the step that is due, with the messages and the feedback since the last step."""
-        said, dropped = self._message_log.messages, self._message_log.take_dropped()
+        received, dropped = self._message_log.messages, self._message_log.take_dropped()
         fields: dict[str, Any] = {
             "episode": progress.episode,
             "step": progress.steps + 1,
             "frame": self._clients.frame_id + 1,
         }
-        if said:
-            fields["messages"] = said
+        if received:
+            fields["messages"] = received
         if dropped:
             fields["messagesDropped"] = dropped
         return StepCall(
             limit=self._settings.step_seconds,
             actions=progress.next_actions(),
             feedback=self._message_log.feedback,
-            messages=len(said),
+            messages=len(received),
             fields=fields,
             truncated_by=self._timing.limit_of_step(progress, now),
         )
 
     def taken(self, call: StepCall, step: StepTaken, progress: TrialProgress, now: float) -> None:
-        """The step was taken: record it, count it, and show what came of it."""
+        """The step was taken: record it, count it, and show the new picture."""
         self._emit(WriteLine(step.line))
         self._message_log.recorded(call.messages, len(call.feedback))
         self._timing.stepped(now, progress.frame_rate)
@@ -71,13 +71,13 @@ class Stepper:
         self._timing.begin_episode()
         self.show(begun, progress, now)
 
-    def show(self, found: Begun | Replayed, progress: TrialProgress, now: float) -> None:
-        """Show the picture with which the episode begins or goes on."""
-        self._see(found.view, progress, now)
-        self._clients.show(found.pictures)
+    def show(self, result: Begun | Replayed, progress: TrialProgress, now: float) -> None:
+        """Show the picture with which the episode begins or goes on, and ask the policies."""
+        self._see(result.view, progress, now)
+        self._clients.show(result.pictures)
 
     def _see(self, view: View | None, progress: TrialProgress, now: float) -> None:
-        """The players see this, and those that are no humans are asked."""
+        """Let the players see `view`, and ask the policies that are due."""
         progress.choices.see(view, now)
         for ask in progress.choices.asks(progress.steps, now):
             self._emit(ask)

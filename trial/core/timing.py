@@ -1,4 +1,4 @@
-"""What is due now: a step, the end of a turn, a break or a first picture; and how long was played. Pure.
+"""Decides what is due: a step, a reset, or the end of a turn, a break, a first picture or an episode. Pure.
 
 All times are seconds of one monotonic clock, which is passed in.
 """
@@ -25,37 +25,38 @@ class Due(Enum):
 
 
 class StateTimes(NamedTuple):
-    """Seconds that are left: of a break, a turn, the first picture, the episode. None: it does not run, or never ends.
-
-    `session` is what the members of a session are told of each other.
-    """
+    """The times in a state for clients, in seconds from now on. None: there is no such time."""
 
     next_in: float | None = None
+    """Until the break ends; infinite if the participant ends it."""
     turn_ends_in: float | None = None
     starts_in: float | None = None
+    """Until the first picture gives way to the game."""
     time_left: float | None = None
+    """Of play in the episode."""
     session: Mapping[str, Any] | None = None
+    """In a session, the fields about its members."""
 
 
 class Pacer:
-    """When the next frame is due. Late frames are skipped, never made up for."""
+    """Says when each frame is due. Frames whose time was missed are skipped."""
 
     def __init__(self) -> None:
         self._due: float | None = None
 
     def rest(self) -> None:
-        """Forget when the last frame was due: the next one is due at once."""
+        """The game is held: the next frame is due at once when it goes on."""
         self._due = None
 
     def next(self, now: float, rate: int) -> float:
-        """The moment at which the next frame is due."""
+        """Return the time at which the next frame is due. `rate`: frames per second."""
         interval = 1.0 / rate
         if self._due is None:
             self._due = now
             return now
         self._due += interval
         missed = int((now - self._due) / interval)
-        if missed > 0:  # skip whole frames and stay on the old grid: what follows is evenly spaced again
+        if missed > 0:  # whole intervals, so that the next frames are due at the same regular times as before
             self._due += missed * interval
         return self._due
 
@@ -65,9 +66,9 @@ class Timing:
 
     def __init__(self, config: TrialSection) -> None:
         self.seconds = 0.0
-        """Seconds that were played."""
+        """The time that was played, in seconds."""
         self.wake_at: float | None = None
-        """When something is due if nothing is now; None: no time makes it so."""
+        """After `next` returned NOTHING: when to call it again; None: only another event makes something due."""
         self._between = config.between_seconds
         self._max_steps = config.max_steps
         self._episode = EpisodeTime(config.reset_freeze, config.episode_seconds)
@@ -79,12 +80,12 @@ class Timing:
     # ---- what has happened
 
     def begin_episode(self) -> None:
-        """An episode begins: its first picture stands for a while."""
+        """An episode begins, with its first picture."""
         self._episode.begin()
 
     def resume_episode(self, played: float) -> None:
-        """The episode goes on. It was played for so many seconds on an earlier server."""
-        self._episode.go_on(played)
+        """The episode goes on. It was played for `played` seconds on an earlier server."""
+        self._episode.resume(played)
 
     def skip(self) -> None:
         """The step that was due is not taken."""
@@ -98,7 +99,7 @@ class Timing:
     # ---- what is due
 
     def next(self, progress: TrialProgress, now: float) -> Due:
-        """What is due now. With NOTHING, `wake_at` says when to ask again."""
+        """Return what is due now. If that is NOTHING, `wake_at` says when to ask again."""
         self.wake_at = None
         playing = progress.playing
         if not playing:
@@ -116,7 +117,7 @@ class Timing:
             if progress.turns is not None:
                 progress.turns.hold(now)
             return Due.NOTHING
-        if self._stands(progress, now):
+        if self._frozen(progress, now):
             return Due.NOTHING
         return self._step_due(progress, now) if progress.turns is None else self._turn_over(progress, now)
 
@@ -126,9 +127,9 @@ class Timing:
         self._due = self._last_step = None
 
     def _break_left(self, progress: TrialProgress, now: float) -> float | None:
-        """Seconds until the next episode, infinite if the player begins it; None if this is no break.
+        """Return the seconds until the break ends, infinite if the participant ends it; None outside a break.
 
-        The time of a break begins when this is asked first.
+        The time of a break runs from the first call in it.
         """
         if not progress.on_break:
             self._break_began = None
@@ -144,8 +145,8 @@ class Timing:
         progress.go_on()
         return Due.MORE
 
-    def _stands(self, progress: TrialProgress, now: float) -> bool:
-        """Whether the episode's first picture still stands; if not, the episode is played from now on."""
+    def _frozen(self, progress: TrialProgress, now: float) -> bool:
+        """Return whether the first picture still stands still. If it does not, the episode is played from now on."""
         left = self._episode.starts_in(now)
         if left > 0.0:
             self._rest()
@@ -159,7 +160,7 @@ class Timing:
         return False
 
     def _step_due(self, progress: TrialProgress, now: float) -> Due:
-        """In real time: whether the step of the next frame is due."""
+        """In real time: return STEP if the next frame is due, else NOTHING."""
         if self._due is None:
             self._due = self._pacer.next(now, progress.frame_rate)
         if now < self._due:
@@ -169,7 +170,7 @@ class Timing:
         return Due.STEP
 
     def _turn_over(self, progress: TrialProgress, now: float) -> Due:
-        """Turn by turn: a step is due once all have chosen. The frame rate lets the step before be seen."""
+        """Turn by turn: return STEP once all have chosen and the last picture was shown for one frame's time."""
         turns, choices = progress.turns, progress.choices
         assert turns is not None
         turns.run(now)
@@ -193,21 +194,21 @@ class Timing:
         return Due.STEP
 
     def limit_of_step(self, progress: TrialProgress, now: float) -> str | None:
-        """The key of `trial` whose limit this step reaches, so that it is the episode's last one; None if none."""
+        """Return the key of `trial` whose limit makes the step that is due the episode's last; None if none does."""
         if self._max_steps and progress.steps + 1 >= self._max_steps:
             return "maxSteps"
         left = self._episode.left(now)
-        nearest = 0.5 / progress.frame_rate  # the step before would be farther from the limit, or the next one
-        return "episodeSeconds" if left is not None and left <= nearest else None
+        half_frame = 0.5 / progress.frame_rate  # no other step is nearer to the limit
+        return "episodeSeconds" if left is not None and left <= half_frame else None
 
     # ---- what clients are told
 
-    def told(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
-        """All seconds that are left, and what is told of the `session`."""
+    def state_times(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
+        """Return the times in a state for clients. `session`: the fields about the members of a session."""
         return StateTimes(
             next_in=self._break_left(progress, now),
             turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
-            starts_in=self._episode.starts_in(now) if progress.stands else None,
+            starts_in=self._episode.starts_in(now) if progress.shows_first_picture else None,
             time_left=None if progress.over or progress.on_break else self._episode.left(now),
             session=session,
         )

@@ -5,11 +5,12 @@
 method returns, in their order. All times are seconds of one monotonic clock.
 
 Events in:
-  already_played, start, agent_failed    what the store holds of the step, and whether the agent has started
+  already_played, start, agent_failed    an earlier server has played the step; the agent has started, or cannot
   connect, disconnect, receive           clients; each connection belongs to a human
-  round_trip, member_saved               of a member of a session: their connection, their answer
+  advise                                 a program suggests or chooses an action
+  round_trip, member_saved               a member's browser has answered a ping; a member's answer is stored
   call_returned, call_failed             the agent's thread has finished the call that it was given
-  policy_acted, policy_failed            the policy of a player that is no human has answered
+  policy_acted, policy_failed            a player's policy has answered
   recording_opened, recording_failed, answer_saved        the store
   advance                                the time `wake_at` has come
   close                                  the server must end
@@ -21,16 +22,16 @@ Phases: STARTING until the store was read and the agent has started, PLAYING, SA
 and the answer), then FINISHED (the answer is stored) or CLOSED (there is no answer: the server had to end, or the game
 could not begin).
 
-This module decides what comes next and whom each event concerns. What the parts decide:
+This module decides what comes next, and passes each event to the part that it concerns. The other modules decide:
   choices, policies, turns, controls     what each player does at the next step
   progress                               episodes, breaks, scores, and how the trial ends
-  timing, episode_time                   when a step, a turn, a break or an episode is over
-  commands                               what a client may ask for, what that does, and what a refused client is told
-  agent_call                             the one call that the agent has
-  participants, session, presence        who is here, and what follows: of one participant, or of several
+  timing, episode_time                   when a step is due; when a turn, a break or an episode is over
+  commands                               what a client may ask for, what that does, and why it is refused
+  agent_call                             which call the agent has now, one at a time
+  participants, session, presence        who is connected, and whether the game goes on, is held or ends
   beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
-  recording, records, message_log        what is recorded and answered
-  clients, messages                      what clients are told
+  recording, records, message_log        what is recorded, and what the answer holds
+  clients, messages                      what is sent to clients
 
 A player is a place of the environment (`trial/core/players.py`): a human plays it, or a policy. Each connection belongs
 to a human, and each human plays one player.
@@ -86,7 +87,7 @@ class Phase(Enum):
 
 
 class Trial:
-    """One game step as it is played on this server. See the module's docstring for events, effects and phases."""
+    """The trial of one game step on this server. See the module's docstring for events, effects and phases."""
 
     def __init__(
         self,
@@ -97,18 +98,18 @@ class Trial:
         new_seed: Callable[[], int],
         assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        """`assets` are the images of a game that is drawn by objects, as clients are told of them."""
+        """`new_seed` draws the seed of an episode. `assets` describe the images of a game that is drawn by objects."""
         self.settings = settings
         self.config = settings.trial
         self.step = step
         self.id = trial_id
         self.phase = Phase.STARTING
         self.ready = False
-        """The first frame is there, or the trial is over."""
+        """Whether the first frame is there, or the trial is over."""
         self.callbacks = False
-        """The agent has callbacks, which are told of the end of each episode and of players who come and go."""
+        """Whether the agent has callbacks. They are called when an episode ends, and when players come and go."""
         self.wake_at: float | None = None
-        """When `advance` is to be called if nothing else happens before; None: there is no need to."""
+        """When the shell must call `advance` if no other event comes before; None: it need not."""
         self.progress = TrialProgress(self.config, alone(self.config.action_space or ("noop",)))
         self._now = 0.0
         self._effects: list[Effect] = []
@@ -129,11 +130,11 @@ class Trial:
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._closing = False
-        self._met: set[str] = set()  # players whose participants have been here
+        self._have_come: set[str] = set()  # players whose participants have connected at least once
 
     @property
     def broken(self) -> bool:
-        """Whether the game could not begin: no frame came, and no answer will. Certain once it is `ready`."""
+        """Whether the game could not begin: there is no frame, and there will be no answer. Valid once `ready`."""
         return self.progress.outcome == "failed" and self._clients.pictures is None
 
     @property
@@ -143,23 +144,26 @@ class Trial:
 
     @property
     def played(self) -> bool:
-        """Whether the game is over and recorded. The store may still lack a part of it."""
+        """Whether the game is over and its last line written. Recordings or the answer may not be stored yet."""
         return self.finished or (self.progress.over and self._ending.all_written)
 
     @property
     def done(self) -> bool:
-        """Whether nothing will happen any more."""
+        """Whether the trial has reached its last phase: no event changes anything any more."""
         return self.phase in (Phase.FINISHED, Phase.CLOSED)
 
     @property
     def saving(self) -> bool:
-        """Whether the trial is over, and not everything is stored."""
+        """Whether the trial is over, and recordings or the answer are not stored yet."""
         return self.progress.over and not self.finished
 
     # ---- events: the start
 
     def already_played(self, answers: Mapping[str, Any]) -> list[Effect]:
-        """An earlier server has stored this answer of the step; in a session, those of all members, by their ids."""
+        """The answer of the step is stored: an earlier server has played it.
+
+        `answers` is that answer; in a session, the answer of each member by their id.
+        """
         self._earlier_answers = answers
         self.phase = Phase.FINISHED
         self.ready = True
@@ -184,11 +188,11 @@ class Trial:
         gone: Sequence[str] = (),
         answered: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> list[Effect]:
-        """The agent has started: these are the environment's players, and what earlier servers recorded of the step.
+        """The agent has started. `players` are the environment's; `recorded` is what earlier servers have recorded.
 
-        In a session, `places` says which player each member plays, by their id, and `vacant` are the places of humans
-        that no member has: policies are in them. In the places of `gone` nobody plays any more. `answered`: the answers
-        of this step that some members have, by their ids.
+        In a session: `places` is the player that each member plays, by the member's id. `vacant` are the places without
+        a member, in which policies play. `gone` are the places of members whose data were erased, and who never come.
+        `answered` holds the answers of this step that some members have already, by their ids.
         """
         if self.phase is not Phase.STARTING:
             return []
@@ -219,9 +223,9 @@ class Trial:
     # ---- events: clients
 
     def connect(self, human: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
-        """A human's client has connected, once the trial is `ready`. It replaces an earlier one of this human.
+        """A human's client has connected. It replaces an earlier client of this human. Call it once `ready`.
 
-        `window` knows the acknowledgements of this connection.
+        `window` counts the frames that this connection has not acknowledged.
         """
         self._now = now
         replaced = self._clients.replace(human)
@@ -235,8 +239,8 @@ class Trial:
             self._send_done(human, client)
             return self._take_effects()
         participants.come(player, now)
-        self._tell_moved("on_return" if player in self._met else "on_join", player)
-        self._met.add(player)
+        self._tell_moved("on_return" if player in self._have_come else "on_join", player)
+        self._have_come.add(player)
         self._clients.send_controls(client, self.progress, participants, now)
         client.sent = state_of(self.progress, player)
         words = participants.sentence(player) or self._failed_words
@@ -250,7 +254,7 @@ class Trial:
         return self.advance(now)
 
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
-        """A connection was closed. The game is held until its human starts it again."""
+        """A connection was closed: hold the game until its human starts it again; in a session, until they are back."""
         self._now = now
         client = self._clients.remove(connection)
         if client is None:
@@ -259,7 +263,7 @@ class Trial:
         return self.advance(now)
 
     def round_trip(self, human: str, seconds: float, now: float) -> list[Effect]:
-        """The human's browser has answered a ping after so many seconds. Only sessions are told of it."""
+        """The human's browser has answered a ping after `seconds`. Only sessions use it."""
         self._now = now
         if self.phase is not Phase.PLAYING:
             return []
@@ -267,7 +271,7 @@ class Trial:
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
-        """A client has sent a message. If its connection was replaced, that changes nothing."""
+        """A client has sent a message. It changes nothing if another connection has replaced this one."""
         self._now = now
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
@@ -276,9 +280,9 @@ class Trial:
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
-        """A program that may do so advises an action for the next step, or chooses it for a player that it plays.
+        """A program advises an action for the next step, or chooses it for a player that it plays.
 
-        `player` as in `Choices.advise`. Raises CommandRefused.
+        `action` and `player` are as in `Choices.advise`. Raises CommandRefused.
         """
         if self.phase is not Phase.PLAYING:
             raise messages.CommandRefused("no game is going on")
@@ -288,7 +292,7 @@ class Trial:
     # ---- events: the agent
 
     def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:
-        """A call of the agent has returned. If it was given up before, that changes nothing."""
+        """A call of the agent has returned `result`. It changes nothing if the trial has given the call up."""
         if not self._agent.has_ended(call):
             return []
         self._now = now
@@ -304,7 +308,7 @@ class Trial:
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
-        """A call of the agent has raised this error. AgentTimeout: it has not returned in time."""
+        """A call of the agent has raised this error; AgentTimeout if it has not returned in time."""
         hangs = isinstance(error, AgentTimeout)
         if not self._agent.has_ended(call, hangs=hangs):
             return []
@@ -333,11 +337,11 @@ class Trial:
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
         """The player's policy has chosen this action. An answer to an earlier question changes nothing."""
         self._now = now
-        wrong = self.progress.choices.policies.acted(player, ask_id, action)
-        if wrong is not None:
-            self._recording.policy_failed(self.progress, player, wrong)
-        # In real time the answer waits for the next step.
-        return self.advance(now) if wrong is not None or self.progress.turns is not None else []
+        problem = self.progress.choices.policies.acted(player, ask_id, action)
+        if problem is not None:
+            self._recording.policy_failed(self.progress, player, problem)
+        # In real time the action waits for the next step.
+        return self.advance(now) if problem is not None or self.progress.turns is not None else []
 
     def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
         """The player's policy raised this error."""
@@ -349,21 +353,21 @@ class Trial:
     # ---- events: the store
 
     def recording_opened(self, now: float) -> list[Effect]:
-        """The recording that was asked for is open."""
+        """The recording of the last `OpenRecording` is open: begin the episode."""
         self._now = now
         self._recording.opened()
         self._agent.make(self._beginning.opened(self.progress, self._participants, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
-        """The recording cannot be opened, so the game ends: nothing is played that is not recorded."""
+        """The recording cannot be opened: end the game, since every game must be recorded."""
         self._now = now
         self._recording.failed()
         self._fail(fatal=True)
         return self.advance(now)
 
     def answer_saved(self, now: float) -> list[Effect]:
-        """Everything is stored."""
+        """All recordings and answers are stored, or there was no answer to store."""
         self._now = now
         if not self.progress.over or self.broken:
             self.phase = Phase.CLOSED
@@ -376,7 +380,7 @@ class Trial:
         return [WriteLog(logging.INFO, text), *self._take_effects()]
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
-        """The member's answer is stored: they go on to the next step, whatever the others do."""
+        """A member's answer is stored: let them go on to the next step, even if the others still play."""
         self._now = now
         self._participants.saved(human)
         for each, client in self._clients.by_human():
@@ -387,7 +391,7 @@ class Trial:
     # ---- events: time
 
     def advance(self, now: float) -> list[Effect]:
-        """Do everything that is due at this time. Every other event does this, too."""
+        """Do everything that is due at this time. The other events do this, too."""
         self._now = now
         self.wake_at = None
         self._agent.give_up(now)
@@ -404,7 +408,7 @@ class Trial:
         return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
-        """The server must end: end the game where it stands. There is no answer unless the trial is over."""
+        """The server must end: stop playing, and write the last lines. There is no answer unless the trial is over."""
         self._closing = self._commands.closed = self._ending.closing = True
         if self._agent.call is not None:
             self._agent.give_up_at = now + LAST_CALL_SECONDS
@@ -415,7 +419,7 @@ class Trial:
     # ---- what comes next
 
     def _go_on(self) -> bool:
-        """Do what is next; return whether more can be done at this time."""
+        """Do the next thing that is due; return whether something else may be due at this time."""
         if self.phase is Phase.PLAYING:
             return self._play()
         if self.phase is Phase.SAVING and not self._ending.all_written:
@@ -457,7 +461,7 @@ class Trial:
         self._beginning.repeat_feedback(unfinished, self._ns())
 
     def _paused_by_stalled(self) -> bool:
-        """Pause if a page has stopped answering; return whether one has."""
+        """Hold the game if a page has stopped answering; return whether one has."""
         stalled = [
             each for each in self._clients.stalled(self._now) if self._participants.stalls(each.player, self._now)
         ]
@@ -467,7 +471,7 @@ class Trial:
         return bool(stalled)
 
     def _write_end(self) -> bool:
-        """Record the end of an episode or a break. The agent hears the last feedback of it before."""
+        """Record the end of an episode or a break, after a last call that gives the agent the feedback before it."""
         call = self._ending.last_feedback(self.progress)
         if (call.feedback or self.callbacks) and not self._agent.hangs:
             self._agent.make(call)
@@ -501,14 +505,14 @@ class Trial:
             self._emit(TellMoved(callback, player))
 
     def _note(self, event: str, client: Client) -> None:
-        """Keep for the recording an event that no message reports."""
+        """Add an event that is no message to the messages that are recorded."""
         self._messages.note(event, self._ns(), self._participants.name_of(client.player))
 
     def _ns(self) -> int:
         return int(self._now * 1e9)
 
     def _send_done(self, human: str, client: Client) -> None:
-        """Tell a client that the trial is over, as the answer says: an earlier server's, or this one's."""
+        """Tell a client that the trial is over, with the values of the answer that this or an earlier server stored."""
         answers = self._earlier_answers
         if answers is None:
             answers = self._participants.answer_of(human)

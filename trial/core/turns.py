@@ -1,6 +1,6 @@
-"""Turn by turn: who is to act, what they chose, and the time they have. Pure; the clock is passed in.
+"""The turns of a game: which players are to act, what they have chosen, and their time. Pure; the clock is passed in.
 
-The game waits until all who are to act have chosen. A choice is final: it cannot be taken back.
+The game waits until all players who are to act have chosen. A choice is final: it cannot be taken back.
 """
 
 from __future__ import annotations
@@ -9,14 +9,16 @@ from trial.core.actions import Action
 
 
 class Turns:
-    """The turns of a game, one after the other. `seconds`: the time of the humans for each; 0: no limit."""
+    """The present turn of a game. `seconds`: the time that humans have for each turn; 0 for no limit."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self._left = seconds
-        self._since: float | None = None  # the clock runs since then
+        self._since: float | None = None  # since when the time runs; None: it does not run
         self.to_act: frozenset[str] = frozenset()
+        """The players who are to act in this turn."""
         self.chosen: dict[str, Action] = {}
+        """By player, the choices of this turn."""
 
     def begin(self, to_act: frozenset[str]) -> None:
         """A turn begins. Its time does not run before `run`."""
@@ -25,7 +27,7 @@ class Turns:
         self._left, self._since = self._seconds, None
 
     def waits_for(self, player: str) -> bool:
-        """Whether it is the player's turn, and they have not chosen."""
+        """Whether the player is to act in this turn and has not chosen."""
         return player in self.to_act and player not in self.chosen
 
     @property
@@ -34,7 +36,7 @@ class Turns:
         return len(self.chosen) < len(self.to_act)
 
     def choose(self, player: str, action: Action) -> None:
-        """The player chooses. A choice that they made before in this turn stays."""
+        """The player chooses an action. It changes nothing if they have chosen in this turn, or are not to act."""
         if self.waits_for(player):
             self.chosen[player] = action
 
@@ -48,9 +50,9 @@ class Turns:
         self._left, self._since = self.left(now), None
 
     def left(self, now: float) -> float:
-        """Seconds that are left in this turn. Without a limit the number means nothing."""
+        """Return the seconds that are left in this turn, negative once it is over. Meaningless without a limit."""
         return self._left if self._since is None else self._left - (now - self._since)
 
     def ends_in(self, now: float) -> float | None:
-        """Seconds that are left in this turn, from 0; None if there is no limit."""
+        """Return the seconds that are left in this turn, at least 0; None if there is no limit."""
         return max(0.0, self.left(now)) if self._seconds else None

@@ -1,4 +1,4 @@
-"""What earlier servers of the participant recorded of a step (`trial/recordings/resume.py` reads it). Pure records."""
+"""What earlier servers have recorded of a game step. `trial/recordings/resume.py` reads it. Pure records."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trial.core.policies import FAILURES
 
 @dataclass(frozen=True, slots=True)
 class RecordedAction:
-    """One player's part of a step. `action` is None if it was not their turn; `observed` and `by` as in `Action`."""
+    """One player's action in a step. `action` is None if it was not their turn; `observed` and `by` as in `Action`."""
 
     action: int | None
     reward: float
@@ -22,9 +22,10 @@ class RecordedAction:
 
 @dataclass(frozen=True, slots=True)
 class RecordedStep:
-    """One step: the human's choice (None: no key acted), its results, and the agent's feedback before it.
+    """One step: the human's action (None: no key acted), the action taken, the reward, and the feedback before it.
 
-    `advice` is what a program advised, if that was taken; `players` are all players, if there are several.
+    `advice` is the action that the agent was asked to take if no key acted; None: the idle action. `players` are the
+    actions of all players, if there are several.
     """
 
     human: int | None
@@ -37,34 +38,35 @@ class RecordedStep:
 
 @dataclass(slots=True)
 class UnfinishedEpisode:
-    """An interrupted episode. `seed` is None if the environment takes none: then it cannot be replayed."""
+    """An interrupted episode. If the environment takes no seed, `seed` is None, and the episode cannot be replayed."""
 
     number: int
     seed: int | None
     steps: list[RecordedStep] = field(default_factory=list)
     unheard: list[Word] = field(default_factory=list)
-    """Feedback after the last step, which the agent did not hear before the server ended."""
+    """Feedback after the last step. The earlier server's agent did not hear it."""
 
     @property
     def score(self) -> float:
+        """The sum of the rewards so far, of the first human."""
         return sum(step.reward for step in self.steps)
 
     @property
     def scores(self) -> dict[str, float]:
-        """The scores of all players, if there are several."""
-        found: dict[str, float] = {}
+        """By player, the sum of the rewards so far, if there are several players; else empty."""
+        scores: dict[str, float] = {}
         for step in self.steps:
             for player, part in step.players.items():
-                found[player] = found.get(player, 0.0) + part.reward
-        return found
+                scores[player] = scores.get(player, 0.0) + part.reward
+        return scores
 
     @property
-    def going_on(self) -> dict[str, int]:
-        """By player, its last action, if a policy chose that in the last step or in an earlier one."""
+    def last_actions(self) -> dict[str, int]:
+        """By player, its action in the last step, if that was its policy's last choice."""
         chosen: dict[str, int | None] = {}
         for step in self.steps:
-            looked = {player: part for player, part in step.players.items() if part.observed is not None}
-            chosen |= {player: None if part.by == "none" else part.action for player, part in looked.items()}
+            asked = {player: part for player, part in step.players.items() if part.observed is not None}
+            chosen |= {player: None if part.by == "none" else part.action for player, part in asked.items()}
         last = self.steps[-1].players if self.steps else {}
         return {
             player: part.action
@@ -74,38 +76,39 @@ class UnfinishedEpisode:
 
     @property
     def failures(self) -> dict[str, int]:
-        """By player, how often its policy failed in a row at the end.
+        """By player, how often its policy has failed in a row, up to the last step.
 
-        What it looked at stands in a step that a policy failed for. An action that had become illegal when it came
-        looks alike; but after that the policy is asked again, and one that idles is not.
+        A step for which a policy failed has `observed`, and `by` is none or late. So has a step whose action had become
+        illegal when the policy answered. But after that the policy is asked again, and a policy with `FAILURES`
+        failures is not: so only a step without a question shows that a policy has reached that number.
         """
-        found: dict[str, int] = {}
+        failures: dict[str, int] = {}
         idle: set[str] = set()
         for step in self.steps:
             for player, part in step.players.items():
                 failed = part.observed is not None and part.by in ("none", "late")
                 if failed:
-                    found[player] = found.get(player, 0) + 1
-                elif part.by == "none" and found.get(player, 0) >= FAILURES:
+                    failures[player] = failures.get(player, 0) + 1
+                elif part.by == "none" and failures.get(player, 0) >= FAILURES:
                     idle.add(player)
                 elif part.observed is not None or part.by == "human":
-                    found.pop(player, None)
+                    failures.pop(player, None)
                 if part.observed is not None or part.by == "human":
                     idle.discard(player)
-        return {player: count if player in idle else min(count, FAILURES - 1) for player, count in found.items()}
+        return {player: count if player in idle else min(count, FAILURES - 1) for player, count in failures.items()}
 
 
 @dataclass(slots=True)
 class RecordedTrial:
-    """What was recorded: the episodes that are over, an interrupted one if there is one, and the seconds of all."""
+    """The records of a game step: the episodes that are over, the interrupted one if any, and the seconds of play."""
 
     ended: list[Episode] = field(default_factory=list)
     unfinished: UnfinishedEpisode | None = None
     seconds: float = 0.0
     outcomes: dict[str, str] = field(default_factory=dict)
-    """In a session, by player: how the trial has ended for each member, as far as it has."""
+    """In a session, by player: how the trial has ended for the members for whom it is over."""
 
     @property
     def begun(self) -> bool:
-        """Whether anything was played. A server begins an episode before its participants come."""
+        """Whether a step was taken or an episode ended. A server begins an episode before its participants come."""
         return bool(self.ended) or (self.unfinished is not None and bool(self.unfinished.steps))

@@ -36,7 +36,7 @@ CHANGES: dict[str, Callable[[Presence, float], object]] = {
     "one pauses": pauses,
     "they count down again": counts_down_again,
     "they play": lambda presence, now: presence.may_play(now + 3, on=False),
-    "a break begins": lambda presence, _: presence.page(),
+    "a break begins": lambda presence, _: presence.begin_break(),
     "goes": lambda presence, now: presence.go("left", now),
     "is waited for no longer": lambda presence, now: presence.look(now + 30),
 }
