@@ -29,7 +29,7 @@ from protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
 from protocol.trial import TrialSection
 from trial.agent import match
 from trial.agent.agent import AgentAdapter, AgentError
-from trial.agent.callbacks import About, Callbacks
+from trial.agent.callbacks import Callbacks, TrialFacts
 from trial.agent.joint import JointAdapter
 from trial.agent.starting import start
 from trial.core.players import PLAYER, Player, who_plays
@@ -230,7 +230,7 @@ def _callbacks(
     humans = tuple(each.name for each in players if each.human)
     return Callbacks(
         player.callbacks,
-        About("check", "check", None, tuple(each.name for each in players), humans),
+        TrialFacts("check", "check", None, tuple(each.name for each in players), humans),
         lambda: player.env,
         seconds=seconds,
         stamp=dict,

@@ -1,4 +1,4 @@
-"""The researcher's `Agent`: finding it, calling it, and the one used when a project brings none."""
+"""Loads the researcher's `Agent`, or else the default one, calls its methods and reads what they return."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from trial.pictures.picture import Picture
 from trial.pictures.reader import PictureReader
 
 _METHODS = ("start", "step", "render", "reset", "close")
-_USUAL = frozenset({"observation", "reward", "done", "info"})  # the dict of HIPPO's sample agent
-_KNOWN = _USUAL | {"terminated", "truncated", "action"}
+_HIPPO_KEYS = frozenset({"observation", "reward", "done", "info"})  # what step() of HIPPO's sample agent returns
+_KNOWN_KEYS = _HIPPO_KEYS | {"terminated", "truncated", "action"}
 _OLD_GYM = Path(__file__).with_name("old_gym")
 _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
-_OF_ENV = ("step", "render", "reset", "close")
-"""What the environment does itself if a class Agent has no such method."""
+_ENV_METHODS = ("step", "render", "reset", "close")
+"""If a class Agent lacks one of these methods, the environment's own method is called."""
 
 
 class AgentError(Exception):
-    """The researcher's code breaks its contract. The message is for the researcher."""
+    """The researcher's code does not do what docs/agent.md asks of it. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """The results of one step of the environment. `action` is the index that the agent reports, if any."""
+    """The results of one step. `action` is the index of the action that the agent reports, if any."""
 
     observation: Any
     reward: float
@@ -47,22 +47,23 @@ class StepResult:
     info: Mapping[str, Any] = field(default_factory=dict)
     action: int | None = None
     extra: Mapping[str, Any] | None = None
-    """What else is in the dict that an agent of HIPPO's kind returns."""
+    """Further entries of the dict that `step` returned; None if there are none."""
 
 
 class Agent:
-    """The agent used when there is no agent.py: the environment alone, moved by the human's actions."""
+    """The agent of a project without an agent.py. Its environment takes the human's actions."""
 
     def __init__(self) -> None:
         self.env: Any = None
 
     def start(self, game: str) -> Any:
-        """Make the environment named `game`.
+        """Make and return the environment `game`.
 
-        That is any Gymnasium id (Atari names, old ones too, load ale_py), or a module such as
-        `pettingzoo.butterfly.cooperative_pong_v6`, which has `parallel_env` or `env`.
+        `game` is an id of Gymnasium (ale_py is imported for ids of Atari games, old ones too), or the name of a module
+        that has `parallel_env` or `env`, such as `pettingzoo.butterfly.cooperative_pong_v6`. Raises AgentError if the
+        module does not exist or makes no environment, and Gymnasium's error if there is no such id.
         """
-        import gymnasium  # noqa: PLC0415 - an agent of the researcher's may do without
+        import gymnasium  # noqa: PLC0415 - a researcher's own agent may need no Gymnasium
 
         if environments.is_module(game) and game not in gymnasium.registry:
             try:
@@ -78,15 +79,15 @@ class Agent:
         return self.env
 
     def step(self, action: int) -> Any:
-        """Take the human's action. Returns observation, reward, terminated, truncated, info."""
+        """Take the human's action. Return observation, reward, terminated, truncated and info."""
         return self.env.step(action)
 
     def render(self) -> Any:
-        """The present picture: height x width x 3 bytes."""
+        """Return the present picture: height x width x 3 bytes."""
         return self.env.render()
 
     def reset(self, seed: int | None = None) -> Any:
-        """Begin an episode."""
+        """Begin an episode. Return its first observation and info."""
         return self.env.reset(seed=seed)
 
     def close(self) -> None:
@@ -94,14 +95,16 @@ class Agent:
 
 
 def load(folder: Path) -> Any:
-    """A new `Agent` of the folder's agent.py, or the default one if there is no such file.
+    """Return the agent of a project folder.
 
-    Raises AgentError if the file has no fit class, and whatever the file itself raises.
+    That is an object of the class `Agent` in the folder's agent.py; or the module agent.py itself, if it has no such
+    class but the five functions; or the default agent, if there is no agent.py. Raises AgentError if methods or
+    functions are missing, and whatever the file itself raises.
     """
     path = folder / "agent.py"
     if not path.is_file():
         return Agent()
-    # agent.py can import the files beside it, and `gym`; neither hides the modules of installed packages.
+    # agent.py can import the files beside it, and `gym`. They come last, so that they hide no installed package.
     sys.path.extend(str(place) for place in (folder, _OLD_GYM) if str(place) not in sys.path)
     spec = importlib.util.spec_from_file_location("agent", path)
     if spec is None or spec.loader is None:
@@ -109,17 +112,17 @@ def load(folder: Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     sys.modules["agent"] = module
     spec.loader.exec_module(module)
-    made = getattr(module, "Agent", None)
-    if isinstance(made, type):
-        missing = _missing(made)
-        misspelt = {name: near for name in missing for near in _nearly(name, made)}
+    agent_class = getattr(module, "Agent", None)
+    if isinstance(agent_class, type):
+        missing = _missing(agent_class)
+        misspelt = {name: near for name in missing for near in _similar_methods(name, agent_class)}
         if misspelt or "start" in missing:
             hint = "".join(f"; is {near} meant to be {name}?" for name, near in misspelt.items())
             raise AgentError(f"Agent in {path.name} has no {', '.join(misspelt or missing)}{hint}")
-        return made()
+        return agent_class()
     missing = _missing(module)
     if len(missing) == len(_METHODS):
-        raise AgentError(f"{path.name} has no class Agent{_meant(module)}")
+        raise AgentError(f"{path.name} has no class Agent{_question_about_class(module)}")
     if missing:
         raise AgentError(f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}")
     return module
@@ -129,23 +132,25 @@ def _missing(methods: Any) -> list[str]:
     return [name for name in _METHODS if not callable(getattr(methods, name, None))]
 
 
-def _meant(module: Any) -> str:
-    """A question about the class of the file whose name is nearly `Agent`; empty if there is none."""
+def _question_about_class(module: Any) -> str:
+    """A question about a class of the module whose name is similar to `Agent`; empty if there is none."""
     near = nearest("Agent", (name for name, found in vars(module).items() if isinstance(found, type)))
     return f"; is {near} meant to be Agent?" if near else ""
 
 
-def _nearly(name: str, made: type) -> list[str]:
-    """A method of the class whose name differs in a letter."""
-    # The agent is refused for it, so it must be more alike than what a message asks about (`protocol/similar.py`).
-    others = [other for other in dir(made) if not other.startswith("_") and callable(getattr(made, other, None))]
+def _similar_methods(name: str, agent_class: type) -> list[str]:
+    """The method of the class whose name is most similar to `name`, as a list; empty if none is similar."""
+    # `load` refuses the agent because of it, so the names must be more similar than in the questions of
+    # `protocol/similar.py`.
+    members = {other: getattr(agent_class, other, None) for other in dir(agent_class) if not other.startswith("_")}
+    others = [other for other, member in members.items() if callable(member)]
     return difflib.get_close_matches(name, set(others) - set(_METHODS), n=1, cutoff=0.88)
 
 
 class AgentAdapter:
-    """Calls an agent and checks what it returns. All methods run on the agent's thread (`trial/agent/worker.py`).
+    """Calls an agent (see `load`) and checks what it returns.
 
-    An agent is an object, or a module with functions of the same names.
+    All methods run on the agent's thread (`trial/agent/worker.py`).
     """
 
     def __init__(
@@ -155,21 +160,26 @@ class AgentAdapter:
         action_space: tuple[str, ...] | None,
         reader: PictureReader | None = None,
     ) -> None:
-        """`reader` reads what `render` returns; by default pixels alone."""
+        """`action_space` has the names of the actions in config.yml, if they are there.
+
+        `reader` reads what `render` returns; the default reader takes pixels alone.
+        """
         self._folder = folder
         self._game = game
-        self._configured = action_space
+        self.configured_actions: tuple[str, ...] = action_space or ()
+        """The names of the actions in config.yml; empty if it has none."""
         self.reader = reader or PictureReader()
         self._agent: Any = None
         self._returned: Any = None  # by start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
         self._unusual_step: Callable[[Any], Any] | None = None
         self._unusual_render = False  # `render` takes something, or is the environment's
-        self._of_env: dict[str, Callable[..., Any]] = {}  # methods that the agent leaves to the environment
-        self._feedback: tuple[Callable[..., Any], bool] | None = None
-        self._word = signatures.NO_WORD  # the newest since the last step
-        self._env_says_action = False
-        self.action_space: tuple[str, ...] = action_space or ()
+        self._env_methods: dict[str, Callable[..., Any]] = {}  # the environment's, for those that the agent lacks
+        self._feedback: tuple[Callable[..., Any], bool] | None = None  # the agent's method; whether it takes the player
+        self._word = signatures.NO_WORD  # the newest word of feedback since the last step
+        self._env_reports_action = False
+        self.action_space: tuple[str, ...] = self.configured_actions
+        """The names of the actions, by their numbers; without names in config.yml, empty until `name_actions`."""
 
     @property
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:
@@ -178,7 +188,7 @@ class AgentAdapter:
 
     @property
     def env(self) -> Any:
-        """The environment, as far as it is known: what `start` returned, or the agent's attribute `env`."""
+        """What `start` returned, or the agent's attribute `env`; None if there is neither."""
         return self._returned if self._returned is not None else getattr(self._agent, "env", None)
 
     @property
@@ -188,54 +198,58 @@ class AgentAdapter:
 
     @property
     def agent_module(self) -> Any:
-        """The module that agent.py has become; None without one."""
+        """The imported agent.py; None if the project has none, or before it is imported."""
         return sys.modules.get("agent") if (self._folder / "agent.py").is_file() else None
 
-    @property
-    def configured(self) -> tuple[str, ...]:
-        """The names of the actions in config.yml."""
-        return self._configured or ()
-
     def start(self) -> None:
-        """Load the agent and start its game; `action_space` is known afterwards."""
+        """Load the agent, call its `start` and set `action_space`. Raises as `begin` and `name_actions` do."""
         self.begin()
         self.name_actions()
 
     def begin(self) -> None:
-        """Load the agent and start its game. Who plays it, and with which actions, is seen afterwards."""
+        """Load the agent and call its `start`.
+
+        Raises AgentError if the agent lacks a method or a method cannot be called, and whatever its own code raises.
+        """
         agent = load(self._folder)
-        self._signatures |= _signatures(agent, ("start",))
+        self._signatures |= _signatures(agent, ("start",), {})
         config = hippo_config(os.environ)
         returned = self._signatures["start"].call(agent.start, {signatures.GAME: self._game, signatures.CONFIG: config})
         missing = _missing(agent)
         if missing:
             returned = environments.playable(returned)
-        self._of_env = _forwarded(missing, returned)
+        self._env_methods = _env_methods(missing, returned)
         self._returned, self._agent = returned, agent
-        self._signatures |= _signatures(agent, _OF_ENV, self._of_env)
+        self._signatures |= _signatures(agent, _ENV_METHODS, self._env_methods)
         if self._signatures["step"] != signatures.usual("step"):
             self._unusual_step = lambda action: self._call("step", action=action)
-        elif "step" in self._of_env:
-            self._unusual_step = self._of_env["step"]
-        if self._signatures["render"] != signatures.usual("render") or "render" in self._of_env:
+        elif "step" in self._env_methods:
+            self._unusual_step = self._env_methods["step"]
+        if self._signatures["render"] != signatures.usual("render") or "render" in self._env_methods:
             self._unusual_render = True
 
     def name_actions(self) -> None:
-        """Find out what the actions of the environment's one player are called. Raises AgentError if that fails."""
-        self.action_space = self._configured or _action_names(self.env)
+        """Set `action_space` for an environment with one player: the names in config.yml, or the environment's.
+
+        Raises AgentError if there are none in config.yml, and the environment does not say how many actions it has.
+        """
+        self.action_space = self.configured_actions or _action_names(self.env)
 
     @property
     def steps_itself(self) -> bool:
-        """Whether the researcher's code takes the actions, and not the environment."""
-        return not isinstance(self._agent, Agent) and "step" not in self._of_env
+        """Whether the researcher has written `step`. Otherwise the environment's `step` gets the actions."""
+        return not isinstance(self._agent, Agent) and "step" not in self._env_methods
 
     @property
     def renders_by_player(self) -> bool:
-        """Whether `render` takes a player and draws the view of that one."""
+        """Whether `render` takes a player, and draws that player's view."""
         return signatures.PLAYER in self._signatures["render"].order
 
     def _call(self, method: str, *, action: Any = None, seed: int | None = None, player: Any = PLAYER) -> Any:
-        """Call a method with what it takes. Raises AgentError if it takes the environment, and that is not known."""
+        """Call a method with the arguments of its signature.
+
+        Raises AgentError if the method takes the environment, and `env` is None.
+        """
         env = self.env
         if env is None and self._signatures[method].needs_env:
             raise AgentError(f"{method}() takes the environment; return it from start(game), or keep it in self.env")
@@ -250,26 +264,30 @@ class AgentAdapter:
         }
         if method == "step":
             self._word = signatures.NO_WORD
-        function = self._of_env.get(method) or getattr(self._agent, method)
+        function = self._env_methods.get(method) or getattr(self._agent, method)
         return self._signatures[method].call(function, given)
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
-        """Begin an episode: its first observation and info, if the agent returns them, and whether it took the seed."""
+        """Begin an episode. Return its first observation, its info, and whether `reset` took the seed.
+
+        The info is empty if `reset` returns an observation alone.
+        """
         seeded = signatures.SEED in self._signatures["reset"].named
         self.reader.begin_episode()
         result = self._call("reset", seed=seed)
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Mapping):
-            # No action was chosen yet, so this is an environment that reports actions of its own.
-            self._env_says_action = "action" in result[1]
+            # No action was chosen yet, so it is the environment that reports an action, and not the agent.
+            self._env_reports_action = "action" in result[1]
             return result[0], result[1], seeded
         return result, {}, seeded
 
     def step(self, action: int) -> StepResult:
-        """Take the human's action, or what the agent makes of it.
+        """Call `step` with the human's action, and read the result. Raises AgentError if it cannot be read.
 
-        An `action` in the info means that the agent chose it, even if it is the human's. Without an agent.py, and if
-        the environment has an `action` in the info of `reset` too, it counts only if it differs from the human's. An
-        `action` beside the info, in a dict, always counts.
+        `action` of the result is set if the agent chose the action. The agent says so by an `action` in the dict that
+        `step` returns, or in the info, even if it is the human's action. If the info of `reset` has an `action` too,
+        the environment reports it: then the `action` in the info counts only if it differs from the human's. Without
+        an agent.py it never counts.
         """
         if self.reader.due:  # steps of an earlier server are taken again without pictures
             self.render()
@@ -277,33 +295,34 @@ class AgentAdapter:
         outcome = read_step_result(result)
         if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
             return outcome
-        if isinstance(self._agent, Agent) or (self._env_says_action and outcome.action == action):
+        if isinstance(self._agent, Agent) or (self._env_reports_action and outcome.action == action):
             return replace(outcome, action=None)
         return outcome
 
     def step_with(self, actions: Mapping[Any, Any]) -> Any:
-        """What `step` returns for the actions of several players, which are given as they are."""
+        """Call `step` with the actions of several players, by the environment's keys. Return its result as it is."""
         return self._agent.step(actions) if self._unusual_step is None else self._unusual_step(actions)
 
     def draw(self, player: Any = PLAYER) -> Any:
-        """What `render` returns, for this player if it takes one."""
+        """Call `render`, for this player if it takes one. Return its result as it is."""
         return self._call("render", player=player) if self._unusual_render else self._agent.render()
 
     def render(self) -> Picture:
-        """The present picture. Raises FrameError or SceneError if it is none."""
+        """Call `render` and read the picture. Raises FrameError or SceneError if `render` returned no picture."""
         return self.reader.read(self.draw())
 
     def feedback(self, word: str, player: Any = PLAYER) -> None:
-        """Hand good, bad, trainOnline, trainOffline or a word of the project's own to an agent that listens.
+        """Call `feedback(word)`, or `feedback(word, player)`, if the agent has this method.
 
-        A method `feedback(word, player)` hears whose participant said it too.
+        `word` is good, bad, trainOnline, trainOffline or a control of the project's own; the participant of `player`
+        has sent it. `step` gets the newest word too, if it takes one.
         """
         self._word = word
-        listen = getattr(self._agent, "feedback", None)
-        if callable(listen):
-            if self._feedback is None or self._feedback[0] != listen:
-                self._feedback = listen, signatures.names(listen, "player")
-            listen(word, player=player) if self._feedback[1] else listen(word)
+        method = getattr(self._agent, "feedback", None)
+        if callable(method):
+            if self._feedback is None or self._feedback[0] != method:
+                self._feedback = method, signatures.names(method, "player")
+            method(word, player=player) if self._feedback[1] else method(word)
 
     def close(self) -> None:
         if self._agent is not None:
@@ -311,18 +330,17 @@ class AgentAdapter:
 
 
 def _signatures(
-    agent: Any, methods: Sequence[str], of_env: Mapping[str, Callable[..., Any]] | None = None
+    agent: Any, methods: Sequence[str], env_methods: Mapping[str, Callable[..., Any]]
 ) -> dict[str, Signature]:
-    """How these methods are called. Raises AgentError if one cannot be."""
-    others = of_env or {}
+    """The signatures of these methods. Raises AgentError if one of them cannot be called."""
     try:
-        return {name: signatures.read(name, others.get(name) or getattr(agent, name)) for name in methods}
+        return {name: signatures.read(name, env_methods.get(name) or getattr(agent, name)) for name in methods}
     except UnfitSignature as error:
         raise AgentError(str(error)) from None
 
 
-def _forwarded(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
-    """The methods of what `start` returned that stand for those that the class lacks. Raises AgentError."""
+def _env_methods(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
+    """The methods of what `start` returned that replace the missing ones. Raises AgentError if it lacks one too."""
     lacking = [name for name in missing if not callable(getattr(returned, name, None))]
     if lacking:
         why = "" if returned is None else f", and neither has what start() returned ({type(returned).__name__})"
@@ -331,9 +349,10 @@ def _forwarded(missing: Sequence[str], returned: Any) -> dict[str, Callable[...,
 
 
 def read_step_result(result: Any) -> StepResult:
-    """Read what `step` returned: a five-tuple, an old four-tuple, HIPPO's dict, or whether the episode is done.
+    """Read what `step` returned.
 
-    Raises AgentError for all else.
+    That is Gymnasium's five values, Gym's old four, HIPPO's dict, or only whether the episode is done, as a bool.
+    Raises AgentError for anything else.
     """
     if isinstance(result, Mapping):
         return _read_dict(result)
@@ -356,18 +375,18 @@ def _read_dict(result: Mapping[str, Any]) -> StepResult:
     if "truncated" in result:
         truncated = bool(result["truncated"])
     outcome = _outcome(result.get("observation"), result.get("reward", 0.0), terminated, truncated, info, action=action)
-    if result.keys() <= _USUAL:
+    if result.keys() <= _HIPPO_KEYS:
         return outcome
-    extra = {key: value for key, value in result.items() if key not in _KNOWN}
+    extra = {key: value for key, value in result.items() if key not in _KNOWN_KEYS}
     if "done" in result and "terminated" in result:
         extra["done"] = result["done"]
-    if action is not None and outcome.action is None:  # no index: it is kept as it is
+    if action is not None and outcome.action is None:  # it is no index: record it as it is
         extra["action"] = action
     return replace(outcome, extra=extra) if extra else outcome
 
 
 def _done(done: Any, info: Any) -> tuple[bool, bool]:
-    """Gym's old `done` as terminated and truncated: Gym's time limit said so in the info."""
+    """Gym's old `done` as terminated and truncated. Gym's TimeLimit noted in the info that it had truncated."""
     over = bool(done)
     truncated = over and isinstance(info, Mapping) and info.get("TimeLimit.truncated") in (True, np.True_)
     return over and not truncated, truncated

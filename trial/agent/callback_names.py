@@ -1,4 +1,4 @@
-"""The names of callbacks, the methods of the researcher's agent that are told what happens (`callbacks.py`)."""
+"""The names of the callbacks, which are methods of the researcher's agent (`callbacks.py`)."""
 
 from __future__ import annotations
 

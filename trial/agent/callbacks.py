@@ -1,8 +1,8 @@
-"""Callbacks: methods of the researcher's agent that are told what happens in a session, and may record values.
+"""Calls callbacks: methods of the researcher's agent for the events of a session, which may record values.
 
-They run on a thread of their own, one after another. The agent's thread waits for each at most `callbackSeconds`, so
-that a quick callback sees the environment at rest. A callback that takes longer goes on by itself. The game goes on
-too, and callbacks are skipped until it has returned. What they raise never ends the game.
+They run on a thread of their own, one after another. The agent's thread waits at most `callbackSeconds` for each, so
+that a quick callback reads the environment between two steps. If a callback takes longer, the game goes on meanwhile,
+and further callbacks are skipped until it has returned. An exception of a callback never ends the game.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from trial.recordings.recorded_values import text_of
 log = logging.getLogger("trial")
 
 MOST_VALUES = 1_000
-"""Values that one call of a callback may record."""
+"""The most values that one call of a callback may record."""
 LONGEST_NAME = 200
-"""Characters of the name of a recorded value."""
-_ERROR = 2_000  # characters of an error in the recording
-_WAITING = 100_000  # finished lines that wait to be written
+"""The most characters of the name of a recorded value."""
+_LONGEST_ERROR = 2_000  # characters of an error in the recording
+_MOST_WAITING = 100_000  # finished lines that wait to be written
 
 Record = Callable[[str, Any], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """How the session stands when a callback is called. Mappings are by player.
+    """The state of the session when a callback is called. Mappings are by player.
 
-    `env` is the environment itself: it is at rest for `callbackSeconds`, and then the game goes on with it.
+    `env` is the environment itself. No step is taken for `callbackSeconds`; after that the game goes on.
     """
 
     trial: str
@@ -53,10 +53,10 @@ class Session:
     group: int | None
     players: tuple[str, ...]
     humans: tuple[str, ...]
-    """Those of the players whom participants play."""
+    """The players whom participants play."""
     episode: int
     ticks: int
-    """Steps that were taken in the episode."""
+    """The number of steps taken in the episode."""
     actions: Mapping[str, Any]
     """Of the last step, by number; empty before the first."""
     rewards: Mapping[str, float]
@@ -67,15 +67,15 @@ class Session:
     why: str | None
     """Why the episode ended: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
     replaying: bool
-    """An earlier server's steps are taken again. What is recorded now stands in its recording already."""
+    """Whether steps of an earlier server are taken again. Values are not recorded now: its recording has them."""
     env: Any
     record: Record
-    """`record(name, value)`: the value stands in the recording, under this name."""
+    """`record(name, value)` writes the value into the recording, under this name."""
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """What stays the same in a trial."""
+class TrialFacts:
+    """The facts about a trial that stay the same."""
 
     trial: str
     step: str
@@ -86,7 +86,7 @@ class About:
 
 @dataclass(slots=True)
 class _Standing:
-    """What callbacks are told, as it changes."""
+    """The state of the episode for callbacks, as it changes."""
 
     episode: int = 1
     ticks: int = 0
@@ -105,17 +105,17 @@ def listening(agent: Any) -> dict[str, Callable[..., Any]]:
 
 
 class Callbacks:
-    """Calls an agent's callbacks. All methods are for the agent's thread, but those that say otherwise.
+    """Calls an agent's callbacks. All methods are for the agent's thread, except those that say otherwise.
 
-    `stamp` returns the first fields of each line, `hide` takes out of a text what must not stand in the recording.
-    `failed` is told the name and the error of a callback that raises, `late` how many lines there are after a callback
-    for which the agent's thread did not wait; both on the callbacks' thread.
+    `stamp` returns the first fields of each line. `hide` removes from a text what must not stand in the recording. The
+    callbacks' thread calls `failed` with the name and the error of a callback that raised, and `late` with the number
+    of lines so far when a callback returns for which the agent's thread has not waited any longer.
     """
 
     def __init__(
         self,
         found: Mapping[str, Callable[..., Any]],
-        about: About,
+        facts: TrialFacts,
         env: Callable[[], Any],
         *,
         seconds: float,
@@ -125,7 +125,7 @@ class Callbacks:
         late: Callable[[int], None] = lambda recorded: None,
     ) -> None:
         self._found = found
-        self.about = about
+        self.facts = facts
         self._env = env
         self._seconds = seconds
         self._late = late
@@ -135,20 +135,20 @@ class Callbacks:
         self._thread: _Thread | None = None
         self.replaying = False
         self.first_late: str | None = None
-        """The first callback for which the game did not wait any longer."""
+        """The name of the first callback that took longer than `seconds`."""
 
     def __bool__(self) -> bool:
         return bool(self._found)
 
     @property
     def busy(self) -> bool:
-        """A callback has not returned yet (it may never)."""
+        """Whether a callback has not returned yet. It may never return."""
         return self._thread is not None and self._thread.running is not None
 
     # ---- what happens
 
     def session_begins(self) -> None:
-        """The session begins, or goes on on this server. Only the first call counts."""
+        """The session begins, or continues on this server. Only the first call has an effect."""
         if not self._started:
             self._started = True
             self._call(SESSION_START)
@@ -156,7 +156,7 @@ class Callbacks:
     def episode_began(self, episode: int, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> None:
         """The environment has been reset."""
         self._now = _Standing(episode, observations=observations, infos=infos)
-        self._now.scores = dict.fromkeys(self.about.players, 0.0)
+        self._now.scores = dict.fromkeys(self.facts.players, 0.0)
         self._call(EPISODE_START)
 
     def stepped(
@@ -175,7 +175,7 @@ class Callbacks:
         self._call(TICK)
 
     def fed_back(self, player: str, word: str) -> None:
-        """A participant has sent a word of feedback, and the agent has heard it."""
+        """A participant has sent a word of feedback, and the agent's `feedback` has been called."""
         self._call(FEEDBACK, player, word)
 
     def episode_ended(self, why: str) -> None:
@@ -195,11 +195,11 @@ class Callbacks:
 
     @property
     def recorded(self) -> int:
-        """The number of lines of the recording until now. For any thread."""
+        """The number of lines for the recording so far. For any thread."""
         return self._notes.recorded
 
     def take(self, recorded: int | None = None) -> list[bytes]:
-        """Those of the first `recorded` lines, or of all, that were not taken yet. For the event loop."""
+        """Take the lines that were not taken yet, of the first `recorded` lines or of all. For the event loop."""
         return self._notes.take(recorded)
 
     def close(self) -> None:
@@ -226,7 +226,7 @@ class Callbacks:
                 log.warning(text, running, self._seconds)
             return
         where: dict[str, Any] = {"episode": self._now.episode, "step": self._now.ticks}
-        if arguments and len(self.about.humans) > 1:  # what one of several participants did
+        if arguments and len(self.facts.humans) > 1:  # the callback is about one of several participants
             where["player"] = arguments[0]
         call = _Call(self._notes, name, where)
         session = self._session(call)
@@ -235,16 +235,16 @@ class Callbacks:
             self.first_late = name
 
     def _session(self, call: _Call) -> Session:
-        about, now = self.about, self._now
+        facts, now = self.facts, self._now
         return Session(
-            trial=about.trial,
-            step=about.step,
-            group=about.group,
-            players=about.players,
-            humans=about.humans,
+            trial=facts.trial,
+            step=facts.step,
+            group=facts.group,
+            players=facts.players,
+            humans=facts.humans,
             episode=now.episode,
             ticks=now.ticks,
-            actions=dict(now.actions),  # copies: what a callback does with them changes no record
+            actions=dict(now.actions),  # copies: a callback may change them, and the records must not
             rewards=dict(now.rewards),
             observations=dict(now.observations),
             infos=dict(now.infos),
@@ -252,12 +252,12 @@ class Callbacks:
             why=now.why,
             replaying=self.replaying,
             env=self._env(),
-            record=_nowhere if self.replaying else call.record,
+            record=_discard if self.replaying else call.record,
         )
 
 
 class _Notes:
-    """The lines that callbacks leave, and what is said once about them."""
+    """The lines of callbacks for the recording, and the warnings about callbacks, each of which is given once."""
 
     def __init__(
         self,
@@ -270,7 +270,7 @@ class _Notes:
         self._failed = failed
         self._lines: deque[bytes] = deque()
         self._taken = 0
-        self._said: set[str] = set()
+        self._warnings: set[str] = set()
         self.recorded = 0
         self.skipped = 0
 
@@ -280,33 +280,33 @@ class _Notes:
         return [self._lines.popleft() for _ in range(count)]
 
     def add(self, **fields: Any) -> None:
-        if len(self._lines) < _WAITING:
+        if len(self._lines) < _MOST_WAITING:
             self._lines.append(recording.line("callback", **self._stamp(), **fields))
             self.recorded += 1
 
     def once(self, text: str) -> bool:
-        """Whether this is the first time; of very many different texts, only so many are first ones."""
-        first = text not in self._said and len(self._said) < MOST_VALUES
+        """Whether this text is new. After MOST_VALUES different texts, no text counts as new."""
+        first = text not in self._warnings and len(self._warnings) < MOST_VALUES
         if first:
-            self._said.add(text)
+            self._warnings.add(text)
         return first
 
     def failed(self, name: str, error: BaseException, **where: Any) -> None:
-        """A callback raised. The log and the recording have each error once."""
-        words = " ".join(f"{type(error).__name__}: {_words(error)}".split())[:_ERROR]
+        """A callback raised this error. Record and log each different error once."""
+        words = " ".join(f"{type(error).__name__}: {_message_of(error)}".split())[:_LONGEST_ERROR]
         if self.once(f"{name} {words}"):
             self.add(**where, name=name, callback=name, error=self._hide(words))
             self._failed(name, error)
 
 
 class _Call:
-    """One call of a callback, and what it records."""
+    """One call of a callback, and the values that it records."""
 
     def __init__(self, notes: _Notes, name: str, where: Mapping[str, Any]) -> None:
         self._notes = notes
         self._name = name
         self._where = where
-        self._left = recording.MAX_EXTRA_BYTES
+        self._bytes_left = recording.MAX_EXTRA_BYTES
         self._values = 0
 
     def run(self, method: Callable[..., Any], session: Session, arguments: tuple[Any, ...]) -> None:
@@ -322,7 +322,7 @@ class _Call:
             notes.add(**self._where, name=name, callback=name, skipped=skipped)
 
     def record(self, name: str, value: Any) -> None:
-        """A value for the recording. One that does not fit with those before it is replaced by its size."""
+        """Record a value. If it does not fit beside the earlier values of this call, record its size instead."""
         notes = self._notes
         self._values += 1
         if self._values > MOST_VALUES:
@@ -330,10 +330,10 @@ class _Call:
                 log.warning("one call of %s may record %d values; it records more", self._name, MOST_VALUES)
             return
         name = text_of(name)[:LONGEST_NAME]
-        kept, too_large = recording.bounded_extra({name: value}, self._left)
+        kept, too_large = recording.bounded_extra({name: value}, self._bytes_left)
         size = too_large.get(name)
         if size is None:
-            self._left -= recording.size_of(kept[name])
+            self._bytes_left -= recording.size_of(kept[name])
         elif notes.once(f"large {name}"):
             text = "what %s records as %r is too large for the recording (%d bytes); its size is recorded instead"
             log.warning(text, self._name, name, size)
@@ -353,13 +353,13 @@ class _Thread:
     def __init__(self, late: Callable[[], None]) -> None:
         self._late = late
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._deciding = threading.Lock()  # whether a callback is late: both threads see it in the same way
+        self._deciding = threading.Lock()  # whether a callback is late: the two threads must agree on it
         self.running: str | None = None
-        """The name of the callback that has not returned."""
+        """The name of the callback that has not returned yet; None if there is none."""
         threading.Thread(target=self._run, name="callbacks", daemon=True).start()
 
     def run(self, name: str, work: Callable[[], None], seconds: float) -> bool:
-        """Do the work, and wait for it at most so long; whether it was done then. Nothing else may be running."""
+        """Start the work, and wait at most `seconds`; return whether it is done. No other work may be running."""
         job = _Job(work, threading.Event())
         self.running = name
         self._jobs.put(job)
@@ -384,11 +384,11 @@ class _Thread:
                 self._late()
 
 
-def _nowhere(name: str, value: Any) -> None:
-    """What is recorded while an earlier server's steps are taken again."""
+def _discard(name: str, value: Any) -> None:
+    """Record nothing: steps of an earlier server are taken again."""
 
 
-def _words(error: BaseException) -> str:
+def _message_of(error: BaseException) -> str:
     try:
         return str(error)
     except BaseException:  # noqa: BLE001 - the researcher's errors may raise anything

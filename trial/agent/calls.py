@@ -16,7 +16,7 @@ from trial.recordings import recording
 
 log = logging.getLogger("trial")
 
-_MOST_SAID = 20  # sentences about what is too large for the recording
+_MOST_WARNINGS = 20  # about values that are too large for the recording
 
 
 class Diverged(Exception):
@@ -30,12 +30,15 @@ class Calls:
         self._stamp = stamp
         self._record_observations = record_observations
         self.callbacks: Callbacks | None = None
-        """Of an agent that has some."""
-        self._said_too_large: set[str] = set()
-        self._cut = False  # something was too large in an info of the line before
+        """The agent's callbacks, if it has any."""
+        self._warned_of: set[str] = set()
+        self._cut = False  # a value in an info of the line before was too large
 
     def run(self, call: Call) -> Any:
-        """Run the call; return its result (see each kind). Raises what the researcher's code raises, and Diverged."""
+        """Run the call and return its result, which the docstring of each kind of call names.
+
+        Raises what the researcher's code raises, and Diverged if a replay differs from the recording.
+        """
         if isinstance(call, StepCall):
             return self._step(call)
         if isinstance(call, FeedbackCall):
@@ -57,7 +60,7 @@ class Calls:
         raise NotImplementedError
 
     def _say(self, word: Word) -> str:
-        """Give the agent a word of feedback; the player whose human said it."""
+        """Give the agent a word of feedback. Return the player whose human sent it."""
         raise NotImplementedError
 
     def _replay(self, call: ReplayCall) -> Replayed:
@@ -92,18 +95,18 @@ class Calls:
         return {"extra": self._bounded("what step() returns as %r", values)}
 
     def _line(self, kind: str, /, **fields: Any) -> recording.Line:
-        """A line of the recording. What is too large in an `info` is replaced by its size."""
+        """A line of the recording. A value in an `info` that is too large is replaced by its size."""
         if self._is_settled(fields):
             return recording.LaterLine(kind, fields | {"info": dict(fields["info"])})
         line = None if self._cut else recording.line(kind, **fields)
         if line is not None and len(line) <= recording.MAX_EXTRA_BYTES:
             return line
         cut = self._cut_infos(fields)
-        self._cut = bool(cut)  # then the next line's is cut at once: to write 50 MB takes seconds
+        self._cut = bool(cut)  # then the next line is not written before its infos are cut: 50 MB would take seconds
         return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
 
     def _is_settled(self, fields: Mapping[str, Any]) -> bool:
-        """Whether all values of a line are small, and no later step can change them: those of most games are."""
+        """Whether all values of a line are small, and no later step can change them. In most games that is so."""
         if self._record_observations or "extra" in fields:
             return False
         parts = fields["players"].values() if "players" in fields else ()
@@ -111,7 +114,7 @@ class Calls:
         return all(map(recording.is_settled, infos))
 
     def _cut_infos(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Those fields of a line whose infos are too large, with what is kept of them."""
+        """The fields of a line whose infos are too large, with their bounded values."""
         cut: dict[str, Any] = {}
         info = self._cut_info(fields.get("info"))
         if info is not None:
@@ -128,18 +131,22 @@ class Calls:
             return None
         return self._bounded("%r in info", info)
 
-    def _bounded(self, what: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    def _bounded(self, subject: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The values, with the size of each one that is too large in its place.
+
+        The log's warning about such a value starts with `subject`, in which `%r` stands for its name.
+        """
         kept, too_large = recording.bounded_extra(values)
         for name, size in too_large.items():
-            said = what % name[:100]
-            if said not in self._said_too_large and len(self._said_too_large) < _MOST_SAID:
-                self._said_too_large.add(said)
-                log.warning("%s is too large for the recording (%d bytes); its size is recorded instead", said, size)
+            value = subject % name[:100]
+            if value not in self._warned_of and len(self._warned_of) < _MOST_WARNINGS:
+                self._warned_of.add(value)
+                log.warning("%s is too large for the recording (%d bytes); its size is recorded instead", value, size)
         return kept
 
 
 class AgentCalls(Calls):
-    """Runs calls of an agent with one player. `views` is whether the core is told what the player sees."""
+    """Runs calls of an agent with one player. With `views`, the results say which actions the player may take now."""
 
     def __init__(
         self,
@@ -232,10 +239,9 @@ class AgentCalls(Calls):
 
 
 def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:
-    """The `action_mask` of an info, as Gymnasium's environments give it: one value for each action."""
+    """The `action_mask` of an info, as bools by the actions' numbers; None if there is none, or it cannot be read."""
     mask = info.get(ACTION_MASK)
     try:
-        found = None if mask is None else [bool(one) for one in mask]
+        return None if mask is None else [bool(one) for one in mask]
     except (TypeError, ValueError):
         return None
-    return found

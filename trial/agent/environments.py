@@ -1,4 +1,4 @@
-"""What an environment is: of one player (Gymnasium) or of several (PettingZoo and others), and who these are."""
+"""Finds the players of an environment, one (Gymnasium) or several (PettingZoo and others), and their actions."""
 
 from __future__ import annotations
 
@@ -11,53 +11,53 @@ from typing import Any
 
 
 class PlayersUnknown(ValueError):
-    """It cannot be told who plays, or what they can do. The message is for the researcher."""
+    """The environment does not exist, or its players or actions are not known. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
 class Players:
-    """The players of an environment."""
+    """The players of an environment. All mappings are by the player's name."""
 
     env: Any
     names: tuple[str, ...]
     keys: Mapping[str, Any]
-    """By the name of a player, what the environment calls them: a text, a number …"""
+    """The environment's own name of each player: a text, a number …"""
     action_names: Mapping[str, tuple[str, ...]]
     observation_spaces: Mapping[str, Any]
     starts: Mapping[str, int]
-    """The number of each player's first action for the environment."""
+    """The environment's number of each player's first action."""
     counts: Mapping[str, int | None]
-    """How many actions each has for the environment; None if that is not known."""
+    """How many actions each player has in the environment; None if that is not known."""
     of_env: bool
-    """`env` itself is stepped, and its `agents` are those who are still in the game."""
+    """Whether `env` is an environment, whose `agents` are the players still in the game; if not, it is the agent."""
 
 
 class AecTurns:
-    """Who is to act in a PettingZoo `AECEnv` in which players take turns."""
+    """The turns of a PettingZoo `AECEnv` in which one player after another acts."""
 
     def __init__(self, aec: Any) -> None:
         self._aec = aec
 
     def selected(self) -> Any:
-        """The environment's own name of the player; an empty list if none is left."""
+        """The environment's own name of the player who is to act; an empty list if no player is left."""
         return self._aec.agent_selection if self._aec.agents else []
 
 
 def is_module(game: str) -> bool:
-    """Whether a game is named as a module with a package: `pettingzoo.butterfly.cooperative_pong_v6`."""
+    """Whether `game` is the name of a module in a package, such as `pettingzoo.butterfly.cooperative_pong_v6`."""
     return "." in game and all(part.isidentifier() for part in game.split("."))
 
 
 def made_by_module(game: str) -> Any:
-    """What the module's `parallel_env`, else its `env` makes, drawn as arrays; an `AECEnv` as a `ParallelEnv`.
+    """Make the environment of a module by its `parallel_env`, or else by its `env`, with pictures as arrays.
 
-    Raises PlayersUnknown if its package has no such module or the module makes no environment, ImportError if
-    something else cannot be imported.
+    An `AECEnv` becomes a `ParallelEnv`. Raises PlayersUnknown if the package has no such module, but others, or if the
+    module makes no environment; ImportError if something else cannot be imported.
     """
     try:
         module = importlib.import_module(game)
     except ModuleNotFoundError as error:
-        others = _similar(game) if error.name == game else []
+        others = _other_modules(game) if error.name == game else []
         if not others:
             raise
         raise PlayersUnknown(f"there is no module {game}; its package has {', '.join(others)}") from None
@@ -67,20 +67,20 @@ def made_by_module(game: str) -> Any:
     return playable(make(render_mode="rgb_array"))
 
 
-def _similar(game: str) -> list[str]:
-    """The modules of the same package that are another version of the game, or else all of them."""
+def _other_modules(game: str) -> list[str]:
+    """The other versions of the game in its package; if there are none, all the package's games."""
     package, _, name = game.rpartition(".")
     folder = getattr(importlib.import_module(package), "__path__", [])
-    found = [each.name for each in pkgutil.iter_modules(folder) if re.search(r"_v\d+$", each.name)]
+    games = [each.name for each in pkgutil.iter_modules(folder) if re.search(r"_v\d+$", each.name)]
     stem = re.sub(r"_v\d+$", "", name)
-    return [other for other in found if other.startswith(f"{stem}_v")] or found
+    return [other for other in games if other.startswith(f"{stem}_v")] or games
 
 
 def playable(env: Any) -> Any:
-    """The environment as it is; an `AECEnv` of PettingZoo as a `ParallelEnv`, by PettingZoo's own wrappers."""
+    """Turn a PettingZoo `AECEnv` into a `ParallelEnv`, by PettingZoo's own wrappers; return anything else as it is."""
     if not is_aec(env):
         return env
-    from pettingzoo.utils import conversions  # noqa: PLC0415 - whoever brings an AECEnv has it
+    from pettingzoo.utils import conversions  # noqa: PLC0415 - with an AECEnv, PettingZoo is installed
 
     if _at_once(env):
         return conversions.aec_to_parallel(env)
@@ -88,43 +88,36 @@ def playable(env: Any) -> Any:
 
 
 def turns(env: Any) -> AecTurns | None:
-    """Whose turn it is in an `AECEnv`, or in what `playable` made of it; None if players act at the same time."""
+    """The turns of an `AECEnv`, or of what `playable` made of one; None if the players act at the same time."""
     aec = env if is_aec(env) else getattr(env, "aec_env", None)
     return None if aec is None or not is_aec(aec) or _at_once(aec) else AecTurns(aec)
 
 
 def is_aec(env: Any) -> bool:
-    """Whether it is a PettingZoo `AECEnv`, or has its methods."""
+    """Whether `env` has the methods of a PettingZoo `AECEnv`."""
     return callable(getattr(env, "agent_iter", None)) and callable(getattr(env, "last", None))
 
 
 def _at_once(aec: Any) -> bool:
+    """Whether the players of an `AECEnv` act at the same time."""
     return bool((getattr(aec, "metadata", None) or {}).get("is_parallelizable", False))
 
 
-def player_keys(*places: Any) -> list[Any]:
-    """What the first of these objects that has several players calls them; empty if none has."""
-    for place in places:
-        for one in (place, getattr(place, "unwrapped", None)):
-            keys = _keys(one)
-            if keys:
-                return keys
+def player_keys(owner: Any) -> list[Any]:
+    """The `possible_agents` of an agent, an environment, or the environment that it wraps; empty if there are none."""
+    for one in (owner, getattr(owner, "unwrapped", None)):
+        keys = getattr(one, "possible_agents", None)
+        if isinstance(keys, Iterable) and not isinstance(keys, str) and (listed := list(keys)):
+            return listed
     return []
 
 
-def _keys(place: Any) -> list[Any]:
-    named = getattr(place, "possible_agents", None)
-    return list(named) if isinstance(named, Iterable) and not isinstance(named, str) else []
+def players_of(env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_env: bool, stepped: bool) -> Players:
+    """The players with these keys, and the names of their actions.
 
-
-def players_of(
-    env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_env: bool, stepped: bool = True
-) -> Players:
-    """The players with these keys, and their actions: the configured names first.
-
-    `of_env`: as in `Players`. `stepped`: the environment itself gets the actions, so there are as many as its spaces
-    have, and they begin there. Raises PlayersUnknown if two players have the same name as text, or if the actions of
-    one cannot be told.
+    `configured` are the names in config.yml. `of_env` is as in `Players`. `stepped` says that the environment's own
+    `step` gets the actions: then each player has as many actions as their action space, and these are numbered as
+    there. Raises PlayersUnknown if two keys are the same text, or if a player's actions are not known.
     """
     by_name = {str(key): key for key in keys}
     if len(by_name) != len(keys):
@@ -143,14 +136,15 @@ def players_of(
 
 
 def _space(env: Any, name: str, key: Any) -> Any:
-    """The space of a player: of PettingZoo's method, of a map by player, or one space for all. None if unknown."""
+    """A player's space, by PettingZoo's method or a map by player, or the one of all players; None if unknown."""
     found = getattr(env, name, None)
     if callable(found) and not hasattr(found, "sample"):
         try:
             return found(key)
         except (KeyError, NotImplementedError, AttributeError):
             return None
-    several = getattr(found, "spaces", found if isinstance(found, Mapping) else None)  # "in" asks a space for samples
+    # A Dict space is a Mapping too, but `key in space` would ask whether the key is a sample of it: so take its dict.
+    several = getattr(found, "spaces", found if isinstance(found, Mapping) else None)
     if several is None:
         several = getattr(env, f"{name}s", None) if found is None else None
     if isinstance(several, Mapping) and key in several:
@@ -179,6 +173,6 @@ def _meanings(env: Any) -> list[str]:
         if callable(meanings):
             try:
                 return [str(name).strip().lower() for name in meanings()]
-            except TypeError:  # it wants to know of whom
+            except TypeError:  # it takes a player
                 continue
     return []

@@ -1,4 +1,4 @@
-"""The section `trial` as HIPPO's trial has it: what `start(config)` of an agent is given."""
+"""The section `trial` in HIPPO's form: the argument of an agent's `start(config)`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from protocol import environment
 
 
 def hippo_config(variables: Mapping[str, str]) -> dict[str, Any]:
-    """The section that this server was started with, in HIPPO's form: keys of the agent's own beside all others, the
-    controls that are shown as a list, and the project's id. `variables` are those of the server's environment.
+    """The section `trial` of this server's project, in HIPPO's form, from the server's environment `variables`.
+
+    The keys of `options` stand beside the others, `ui` is a list of the controls that are shown, and `projectId` is
+    the project's id.
     """
     section: dict[str, Any] = json.loads(variables.get(environment.TRIAL) or "{}")
-    own, controls = section.pop("options", None) or {}, section.get("ui") or {}
+    options, controls = section.pop("options", None) or {}, section.get("ui") or {}
     if isinstance(controls, dict):
         section["ui"] = [name for name, shown in controls.items() if shown is True]
-    return {**own, **section, "projectId": variables.get(environment.PROJECT_ID, "")}
+    return {**options, **section, "projectId": variables.get(environment.PROJECT_ID, "")}

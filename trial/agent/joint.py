@@ -1,7 +1,7 @@
 """Calls an agent whose environment has several players, and checks what it returns.
 
-The environment is a PettingZoo `ParallelEnv` or `AECEnv` that `start` returned, or the agent's five methods take and
-give dictionaries by player. Players are known by text here; the environment's own names of them may be of any type.
+The environment is a PettingZoo `ParallelEnv` or `AECEnv`, or the agent's five methods take and return dictionaries by
+player. Here a player's name is a text. The environment's own key of a player may be of any type.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ _FLAGS = frozenset({bool})
 
 
 class Joint(NamedTuple):
-    """What all players of an environment have after a reset or a step. All maps are by the player's name.
+    """The results of a reset or a step for all players of an environment. All maps are by the player's name.
 
-    A player who has left the game has no observation and no info; `terminated` and `truncated` keep saying why.
+    A player who has left the game may have no observation and no info; `terminated` and `truncated` still say why.
     """
 
     observations: Mapping[str, Any]
     infos: Mapping[str, Mapping[str, Any]]
     rewards: Mapping[str, float]
-    """Of every player; 0 for those that the environment says nothing of."""
+    """Of every player; 0 if the environment gives none."""
     terminated: Mapping[str, bool]
     truncated: Mapping[str, bool]
     """Of every player."""
     to_act: frozenset[str]
-    """Who is to choose an action for the next step; empty when the episode is over."""
+    """The players who are to choose an action for the next step; empty when the episode is over."""
     masks: Mapping[str, tuple[bool, ...]]
-    """Of players who may not take each action: which are legal now."""
+    """For each action, whether it is legal now; only of players for whom the environment gives a mask."""
     over: bool
-    """The episode is over: for all players, or since none is left."""
+    """Whether the episode is over for all players."""
     extra: Mapping[str, Any] | None = None
-    """What else is in the dict that an agent of HIPPO's kind returns."""
+    """Further entries of the dict that `step` returned; None if there are none."""
 
     @property
     def why(self) -> str:
-        """Why the episode is over: `truncated` if that is so for all who were in it, else `terminated`."""
+        """`truncated` if the episode was truncated for players and terminated for none, else `terminated`."""
         ended = [player for player in self.terminated if self.terminated[player] or self.truncated[player]]
         cut = bool(ended) and not any(self.terminated[player] for player in ended)
         return "truncated" if cut else "terminated"
@@ -61,13 +61,13 @@ class JointAdapter:
         self._reader = adapter.reader
         self._players = players
         self._turns = turns
-        self._gone: set[str] = set()
-        self._first: dict[str, int] = {}  # the first legal action of those with a mask
+        self._ended: set[str] = set()  # players for whom the episode is over
+        self._first_legal: dict[str, int] = {}  # the first legal action of each player with a mask
         self._terminated: dict[str, bool] = {}
         self._truncated: dict[str, bool] = {}
         self.players: tuple[str, ...] = players.names
         """In the environment's order."""
-        self._named = frozenset(players.names)
+        self._names = frozenset(players.names)
         self.action_spaces: Mapping[str, tuple[str, ...]] = players.action_names
         """The names of each player's actions, in the order of their numbers."""
         self.observation_spaces: Mapping[str, Any] = players.observation_spaces
@@ -75,37 +75,40 @@ class JointAdapter:
         self.action_counts: Mapping[str, int | None] = players.counts
         """How many actions each player has in the environment; None where it is not known."""
         self.views: tuple[str, ...] = self.players
-        """The players whose pictures are wanted, where each has a view of their own."""
+        """The players whose pictures are drawn, if `render` takes a player."""
 
     @property
     def env(self) -> Any:
-        """The environment, as far as it is known."""
+        """As `AgentAdapter.env`."""
         return self._adapter.env
 
     @property
     def steps_itself(self) -> bool:
-        """Whether the researcher's code takes the actions, and not the environment."""
+        """As `AgentAdapter.steps_itself`."""
         return self._adapter.steps_itself
 
     @property
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:
-        """The callbacks that the agent has."""
+        """As `AgentAdapter.callbacks`."""
         return self._adapter.callbacks
 
     @property
     def agent(self) -> Any:
-        """The researcher's agent."""
+        """As `AgentAdapter.agent`."""
         return self._adapter.agent
 
     @property
     def agent_module(self) -> Any:
-        """The module that agent.py has become; None without one."""
+        """As `AgentAdapter.agent_module`."""
         return self._adapter.agent_module
 
     def reset(self, seed: int) -> tuple[Joint, bool]:
-        """Begin an episode: what the players have at its start, and whether the agent took the seed."""
+        """Begin an episode. Return its first observations and infos, and whether `reset` took the seed.
+
+        Raises AgentError if `reset` returns something else than observations by player.
+        """
         observations, infos, seeded = self._adapter.reset(seed)
-        self._gone = set()
+        self._ended = set()
         self._terminated = dict.fromkeys(self.players, False)
         self._truncated = dict.fromkeys(self.players, False)
         if not isinstance(observations, Mapping):
@@ -113,16 +116,16 @@ class JointAdapter:
         return self._joint("reset", observations, infos, {}, over=False), seeded
 
     def step(self, actions: Mapping[str, int]) -> Joint:
-        """Take one step with the actions' numbers by player.
+        """Take one step with the numbers of the actions by player. Raises AgentError if the result cannot be read.
 
-        Players in the game who are not in `actions` take their first legal action: the environment wants one of each,
-        also of those who are not to act.
+        The environment takes an action of each player in the game, also of those who are not to act. So a player who
+        is not in `actions` takes their first legal action.
         """
-        keys, starts, first = self._players.keys, self._players.starts, self._first
+        keys, starts, first_legal = self._players.keys, self._players.starts, self._first_legal
         given = {
-            keys[player]: starts[player] + actions.get(player, first.get(player, 0))
+            keys[player]: starts[player] + actions.get(player, first_legal.get(player, 0))
             for player in self.players
-            if player not in self._gone
+            if player not in self._ended
         }
         if self._reader.due:  # steps of an earlier server are taken again without pictures
             self.pictures()
@@ -130,10 +133,10 @@ class JointAdapter:
         self._end(returned.terminated, self._terminated)
         self._end(returned.truncated, self._truncated)
         if True in self._terminated.values() or True in self._truncated.values():
-            self._gone |= {player for player in self.players if self._terminated[player] or self._truncated[player]}
+            self._ended |= {player for player in self.players if self._terminated[player] or self._truncated[player]}
         if self._players.of_env:
-            self._gone |= self._left()
-        over = len(self._gone) == len(self.players)
+            self._ended |= self._no_agents()
+        over = len(self._ended) == len(self.players)
         return self._joint(
             "step", returned.observations, returned.infos, returned.rewards, over=over, extra=returned.extra
         )
@@ -146,7 +149,7 @@ class JointAdapter:
         return self._reader.read(self._adapter.draw())
 
     def feedback(self, player: str, word: str) -> None:
-        """Hand a word of this player's participant to an agent that listens: `feedback(word)` or also the player."""
+        """Call the agent's `feedback` with a word of this player's participant (`AgentAdapter.feedback`)."""
         self._adapter.feedback(word, self._players.keys[player])
 
     def close(self) -> None:
@@ -164,37 +167,37 @@ class JointAdapter:
         over: bool,
         extra: Mapping[str, Any] | None = None,
     ) -> Joint:
-        seen = self._by_player(method, observations)
-        told = self._by_player(method, infos) if infos and isinstance(infos, Mapping) else {}
-        details = {player: _info(value) for player, value in told.items()}
-        paid = self._by_player(method, rewards)
-        masks = {} if over else self._masks(seen, details)
-        self._first = {player: mask.index(True) for player, mask in masks.items()}
+        observations = self._by_player(method, observations)
+        infos = self._by_player(method, infos) if infos and isinstance(infos, Mapping) else {}
+        infos = {player: _info(value) for player, value in infos.items()}
+        rewards = self._by_player(method, rewards)
+        masks = {} if over else self._masks(observations, infos)
+        self._first_legal = {player: mask.index(True) for player, mask in masks.items()}
         return Joint(
-            observations=seen,
-            infos=details,
-            rewards={player: _reward(player, paid.get(player)) for player in self.players},
+            observations=observations,
+            infos=infos,
+            rewards={player: _reward(player, rewards.get(player)) for player in self.players},
             terminated=dict(self._terminated),
             truncated=dict(self._truncated),
-            to_act=frozenset() if over else self._to_act(details),
+            to_act=frozenset() if over else self._to_act(infos),
             masks=masks,
             over=over,
             extra=extra,
         )
 
-    def _end(self, said: Mapping[Any, Any], ended: dict[str, bool]) -> None:
-        """Note for whom it is over. The value for all counts for those who are still in the game."""
-        values = said.values()
-        if said.keys() == self._named and _FLAGS.issuperset(map(type, values)) and True not in values:
+    def _end(self, returned: Mapping[Any, Any], ended: dict[str, bool]) -> None:
+        """Set `ended` for the players whose episode `step` says is over; by ALL, for all who are still in the game."""
+        values = returned.values()
+        if returned.keys() == self._names and _FLAGS.issuperset(map(type, values)) and True not in values:
             return  # for none of them: the usual case
-        for player, value in self._by_player("step", said).items():
+        for player, value in self._by_player("step", returned).items():
             ended[player] = ended[player] or _truth(value, "step() returned for %s, as its end,", player)
-        if _truth(said.get(ALL), "step() returned for %s", ALL):
-            ended.update(dict.fromkeys((player for player in self.players if player not in self._gone), True))
+        if _truth(returned.get(ALL), "step() returned for %s", ALL):
+            ended.update(dict.fromkeys((player for player in self.players if player not in self._ended), True))
 
     def _by_player(self, method: str, values: Mapping[Any, Any]) -> dict[str, Any]:
-        """The values by the players' names, without the value for all. Raises AgentError for one there is not."""
-        if values.keys() == self._named:  # the usual case
+        """The values by the players' names, without the value of ALL. Raises AgentError for an unknown player."""
+        if values.keys() == self._names:  # the usual case
             return dict(values)
         found = {}
         for key, value in values.items():
@@ -208,16 +211,19 @@ class JointAdapter:
     def _shown(self) -> str:
         return ", ".join(self.players)
 
-    def _left(self) -> set[str]:
-        """Who is in the environment's `agents` no more. PettingZoo takes out whoever has ended."""
-        now = getattr(self._players.env, "agents", None)
-        if not isinstance(now, list | tuple):
+    def _no_agents(self) -> set[str]:
+        """The players who are not in the environment's `agents`: PettingZoo removes those whose episode is over."""
+        agents = getattr(self._players.env, "agents", None)
+        if not isinstance(agents, list | tuple):
             return set()
-        return set(self.players) - {str(key) for key in now}
+        return set(self.players) - {str(key) for key in agents}
 
     def _to_act(self, infos: Mapping[str, Mapping[str, Any]]) -> frozenset[str]:
-        """Who chooses an action now: whom the agent's `to_act` or PettingZoo names, else all whose info allows it."""
-        there = [player for player in self.players if player not in self._gone]
+        """The players who choose an action now.
+
+        The agent's method `to_act` names them, or else the turn of an `AECEnv`, or else `to_act` in their infos.
+        """
+        in_game = [player for player in self.players if player not in self._ended]
         method = getattr(self._adapter.agent, TO_ACT, None)
         named: Any = None
         if callable(method):
@@ -227,24 +233,25 @@ class JointAdapter:
         if named is not None:
             several = isinstance(named, Iterable) and not isinstance(named, str)
             names = {str(name) for name in (named if several else (named,))}
-            unknown = sorted(names - set(self.players))
+            unknown = sorted(names - self._names)
             if unknown:
                 raise AgentError(f"to_act() returned {unknown[0]!r}; the players are {self._shown()}")
-            return frozenset(player for player in there if player in names)
+            return frozenset(player for player in in_game if player in names)
         if not infos:
-            return frozenset(there)
+            return frozenset(in_game)
         return frozenset(
             player
-            for player in there
+            for player in in_game
             if player not in infos or _truth(infos[player].get(TO_ACT, True), _TO_ACT_IS, player)
         )
 
     def _masks(
         self, observations: Mapping[str, Any], infos: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, tuple[bool, ...]]:
+        """The `action_mask` of each player in the game: in their info, else in their observation, if it is a map."""
         found = {}
         for player in self.players:
-            if player in self._gone:
+            if player in self._ended:
                 continue
             mask = infos[player].get(ACTION_MASK) if player in infos else None
             if mask is None:
@@ -261,25 +268,30 @@ class JointAdapter:
                 count = len(self.action_spaces[player])
                 if len(legal) != count:
                     raise AgentError(f"{ACTION_MASK} of {player} has {len(legal)} values; there are {count} actions")
-                if any(legal):  # PettingZoo's games give zeros to those who are not to act
+                if any(legal):  # PettingZoo's games give only zeros to a player who is not to act
                     found[player] = legal
         return found
 
 
 def _info(value: Any) -> Mapping[str, Any]:
-    is_map = type(value) is dict or isinstance(value, Mapping)  # the first is quicker
+    """The info as a map: anything else is put into one, under the name `info`."""
+    is_map = type(value) is dict or isinstance(value, Mapping)  # the first check is quicker
     return value if is_map else {} if value is None else {"info": value}
 
 
-def _truth(value: Any, what: str, player: str) -> bool:
-    """Raises AgentError if the value has none; the sentence begins with `what`, which has a place for the player."""
+def _truth(value: Any, beginning: str, player: str) -> bool:
+    """The value as a bool. Raises AgentError if it has no truth value.
+
+    The error's sentence starts with `beginning`, in which `%s` stands for the player.
+    """
     try:
         return bool(value)
     except (TypeError, ValueError):  # such as an array of several numbers
-        raise AgentError(f"{what % player} {type(value).__name__}, which is neither true nor false") from None
+        raise AgentError(f"{beginning % player} {type(value).__name__}, which is neither true nor false") from None
 
 
 def _reward(player: str, value: Any) -> float:
+    """The reward as a number; 0 for None. Raises AgentError if it is no finite number."""
     try:
         number = float(0.0 if value is None else value.item() if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError) as error:
@@ -296,14 +308,14 @@ _KEYS = {
     "truncations": ("truncated", "truncations"),
     "infos": ("info", "infos"),
 }
-"""What each part may be called in a dict, as HIPPO's agents return one."""
+"""The keys under which each part may stand if `step` returns a dict, as HIPPO's agents do."""
 _MAPS = frozenset({dict})
 _ENDS = ("terminations", "truncations")
 _WANTED = "step() must return (observations, rewards, terminations, truncations, infos), each of them by player"
 
 
 class _Returned(NamedTuple):
-    """What `step` returned, each part by the environment's own names of the players."""
+    """The parts of what `step` returned, each by the environment's own keys of the players."""
 
     observations: Mapping[Any, Any]
     rewards: Mapping[Any, Any]
@@ -314,14 +326,14 @@ class _Returned(NamedTuple):
 
 
 def _read(result: Any) -> _Returned:
-    """The parts of a five-tuple, Gym's old four-tuple or a dict. Raises AgentError for all else."""
+    """The parts of Gymnasium's five values, Gym's old four values, or a dict. Raises AgentError for anything else."""
     extra: Mapping[str, Any] | None = None
-    given = len(result) if isinstance(result, (tuple, list)) else None
-    if given == 5:
+    count = len(result) if isinstance(result, (tuple, list)) else None
+    if count == 5:
         if _MAPS.issuperset(map(type, result)):  # the usual case
             return _Returned(*result)
         parts = list(result)
-    elif given == 4:
+    elif count == 4:
         observations, rewards, done, infos = result
         parts = [observations, rewards, done, {}, infos]
     elif isinstance(result, Mapping):

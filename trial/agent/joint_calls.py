@@ -1,4 +1,4 @@
-"""Carries out the core's calls on an agent with several players, on the agent's thread."""
+"""Carries out the core's calls (`trial/core/effects.py`) on an agent with several players, on the agent's thread."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ _NONE: frozenset[str] = frozenset()
 class JointCalls(Calls):
     """Runs calls of an agent with several players. `players` are all of them, in the environment's order.
 
-    What a line of the recording says of one player, as lines of a game with one player do, it says of the first human.
+    A line of the recording has the same fields as in a game with one player. There they are about the first human.
+    Its field `players` is about all players.
     """
 
     def __init__(
@@ -37,14 +38,14 @@ class JointCalls(Calls):
         record_observations: bool,
         stand_ins: Iterable[str] = (),
     ) -> None:
-        """In the places of `stand_ins` a policy may play while their participant is away."""
+        """`stand_ins` are players in whose place a policy may play while their participant is away."""
         super().__init__(stamp, record_observations=record_observations)
         self._agent = agent
         humans = tuple(player.name for player in players if player.human)
-        self._first = humans[0]
+        self._first_human = humans[0]
         policies = (player.name for player in players if not player.human and not player.by_program)
         self._policies = frozenset((*policies, *stand_ins))
-        self._ended: frozenset[str] = frozenset()  # the episode is over for them
+        self._ended: frozenset[str] = frozenset()  # the players for whom the episode is over
         agent.views = humans
 
     def _reset(self, call: ResetCall) -> Begun:
@@ -57,51 +58,52 @@ class JointCalls(Calls):
         fields: dict[str, Any] = {
             "episode": episode,
             "seed": seed if seeded else None,
-            "info": recording.plain(joint.infos.get(self._first, {})),
-            **self._seen(joint),
-            "players": {player: self._begun(player, call, joint) for player in self._agent.players},
+            "info": recording.plain(joint.infos.get(self._first_human, {})),
+            **self._first_observation(joint),
+            "players": {player: self._reset_part(player, call, joint) for player in self._agent.players},
             "toAct": sorted(joint.to_act),
             **call.fields,
         }
         return Begun(self._line("reset", **self._stamp(), **fields), pictures, self._view(joint))
 
     def _view(self, joint: Joint) -> View:
-        """What the core is told. Policies look at it while the environment goes on, so they get copies."""
+        """The players' view for the core. Policies read it while the environment goes on, so they get copies."""
         watching = self._policies & joint.to_act
         if not watching:
             return View(joint.to_act, masks=joint.masks)
-        seen = {player: snapshot(joint.observations.get(player)) for player in watching}
-        infos = {player: snapshot(joint.infos.get(player, {})) for player in seen}
-        return View(joint.to_act, seen, infos, joint.masks)
+        observations = {player: snapshot(joint.observations.get(player)) for player in watching}
+        infos = {player: snapshot(joint.infos.get(player, {})) for player in watching}
+        return View(joint.to_act, observations, infos, joint.masks)
 
-    def _seen(self, joint: Joint) -> dict[str, Any]:
+    def _first_observation(self, joint: Joint) -> dict[str, Any]:
+        """The field of a line with the first human's observation, if observations are recorded."""
         if not self._record_observations:
             return {}
-        return {"observation": recording.observation(joint.observations.get(self._first))}
+        return {"observation": recording.observation(joint.observations.get(self._first_human))}
 
-    def _begun(self, player: str, call: ResetCall, joint: Joint) -> dict[str, Any]:
+    def _reset_part(self, player: str, call: ResetCall, joint: Joint) -> dict[str, Any]:
         """One player's part of a reset's line. Policies have a seed, also if the environment takes none."""
         seeded = {"seed": policy_seed(call.seed, player)} if player in call.asked else {}
-        return {**seeded, **self._told(player, joint)}
+        return {**seeded, **self._info_and_observation(player, joint)}
 
-    def _told(self, player: str, joint: Joint) -> dict[str, Any]:
-        """What a line says of what another player than the first human was told."""
-        said: dict[str, Any] = {}
-        if player != self._first:
+    def _info_and_observation(self, player: str, joint: Joint) -> dict[str, Any]:
+        """A player's info and observation, for their part of a line; the first human's stand in the line itself."""
+        fields: dict[str, Any] = {}
+        if player != self._first_human:
             info = joint.infos.get(player)
             if info:
-                said["info"] = recording.plain(info)
+                fields["info"] = recording.plain(info)
             if self._record_observations and player in joint.observations:
-                said["observation"] = recording.observation(joint.observations[player])
-        return said
+                fields["observation"] = recording.observation(joint.observations[player])
+        return fields
 
     def _say(self, word: Word) -> str:
-        player = word.player if word.player in self._agent.players else self._first
+        player = word.player if word.player in self._agent.players else self._first_human
         self._agent.feedback(player, word.text)
         return player
 
     def _step(self, call: StepCall) -> StepTaken:
-        stamp, actions, first = self._stamp(), call.actions, self._first
+        stamp, actions, first = self._stamp(), call.actions, self._first_human
         self._give_feedback(call)
         joint = self._agent.step({player: action.index for player, action in actions.items()})
         pictures = self._agent.pictures()
@@ -122,15 +124,15 @@ class JointCalls(Calls):
             terminated=terminated,
             truncated=truncated or call.truncated_by is not None,
             info=joint.infos.get(first, {}),
-            players={player: self._part(player, action, joint) for player, action in actions.items()},
+            players={player: self._step_part(player, action, joint) for player, action in actions.items()},
             toAct=sorted(joint.to_act),
-            **self._seen(joint),
+            **self._first_observation(joint),
             **(self._extra(joint.extra) if joint.extra else {}),
         )
         self._ended = _ended(joint)
         return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint))
 
-    def _part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
+    def _step_part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
         """One player's part of a step's line."""
         part: dict[str, Any] = {
             "action": action.index if action.acts else None,
@@ -147,7 +149,7 @@ class JointCalls(Calls):
                 part["terminated"] = True
             if joint.truncated[player]:
                 part["truncated"] = True
-        part |= self._told(player, joint)
+        part |= self._info_and_observation(player, joint)
         return part
 
     def _tell_step(self, actions: Mapping[str, int], joint: Joint) -> None:
@@ -162,8 +164,8 @@ class JointCalls(Calls):
         if self.callbacks:
             self.callbacks.episode_began(unfinished.number, joint.observations, joint.infos)
         self._ended = frozenset()
-        acted_upon = _Remembered(unfinished)
-        acted_upon.see(0, joint)
+        observed = _Observations(unfinished)
+        observed.add(0, joint)
         for number, step in enumerate(unfinished.steps, 1):
             for word in step.feedback:
                 self._feedback(word)
@@ -176,39 +178,39 @@ class JointCalls(Calls):
                 raise Diverged("it plays differently now")
             if self.callbacks:
                 self._tell_step(taken, joint)
-            acted_upon.see(number, joint)
+            observed.add(number, joint)
             self._ended = _ended(joint)
-        return Replayed(self._agent.pictures(), self._view(joint), acted_upon.by_player)
+        return Replayed(self._agent.pictures(), self._view(joint), observed.by_player)
 
 
 def _ended(joint: Joint) -> frozenset[str]:
-    """For whom the episode is over."""
+    """The players for whom the episode is over."""
     if True not in joint.terminated.values() and True not in joint.truncated.values():
         return _NONE
     return frozenset(player for player in joint.terminated if joint.terminated[player] or joint.truncated[player])
 
 
-class _Remembered:
-    """Finds in a replay what each policy acted upon."""
+class _Observations:
+    """Collects in a replay the observations upon which each policy acted, as the recording names them."""
 
     def __init__(self, unfinished: UnfinishedEpisode) -> None:
-        self._wanted: dict[int, list[str]] = defaultdict(list)
+        self._wanted: dict[int, list[str]] = defaultdict(list)  # policies' players by the number of steps taken before
         for step in unfinished.steps:
             for player, part in step.players.items():
                 if part.observed is not None:
                     self._wanted[part.observed].append(player)
         self.by_player: dict[str, list[Observed]] = defaultdict(list)
 
-    def see(self, steps: int, joint: Joint) -> None:
-        """So many steps were taken, and this is what the players see."""
+    def add(self, steps: int, joint: Joint) -> None:
+        """Keep the observations of `joint`, after `steps` steps of the episode, if a policy acted upon them."""
         for player in self._wanted.get(steps, ()):
-            seen = snapshot(joint.observations.get(player))
-            told = snapshot(joint.infos.get(player, {}))
-            self.by_player[player].append(Observed(seen, told, joint.masks.get(player)))
+            observation = snapshot(joint.observations.get(player))
+            info = snapshot(joint.infos.get(player, {}))
+            self.by_player[player].append(Observed(observation, info, joint.masks.get(player)))
 
 
 def snapshot(observation: Any) -> Any:
-    """A copy of an observation, which the environment does not change any more; one that holds itself stays."""
+    """A copy of an observation, which the environment cannot change; of one that contains itself, no copy."""
     try:
         return _copied(observation)
     except RecursionError:
@@ -221,9 +223,6 @@ def _copied(observation: Any) -> Any:
     if isinstance(observation, Mapping):
         return {key: _copied(value) for key, value in observation.items()}
     if isinstance(observation, list | tuple):
-        return _same_kind(observation, (_copied(value) for value in observation))
+        copies = [_copied(value) for value in observation]
+        return tuple(copies) if isinstance(observation, tuple) else copies
     return observation
-
-
-def _same_kind(kind: Sequence[Any], values: Iterable[Any]) -> Any:
-    return tuple(values) if isinstance(kind, tuple) else list(values)

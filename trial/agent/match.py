@@ -16,32 +16,33 @@ SECONDS = 5.0
 
 
 class BadGroups(AgentError):
-    """`match` returned something else than groups of those who wait. The message is for the researcher."""
+    """`match` returned something else than groups of ids or of candidates. The message is for the researcher."""
 
 
 def function_of(module: ModuleType | None) -> Callable[..., Any] | None:
     """The function `match` of agent.py; None if there is none."""
-    found = getattr(module, NAME, None)
-    return found if callable(found) else None
+    function = getattr(module, NAME, None)
+    return function if callable(function) else None
 
 
 def in_class(agent: Any) -> bool:
-    """Whether `match` is a method of the agent, where it is not looked for."""
+    """Whether the agent has a method `match`, which is never called: `match` must be a function of agent.py."""
     return callable(getattr(agent, NAME, None))
 
 
 def candidates(question: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What `match` is given: a dict for each participant who waits, in the order in which they came."""
+    """The argument of `match`: a dict for each participant who waits, in the order in which they came."""
     return [{"waited": 0, "group": None, "answers": {}} | each for each in json.loads(json.dumps(question["waiting"]))]
 
 
 def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[list[list[str]], str]:
-    """Call it. Return the groups that can be played, and a sentence on what is wrong with the others; "" if nothing is.
+    """Call `match`. Return the groups that can be played, as lists of ids, and a sentence about the first other group.
 
-    A group holds ids, or the dicts themselves. Raises BadGroups if no groups were returned, and what `match` raises.
+    The sentence is empty if all groups can be played. `match` may return ids or the candidates themselves. Raises
+    BadGroups if it returned anything else, and what `match` raises.
     """
     waiting, players = candidates(question), question["players"]
-    there = {each["id"] for each in waiting}
+    waiting_ids = {each["id"] for each in waiting}
     more = {"players": players} if signatures.names(function, "players") else {}
     returned = function(waiting, **more)
     if returned is None or isinstance(returned, str | bytes | Mapping) or not isinstance(returned, Iterable):
@@ -53,9 +54,9 @@ def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[l
         ids = _ids(group)
         if ids is None:
             raise BadGroups(f"each group that match() returns must be a list of ids; one is {type(group).__name__}")
-        wrong = _wrong(ids, players, there, taken)
-        if wrong:
-            problem = problem or wrong
+        fault = _fault(ids, players, waiting_ids, taken)
+        if fault:
+            problem = problem or fault
         else:
             taken.update(ids)
             found.append(ids)
@@ -63,6 +64,7 @@ def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[l
 
 
 def _ids(group: Any) -> list[str] | None:
+    """The ids of a group; None if it is no list of ids or candidates."""
     if isinstance(group, str | bytes | Mapping) or not isinstance(group, Iterable):
         return None
     found: list[str] = []
@@ -74,8 +76,9 @@ def _ids(group: Any) -> list[str] | None:
     return found
 
 
-def _wrong(ids: list[str], players: int, there: set[str], taken: set[str]) -> str:
-    if not there.issuperset(ids):
+def _fault(ids: list[str], players: int, waiting_ids: set[str], taken: set[str]) -> str:
+    """Why the group cannot be played, in a sentence for the researcher; empty if it can."""
+    if not waiting_ids.issuperset(ids):
         return "match() chose an id that is not among those who wait"
     if len(set(ids)) < len(ids):
         return "match() chose a participant twice in one group"

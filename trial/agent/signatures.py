@@ -1,7 +1,7 @@
-"""How the methods of a researcher's agent are to be called: with or without the environment, a seed, a game.
+"""Finds out which arguments the methods of a researcher's agent take: the environment, a seed, the game …
 
-HIPPO's documentation has `step(env, action)`, its sample agents `step(action)`, and its first version functions of a
-module. What a method takes is read once, by `inspect.signature`, when the agent is loaded.
+HIPPO's documentation has `step(env, action)`, its sample agents have `step(action)`, and its first version has
+functions of a module. The parameters of a method are read once, by `inspect.signature`, when the agent is loaded.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
 CONFIG, PLAYER = "config", "player"
-"""What a parameter is given. CONFIG: the section `trial` as HIPPO's trial has it. PLAYER: whose picture is to be drawn.
-WORD: the newest word of feedback since the last step, or the text None."""
+"""The kinds of arguments. CONFIG is the section `trial` in HIPPO's form (`hippo_config.py`). PLAYER is the player whose
+view `render` draws. WORD is the newest word of feedback since the last step, or NO_WORD."""
 
 NO_WORD = "None"
-"""What HIPPO's TAMER and COACH agents take for no feedback."""
+"""The text that HIPPO's TAMER and COACH agents get if there was no feedback."""
 
 _NAMES = {
     "env": ENV, "environment": ENV, "gym_env": ENV,
@@ -35,7 +35,7 @@ _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "reset": ((), (ENV,)),
     "close": ((), (ENV,)),
 }
-"""What each method may take in this order, the usual form first. `seed` and `options` of `reset` go by their names."""
+"""The positional arguments of each method, its usual form first. `reset` gets `seed` and `options` by name."""
 
 _SHOWN = {
     "start": "start(game)",
@@ -52,7 +52,7 @@ class UnfitSignature(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """What to give to a method: in its order, and by name. Each value is one of the constants above."""
+    """The arguments of a method: positional ones, in `order`, and those by name. Each is one of the kinds above."""
 
     order: tuple[str, ...]
     named: Mapping[str, str] = field(default_factory=dict)
@@ -62,21 +62,21 @@ class Signature:
         return ENV in self.order
 
     def call(self, function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
-        """Call it with what it takes of `given`."""
+        """Call the function with its arguments; `given` has a value for each kind."""
         return function(
-            *[given[what] for what in self.order], **{name: given[what] for name, what in self.named.items()}
+            *[given[kind] for kind in self.order], **{name: given[kind] for name, kind in self.named.items()}
         )
 
 
 def usual(method: str) -> Signature:
-    """How a method is called whose parameters cannot be read."""
+    """The usual form of a method; also for methods whose parameters cannot be read."""
     return Signature(_FORMS[method][0])
 
 
 def read(method: str, function: Callable[..., Any]) -> Signature:
-    """How to call `function`, which is the agent's `start`, `step`, `render`, `reset` or `close`.
+    """The signature of `function`, which is the agent's `start`, `step`, `render`, `reset` or `close`.
 
-    Raises UnfitSignature if it needs a value that cannot be given.
+    Raises UnfitSignature if the function needs an argument that no form of the method has.
     """
     try:
         parameters = list(inspect.signature(function).parameters.values())
@@ -100,7 +100,7 @@ def names(function: Callable[..., Any], parameter: str) -> bool:
 
 
 def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str, str], list[inspect.Parameter]]:
-    """What `reset` takes by name, and the other parameters."""
+    """The arguments that `reset` takes by name, and the other parameters."""
     if method != "reset":
         return {}, parameters
     named: dict[str, str] = {}
@@ -117,7 +117,7 @@ def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str
 
 
 def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[str]]:
-    """The names of the parameters that must be given in order, and of all that can be."""
+    """The names of the positional parameters: of those without a default, and of all."""
     in_order = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     possible = [p.name.lower() for p in in_order]
     possible += [ACTION] * any(p.kind is p.VAR_POSITIONAL for p in parameters) * (not possible)
@@ -125,15 +125,18 @@ def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[st
 
 
 def _order(method: str, needed: list[str], possible: list[str]) -> tuple[str, ...] | None:
-    """What to give in order; None if nothing fits. First by the parameters' names, as far as known, then by number."""
+    """The form of the method with as many arguments as it needs, and with most of them under their names.
+
+    None if no form has as many arguments.
+    """
     if not needed and method in ("start", "step"):
         needed = possible[:1]
     if method == "step" and [_NAMES.get(name) for name in needed] == [ENV]:
         needed = possible[:2]
-    meant = tuple(_NAMES.get(name, "") for name in needed)
-    if meant == (ACTION, ENV):
-        return meant
+    kinds = tuple(_NAMES.get(name, "") for name in needed)
+    if kinds == (ACTION, ENV):
+        return kinds
     fitting = [form for form in _FORMS[method] if len(form) == len(needed)]
     if len(needed) == 3:
-        fitting = [form for form in fitting if form[-1] == meant[-1]]
-    return max(fitting, key=lambda form: sum(map(str.__eq__, form, meant)), default=None)
+        fitting = [form for form in fitting if form[-1] == kinds[-1]]
+    return max(fitting, key=lambda form: sum(map(str.__eq__, form, kinds)), default=None)

@@ -1,4 +1,4 @@
-"""Starts the researcher's agent and decides by which of the two adapters it is called."""
+"""Starts the researcher's agent, and decides whether it has one player (`AgentAdapter`) or several (`JointAdapter`)."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ from trial.agent.joint import JointAdapter
 
 
 def start(adapter: AgentAdapter, players: Sequence[str] = ()) -> AgentAdapter | JointAdapter:
-    """Start the agent's game. The adapter itself if there is one player, else one for several.
+    """Start the agent's game. Return the adapter itself if the game has one player, else a JointAdapter.
 
-    `players` are the names in `trial.players`. Several play if `start` returned such an environment (or the agent keeps
-    it in its attribute `env`), if the agent has `possible_agents`, or if `players` has more than one name. But a class
-    with a `step` of its own is called for one player unless `players` or its own `possible_agents` say otherwise: it
-    may play the others itself. Raises AgentError, and whatever the researcher's code raises.
+    `players` are the names in `trial.players`. The game has several players if the environment (`adapter.env`) or the
+    agent has `possible_agents`, or if `players` has more than one name. But an agent with a `step` of its own may play
+    the others itself. It has one player unless `players` or its own `possible_agents` name several. Raises AgentError,
+    and whatever the researcher's code raises.
     """
     adapter.begin()
-    own = environments.player_keys(adapter.agent)
-    keys = own or environments.player_keys(adapter.env)
-    if not own and adapter.steps_itself and len(players) < 2:
-        keys = []
+    env = adapter.env
+    keys = environments.player_keys(adapter.agent)
+    if not keys and (len(players) > 1 or not adapter.steps_itself):
+        keys = environments.player_keys(env)
     if not keys and len(players) > 1:
         keys = list(players)
     if not keys:
         adapter.name_actions()
         return adapter
-    env = adapter.env
-    about = adapter.agent if env is None else env
     try:
         found = environments.players_of(
-            about, keys, adapter.configured, of_env=env is not None, stepped=not adapter.steps_itself
+            adapter.agent if env is None else env,
+            keys,
+            adapter.configured_actions,
+            of_env=env is not None,
+            stepped=not adapter.steps_itself,
         )
     except environments.PlayersUnknown as error:
         raise AgentError(str(error)) from None

@@ -1,4 +1,4 @@
-"""Errors of the researcher's code, for the log."""
+"""Formats errors of the researcher's code for the log."""
 
 from __future__ import annotations
 
@@ -12,33 +12,34 @@ _LONGEST_CHAIN = 20
 
 
 def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> str:
-    """The traceback. Its last line says where in the folder's files, and what: `agent.py:30: NameError: …`.
+    """The traceback. Its last line is the place in the folder's files and the error: `agent.py:30: NameError: …`.
 
-    The whole message of the error is in that line. `private`, ids of participants, are left out.
+    That line has the whole message of the error. The participants' ids in `private` are replaced (`without`).
     """
-    whole, only = traceback.format_exception(error), traceback.format_exception_only(error)
-    frames = whole[: -len(only)] if whole[-len(only) :] == only else whole
-    indented = [part for part in only if part.startswith(" ")]  # the line that is no Python
-    words = " ".join("".join(part for part in only if part not in indented).split()).removeprefix("trial.agent.agent.")
+    whole, last = traceback.format_exception(error), traceback.format_exception_only(error)
+    frames = whole[: -len(last)] if whole[-len(last) :] == last else whole
+    indented = [part for part in last if part.startswith(" ")]  # of a SyntaxError: the line of the file
+    message = " ".join("".join(part for part in last if part not in indented).split())
+    message = message.removeprefix("trial.agent.agent.")
     place = where(error, folder)
-    return without(private, "".join([*frames, *indented]) + (f"{place}: {words}" if place else words))
+    return without(private, "".join([*frames, *indented]) + (f"{place}: {message}" if place else message))
 
 
 def where(error: BaseException, folder: Path) -> str | None:
-    """The innermost line of the researcher's own that led to the error, as `agent.py:30`; None if there is none."""
+    """The innermost line of the researcher's own code that led to the error, as `agent.py:30`; None without one."""
     for each in _chain(error):
         places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(each.__traceback__)]
         if isinstance(each, SyntaxError) and each.filename:
             places.append((each.filename, each.lineno))
         for filename, number in reversed(places):
-            own = _own(Path(filename), folder)
+            own = _own_path(Path(filename), folder)
             if own is not None and number:
                 return f"{own}:{number}"
     return None
 
 
-def _own(path: Path, folder: Path) -> str | None:
-    """The file's name within the folder, unless it is a library's or ours."""
+def _own_path(path: Path, folder: Path) -> str | None:
+    """The file's path within the folder; None for a file outside, of an installed package, or of Hippodrome."""
     if not path.is_relative_to(folder) or path.is_relative_to(_OURS):
         return None
     inside = path.relative_to(folder)
@@ -47,6 +48,7 @@ def _own(path: Path, folder: Path) -> str | None:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
+    """The error and the errors that led to it, the latest first."""
     each: BaseException | None = error
     for _ in range(_LONGEST_CHAIN):
         if each is None:
@@ -56,8 +58,8 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def without(private: Iterable[str], text: str) -> str:
-    """The text without these ids of participants."""
-    # Short numbers are left: they are in every traceback. Of two ids that begin alike, the longer one is found first.
+    """The text with `(participant)` in place of these ids of participants. Numbers of up to five digits stay."""
+    # Such numbers are in every traceback. The longest id comes first, since another may be its beginning.
     ids = [each for each in sorted(private, key=len, reverse=True) if each and not (each.isdigit() and len(each) < 6)]
     if not ids:
         return text

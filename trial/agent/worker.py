@@ -1,4 +1,4 @@
-"""The agent's thread: it runs the researcher's code, so that slow code never holds up the event loop."""
+"""The agent's thread: it runs the researcher's code, so that slow code never blocks the event loop."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Done = Callable[[Any, Exception | None], None]
 
 @dataclass(eq=False, slots=True)
 class _Job:
-    """A function that the thread has, and who waits for it."""
+    """A function that was given to the thread, with `done`, which takes its result. `until` is a time of the loop."""
 
     done: Done
     until: float
@@ -31,10 +31,10 @@ class _Job:
 
 
 class _Notifier:
-    """Makes an event loop call `callback` once for each `notify`, which another thread may call.
+    """Makes an event loop call `callback` once for each `notify`, which any thread may call.
 
-    `call_soon_threadsafe` does that too, with a handle, a write to its own socket and two reads of it: a tick of two
-    participants takes 3 % more with it.
+    `call_soon_threadsafe` does the same, but makes a handle, a write to a socket of its own and two reads of it: with
+    it a tick of two participants takes 3 % longer.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
@@ -59,11 +59,12 @@ class _Notifier:
 
     def __del__(self) -> None:
         if self._eventfd >= 0:
-            os.close(self._eventfd)  # nobody uses it: the loop while it runs, and a thread that may notify, keep this
+            # Unused by now: a loop that reads it, and a thread that may notify, hold a reference to this object.
+            os.close(self._eventfd)
 
 
 class Worker:
-    """Calls functions one after another on a single thread of its own (many simulators need one and the same thread).
+    """Calls functions one after another on one thread of its own, since many simulators must stay on one thread.
 
     The thread is a daemon: code that never returns cannot keep the process alive.
     """
@@ -72,21 +73,22 @@ class Worker:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
-        self._out = 0  # functions that have not returned
-        self._waiting: dict[_Job, None] = {}  # those that are not late
+        self._unfinished = 0  # functions that have not returned
+        self._waiting: dict[_Job, None] = {}  # those of them that are not late; a dict keeps the order
         self._timer: asyncio.TimerHandle | None = None  # one for all of them: most return long before their limit
         self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each
         self._notifier: _Notifier | None = None
 
     @property
     def busy(self) -> bool:
-        """A function has not returned yet (it may never)."""
-        return self._out > 0
+        """Whether a function has not returned yet. It may never return."""
+        return self._unfinished > 0
 
     def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
-        """Call the function on the thread, and then, once, `done` on the event loop; for AgentTimeout after `limit` s.
+        """Call the function on the thread, then `done` on the event loop with its result or exception.
 
-        To be called from the event loop.
+        If the function has not returned after `limit` seconds, `done` gets an AgentTimeout instead. It is called once
+        in any case. `submit` must be called from the event loop.
         """
         loop = asyncio.get_running_loop()
         if self._notifier is None or self._notifier.loop is not loop:
@@ -97,7 +99,7 @@ class Worker:
             results.append((job, *_call(function)))
             notifier.notify()
 
-        self._out += 1
+        self._unfinished += 1
         self._waiting[job] = None
         if self._timer is None or job.until < self._timer.when():
             self._wake_at(loop, job.until)
@@ -105,7 +107,7 @@ class Worker:
 
     def _returned(self) -> None:
         job, result, error = self._results.popleft()
-        self._out -= 1
+        self._unfinished -= 1
         if job in self._waiting:
             del self._waiting[job]
             job.done(result, error)
@@ -113,10 +115,10 @@ class Worker:
     def _wake_at(self, loop: asyncio.AbstractEventLoop, when: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = loop.call_at(when, self._look, loop)
+        self._timer = loop.call_at(when, self._give_up_late, loop)
 
-    def _look(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Give up the functions that are late; look again when the next one may be."""
+    def _give_up_late(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Call `done` of the functions that are late, and set the timer for the next limit."""
         self._timer = None
         now = loop.time()
         late = [job for job in self._waiting if job.until <= now]
@@ -128,7 +130,10 @@ class Worker:
             job.done(None, AgentTimeout(f"no answer within {job.limit:g} s"))
 
     async def call(self, function: Callable[[], T], *, limit: float) -> T:
-        """The function's result, or the exception that it raised. Raises AgentTimeout after `limit` seconds."""
+        """Call the function on the thread. Return its result, or raise its exception.
+
+        Raises AgentTimeout after `limit` seconds.
+        """
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
         def done(result: T, error: Exception | None) -> None:
@@ -155,7 +160,7 @@ class Worker:
 
 
 def _call(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """The function's result, and what it raised. SystemExit in a researcher's code is a failure like another."""
+    """Call the function. Return its result and None, or None and its exception; for SystemExit, a RuntimeError."""
     try:
         return function(), None
     except StopIteration as error:  # cannot be raised in a coroutine

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from trial.agent.callbacks import About, Callbacks
+from trial.agent.callbacks import Callbacks, TrialFacts
 from trial.agent.calls import AgentCalls, Calls
 from trial.agent.joint import JointAdapter
 from trial.agent.joint_calls import JointCalls
@@ -304,7 +304,7 @@ class TrialLoop:
         self.core.callbacks = True
         self._calls.callbacks = Callbacks(
             started.callbacks,
-            About(
+            TrialFacts(
                 self.core.id,
                 self.core.step,
                 settings.group,

@@ -17,18 +17,18 @@ from tests.trial.client_messages import play_to_the_end
 from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
-from trial.agent.callbacks import MOST_VALUES, About, Callbacks, Session, listening
+from trial.agent.callbacks import MOST_VALUES, Callbacks, Session, TrialFacts, listening
 from trial.recordings import recording
 
-ABOUT = About("trial-1", "3", 1)
+FACTS = TrialFacts("trial-1", "3", 1)
 
 
-def made(agent, seconds=5.0, about=ABOUT, **more):
+def made(agent, seconds=5.0, facts=FACTS, **more):
     """The callbacks of an agent, and a list of what raised."""
     raised = []
     callbacks = Callbacks(
         listening(agent),
-        about,
+        facts,
         lambda: "the environment",
         seconds=seconds,
         stamp=dict,
@@ -183,7 +183,7 @@ def test_where_several_take_part_a_line_says_who_did_what_it_is_about():
         def on_tick(self, session):
             return "tick"
 
-    callbacks, _ = made(Agent(), about=About("t-1", "3", players=("left", "right"), humans=("left", "right")))
+    callbacks, _ = made(Agent(), facts=TrialFacts("t-1", "3", players=("left", "right"), humans=("left", "right")))
     callbacks.fed_back("right", "good")
     callbacks.stepped({}, {}, {}, {})
     found = [(line["callback"], line["name"], line.get("player")) for line in lines(callbacks)]

@@ -1,10 +1,11 @@
 """OpenAI Gym's old interface over Gymnasium, for agents that say `import gym`.
 
-The trial puts it at the end of Python's path, so a real `gym` that is installed comes first. `make` returns what Gym
-before 0.26 returned: `reset()` gives the observation alone, `step()` four values, `render(mode="rgb_array")` a picture,
-and `seed()` seeds. With `render_mode` it returns Gym 0.26's five values instead, since that is where `make` got it.
+The trial puts this package at the end of Python's path, so a real `gym` that is installed comes first. Environments of
+`make` are as in Gym before 0.26: `reset()` returns the observation alone, `step()` four values,
+`render(mode="rgb_array")` a picture, and `seed()` seeds. If `make` gets a `render_mode`, which it takes since Gym 0.26,
+`reset` and `step` return what they return there: two and five values.
 
-docs/hippo.md says what is here and what is not.
+docs/hippo.md says which parts of Gym are here.
 """
 
 import sys
@@ -45,7 +46,7 @@ __version__ = version.VERSION
 
 
 def _alias() -> None:
-    """Let `import gym.spaces.box` find what Gymnasium has under that name and this package has not."""
+    """Let `import gym.spaces.box` find Gymnasium's module of that name, where this package has none."""
     for name, module in list(sys.modules.items()):
         if name.startswith(("gymnasium.spaces", "gymnasium.error", "gymnasium.vector", "gymnasium.utils.")):
             sys.modules.setdefault(f"{__name__}{name.removeprefix(gymnasium.__name__)}", module)

@@ -10,7 +10,7 @@ import gymnasium
 
 from gym.utils import seeding
 
-_UNSEEN = "env"  # the one attribute that a wrapper does not ask its environment for
+_OWN_ATTRIBUTE = "env"  # the one missing attribute that a wrapper does not look up in its environment
 
 
 class Env(gymnasium.Env[Any, Any]):
@@ -20,25 +20,25 @@ class Env(gymnasium.Env[Any, Any]):
     reward_range = (-math.inf, math.inf)
 
     def seed(self, seed: Any = None) -> Any:
-        """Seed `np_random`; the list of seeds that are used."""
+        """Seed `np_random`. Return a list with the seed."""
         self.np_random, used = seeding.np_random(seed)
         return [used]
 
     def reset(self, **kwargs: Any) -> Any:
-        """Begin an episode. With a `seed`, as later versions of Gym have it, seed `np_random` first."""
+        """Begin an episode. If there is a `seed`, as in later versions of Gym, seed `np_random` first."""
         if kwargs.get("seed") is not None:
             self.seed(kwargs["seed"])
 
     def step(self, action: Any) -> Any:
-        """The observation, reward, whether the episode is done, and info."""
+        """Take a step. Return the observation, the reward, whether the episode is done, and the info."""
         raise NotImplementedError
 
     def render(self, mode: str = "human") -> Any:
-        """Draw; with the mode rgb_array, return the picture."""
+        """Draw. With the mode rgb_array, return the picture."""
         raise NotImplementedError
 
-    def compute_reward(self, *given: Any) -> Any:
-        """The base class of environments with goals."""
+    def compute_reward(self, *arguments: Any) -> Any:
+        """The reward for goals: GoalEnv's method."""
         raise NotImplementedError
 
 
@@ -46,7 +46,7 @@ GoalEnv = Env
 
 
 class Wrapper(Env):
-    """Wraps another environment, whose attributes it has too; `reset` and `step` return what that returns."""
+    """Wraps another environment, and has its attributes too. `reset` and `step` return the results of that one."""
 
     def __init__(self, env: Any, new_step_api: bool = False) -> None:
         self.env = env
@@ -56,7 +56,7 @@ class Wrapper(Env):
         self.render_mode = getattr(env, "render_mode", None)
 
     def __getattr__(self, name: str) -> Any:
-        if name == _UNSEEN or name.startswith("__"):
+        if name == _OWN_ATTRIBUTE or name.startswith("__"):
             raise AttributeError(name)
         if isinstance(self.env, gymnasium.Env) and not isinstance(self.env, Env):
             return self.env.get_wrapper_attr(name)
@@ -69,7 +69,7 @@ class Wrapper(Env):
 
     @property
     def np_random(self) -> Any:
-        """That of the environment."""
+        """The environment's generator of random numbers."""
         return self.env.np_random
 
     @np_random.setter
@@ -155,12 +155,12 @@ class ActionWrapper(Wrapper):
 
 
 def with_info(result: Any) -> bool:
-    """Whether this result of `reset` is an observation with its info."""
+    """Whether this result of `reset` is a pair of observation and info."""
     return isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)
 
 
 class FromGymnasium(Env):
-    """One of Gymnasium's environments with the old interface. Its other attributes can be read and set here."""
+    """An environment of Gymnasium's with Gym's old interface. Its other attributes can be read and set here too."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         own = self.__dict__
@@ -181,12 +181,12 @@ class FromGymnasium(Env):
 
     @property
     def unwrapped(self) -> Any:
-        """This environment: below it, the interface is another."""
+        """The innermost environment that has the old interface."""
         return self.base.old.unwrapped if isinstance(self.base, ToGymnasium) else self
 
     @property
     def np_random(self) -> Any:
-        """That of the environment."""
+        """The environment's generator of random numbers."""
         return self.base.np_random
 
     @np_random.setter
@@ -194,13 +194,13 @@ class FromGymnasium(Env):
         self.base.np_random = value
 
     def seed(self, seed: Any = None) -> Any:
-        """Begin the next episode with this seed."""
+        """Let the next `reset` use this seed, or a random one if it is None. Return a list with the seed."""
         _, used = seeding.np_random(seed)
         self.__dict__["next_seed"] = used % 2**31 if seed is None else used
         return [self.next_seed]
 
     def reset(self, **kwargs: Any) -> Any:
-        """Begin an episode: the observation, or with `return_info` the observation and info."""
+        """Begin an episode. Return the observation, or with `return_info` the observation and the info."""
         seed, self.__dict__["next_seed"] = self.next_seed, None
         if kwargs.get("seed") is not None:
             seed = int(kwargs["seed"])
@@ -208,14 +208,14 @@ class FromGymnasium(Env):
         return (observation, info) if kwargs.get("return_info") else observation
 
     def step(self, action: Any) -> Any:
-        """The observation, reward, whether the episode is done, and info."""
+        """Take a step. Return the observation, the reward, whether the episode is done, and the info."""
         observation, reward, terminated, truncated, info = self.inner.step(action)
         if truncated:
             info = {**info, "TimeLimit.truncated": not terminated}
         return observation, reward, bool(terminated or truncated), info
 
     def render(self, mode: str = "human", **kwargs: Any) -> Any:
-        """The picture, also for the mode human, since a server has no screen. Other modes as Gymnasium has them."""
+        """Return the picture, also for the mode human: a server has no screen. Other modes are as in Gymnasium."""
         if mode in ("human", "rgb_array", self.base.render_mode):
             return self.inner.render()
         before = self.base.render_mode
@@ -237,7 +237,7 @@ class FromGymnasium(Env):
 
 
 class ToGymnasium(gymnasium.Env[Any, Any]):
-    """An environment with the old interface as one of Gymnasium's, for Gymnasium's wrappers."""
+    """An environment with Gym's old interface as one of Gymnasium's, for Gymnasium's wrappers."""
 
     def __init__(self, old: Any) -> None:
         self.old = old

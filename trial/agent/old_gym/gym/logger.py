@@ -1,4 +1,4 @@
-"""Gym's logger, on Gymnasium's."""
+"""Gym's logger, by means of Gymnasium's."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ DEBUG, INFO, WARN, ERROR, DISABLED = 10, 20, 30, 40, 50
 
 
 def set_level(level: int) -> None:
-    """Say nothing below this level."""
+    """Log nothing below this level."""
     logger.min_level = level
 
 
@@ -33,7 +33,7 @@ setLevel = set_level  # noqa: N816 - Gym has both names
 
 
 def debug(text: str, *values: Any) -> None:
-    """Gym shows this only at its lowest level; here it is never shown."""
+    """Do nothing: Gym shows such messages only at its lowest levels."""
 
 
 info = debug

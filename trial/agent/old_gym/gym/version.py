@@ -1,3 +1,3 @@
-"""The version whose interface this is: the last that was in wide use before `step` had five values."""
+"""The version of Gym whose interface this package has: the last in wide use before `step` returned five values."""
 
 VERSION = "0.21.0"

@@ -1,4 +1,4 @@
-"""`make` and `register`: environments that an agent registers, and all of Gymnasium's and ALE's, by old ids too."""
+"""`make` and `register`, for environments that an agent registers, and for Gymnasium's and ALE's, by old ids too."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PICTURE = "rgb_array"
 
 @dataclass
 class EnvSpec:
-    """What `register` was told."""
+    """The arguments of `register`."""
 
     id: str
     entry_point: str | Callable[..., Any] | None = None
@@ -46,7 +46,7 @@ class EnvRegistry(ChainMap[str, Any]):
 
     @property
     def env_specs(self) -> EnvRegistry:
-        """The same, by its older name."""
+        """The registry itself, under its older name."""
         return self
 
     def all(self) -> Any:
@@ -70,7 +70,7 @@ registry = EnvRegistry({}, gymnasium.registry)
 
 
 def register(id: str, entry_point: Any = None, **kwargs: Any) -> None:
-    """Let `make` know an environment: `entry_point` is its class, a function, or `module:Class`."""
+    """Register an environment for `make`. `entry_point` is its class, a function, or `module:Class`."""
     known = {key: value for key, value in kwargs.items() if key in EnvSpec.__dataclass_fields__ and value is not None}
     registry[id] = EnvSpec(id, entry_point, **known)
 
@@ -83,17 +83,16 @@ def spec(id: str) -> Any:
 
 
 def make(id: Any, **kwargs: Any) -> Any:
-    """A new environment. Raises gym.error.Error if there is none of this id."""
-    name = id if isinstance(id, str) else id.id
-    name = _imported(name)
-    ours = id if isinstance(id, EnvSpec) else registry.maps[0].get(name)
+    """Make a new environment, of an id or an EnvSpec. Raises gym.error.Error if there is none of this id."""
+    name = _imported(id if isinstance(id, str) else id.id)
+    registered = id if isinstance(id, EnvSpec) else registry.maps[0].get(name)
     for old in ("new_step_api", "apply_api_compatibility", "autoreset", "disable_env_checker"):
         kwargs.pop(old, None)
-    return _make_registered(ours, kwargs) if ours is not None else _make_of_gymnasium(name, kwargs)
+    return _make_registered(registered, kwargs) if registered is not None else _make_of_gymnasium(name, kwargs)
 
 
 def _imported(id: str) -> str:
-    """The id without its module, `module:Env-v0`, which registers it when it is imported."""
+    """The id without its module. The module of `module:Env-v0` is imported, which registers the environment."""
     module, colon, rest = id.partition(":")
     if colon:
         importlib.import_module(module)
@@ -136,14 +135,14 @@ def _make_of_gymnasium(id: str, kwargs: dict[str, Any]) -> Any:
 
 
 def _quietly(id: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Make it without a limit of steps, and without a warning that the id is old."""
+    """Make an environment of Gymnasium's, without a limit of steps, and without a warning that the id is old."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
 
 def _newest(id: str) -> tuple[str, dict[str, Any]]:
-    """The id under which Gymnasium or ALE has the environment now, and what it must be made with."""
+    """The id under which Gymnasium or ALE has the environment now, and further arguments for `gymnasium.make`."""
     atari = _OLD_ATARI.fullmatch(id)
     if (id.startswith("ALE/") or atari) and id not in gymnasium.registry:
         with contextlib.suppress(ImportError):

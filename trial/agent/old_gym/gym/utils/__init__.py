@@ -1,4 +1,4 @@
-"""Gymnasium's, but for seeding."""
+"""Gym's utilities: Gymnasium's, and `seeding` of this package."""
 
 from gymnasium.utils import EzPickle, colorize
 

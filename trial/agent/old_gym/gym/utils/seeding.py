@@ -1,4 +1,4 @@
-"""Random numbers with the methods of numpy's RandomState, which Gym's environments used, and of its Generator."""
+"""Random numbers, by a generator with the methods of NumPy's Generator and of RandomState, which Gym used earlier."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from gymnasium import error
 
 
 class RandomNumberGenerator(np.random.Generator):
-    """A Generator that also has RandomState's names."""
+    """A NumPy Generator that has RandomState's methods too."""
 
     def rand(self, *shape: int) -> Any:
         """Numbers in [0, 1)."""
@@ -30,7 +30,7 @@ RNG = RandomNumberGenerator
 
 
 def np_random(seed: Any = None) -> tuple[RandomNumberGenerator, int]:
-    """A generator, and the seed that it has got. Raises gym.error.Error if the seed is no whole number from 0 on."""
+    """A new generator, and its seed (random for None). Raises gym.error.Error if it is no whole number from 0."""
     if seed is not None and not (isinstance(seed, int | np.integer) and seed >= 0):
         raise error.Error(f"Seed must be a non-negative integer or omitted, not {seed}")
     sequence = np.random.SeedSequence(None if seed is None else int(seed))
@@ -40,13 +40,13 @@ def np_random(seed: Any = None) -> tuple[RandomNumberGenerator, int]:
 
 
 def create_seed(seed: Any = None, max_bytes: int = 8) -> int:
-    """The seed, or a new one."""
+    """The seed as an int; a random one of at most `max_bytes` bytes if it is None."""
     bits: int = 8 * max_bytes
     return np_random()[1] % (1 << bits) if seed is None else int(seed)
 
 
 def hash_seed(seed: Any = None, max_bytes: int = 8) -> int:
-    """Another seed that follows from this one."""
+    """Another seed, which depends on this one alone."""
     words = np.random.SeedSequence(create_seed(seed)).generate_state(2)
     bits: int = 8 * max_bytes
     return (int(words[0]) << 32 | int(words[1])) % (1 << bits)

@@ -1,4 +1,4 @@
-"""Gym's wrappers: TimeLimit, and Gymnasium's under the names that Gym had for them."""
+"""Gym's wrappers: TimeLimit, and Gymnasium's wrappers under Gym's names."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["Monitor", "OrderEnforcing", "TimeLimit", "Wrapper"]
 
 
 class OrderEnforcing(Wrapper):
-    """Gym's; changes nothing here."""
+    """Stands for Gym's wrapper. It changes nothing."""
 
 
 class Monitor(Wrapper):
-    """Gym's Monitor wrote videos and results to a folder. Here the trial records; this changes nothing, and says so."""
+    """Stands for Gym's Monitor, which wrote videos and results to a folder. This one warns that it writes nothing."""
 
     def __init__(self, env: Any, *args: Any, **kwargs: Any) -> None:
         warnings.warn("gym.wrappers.Monitor writes nothing here: the trial records each step itself", stacklevel=2)
@@ -45,11 +45,12 @@ _NAMES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "TransformObservation": ("TransformObservation", {"f": "func"}),
     "TransformReward": ("TransformReward", {"f": "func"}),
 }
-"""Gym's name: Gymnasium's, and the arguments that have other names there."""
+"""By Gym's name of a wrapper: Gymnasium's name, and Gymnasium's names of the arguments by Gym's."""
 
 
-def _of_gymnasium(name: str, theirs: str, renamed: Mapping[str, str]) -> type[Wrapper]:
-    wrap: Any = getattr(wrappers, theirs)
+def _of_gymnasium(name: str, gymnasium_name: str, renamed: Mapping[str, str]) -> type[Wrapper]:
+    """A class for Gymnasium's wrapper that wraps environments with Gym's old interface."""
+    wrap: Any = getattr(wrappers, gymnasium_name)
 
     def __init__(self: Any, env: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         kwargs = {renamed.get(key, key): value for key, value in kwargs.items()}
@@ -61,18 +62,18 @@ def _of_gymnasium(name: str, theirs: str, renamed: Mapping[str, str]) -> type[Wr
         wrapped = wrap(new if new is not None else ToGymnasium(env), *args, **kwargs)
         Wrapper.__init__(self, wrapped if new is not None else FromGymnasium(wrapped))
 
-    return type(name, (Wrapper,), {"__init__": __init__, "__doc__": f"Gymnasium's {theirs}."})
+    return type(name, (Wrapper,), {"__init__": __init__, "__doc__": f"Gymnasium's {gymnasium_name}."})
 
 
 def _new(env: Any) -> gymnasium.Env[Any, Any] | None:
-    """The environment of Gymnasium that `make` was asked for with a `render_mode`; None for the old interface."""
+    """The environment of Gymnasium that `make` returns with a `render_mode`; None if `env` has the old interface."""
     if type(env) is Wrapper and isinstance(env.env, gymnasium.Env) and not isinstance(env.env, Env):
         return env.env
     return None
 
 
-for _name, (_theirs, _renamed) in _NAMES.items():
-    globals()[_name] = _of_gymnasium(_name, _theirs, _renamed)
+for _name, (_gymnasium_name, _renamed) in _NAMES.items():
+    globals()[_name] = _of_gymnasium(_name, _gymnasium_name, _renamed)
     __all__ += [_name]  # noqa: PLE0604
 
 for _module in ("atari_preprocessing", "frame_stack", "monitor", "record_video", "transform_observation"):

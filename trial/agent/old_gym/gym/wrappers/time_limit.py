@@ -1,4 +1,4 @@
-"""Ends an episode after so many steps."""
+"""Gym's wrapper TimeLimit, which ends an episode after a number of steps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from gym.core import Wrapper
 
 
 class TimeLimit(Wrapper):
-    """Ends an episode after `max_episode_steps`. The info's `TimeLimit.truncated` then says whether it did so."""
+    """Ends an episode after `max_episode_steps`.
+
+    With four values, `TimeLimit.truncated` in the info then says whether the wrapper ended the episode; with five
+    values, `truncated` is True.
+    """
 
     def __init__(self, env: Any, max_episode_steps: int | None = None, new_step_api: bool = False) -> None:
         super().__init__(env)
