@@ -1,1 +1,1 @@
-"""Players of an environment that are no humans: ONNX files, `random`, `idle`, and classes of agent.py."""
+"""The policies that play for players of an environment: ONNX files, `random`, `idle`, and classes of agent.py."""

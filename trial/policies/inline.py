@@ -1,4 +1,4 @@
-"""Asks a policy that takes no time on the event loop itself, so that it needs no thread."""
+"""Asks a quick policy on the event loop itself, without a thread."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trial.policies.thread import Done
 
 
 class InlinePolicy:
-    """Has the methods of `PolicyThread`. `done` is called soon, once for each question."""
+    """Asks a policy whose methods return at once. Has the same methods as `PolicyThread`."""
 
     busy = False
 
@@ -22,7 +22,7 @@ class InlinePolicy:
         self._loop = asyncio.get_running_loop()
 
     def ask(self, ask_id: int, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> None:
-        """Ask for an action; `done(ask_id, action, None)` follows."""
+        """Ask for an action. The event loop then calls `done(ask_id, action, None)`."""
         self._loop.call_soon(self._done, ask_id, self.policy.act(observation, info, mask), None)
 
     def reset(self, seed: int) -> None:
@@ -30,5 +30,5 @@ class InlinePolicy:
         self.policy.reset(seed)
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Close the policy."""
         self.policy.close()

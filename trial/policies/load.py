@@ -1,4 +1,4 @@
-"""Makes a policy of what `trial.players` says of a player."""
+"""Makes the policy that `trial.players` names for a player."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ def load(
     player: str = "player_1",
     idle: int = 0,
 ) -> Policy:
-    """The policy for one player: `random`, `idle`, `agent:Class`, `FILE.onnx` or `sample:FILE.onnx`.
+    """Make the policy `spec` for one player: `random`, `idle`, `agent:Class`, `FILE.onnx` or `sample:FILE.onnx`.
 
-    `folder` is that of agent.py, `agent_module` the module that agent.py has become (None without one), and
-    `observation_space` the player's space, if it is known. Files are tried with one observation of zeros.
-    Raises PolicyError with a sentence, and whatever the researcher's class raises.
+    `folder` is the project's, `agent_module` the imported agent.py (None without one), `observation_space` the
+    player's space (None if it is not known), and `idle` the number of the player's idle action. A file is tried with
+    one observation of zeros, if the space is known. Raises PolicyError with a sentence for the researcher, and whatever
+    the researcher's class raises.
     """
     if spec == "random":
         return RandomPolicy(action_count)
@@ -33,7 +34,7 @@ def load(
     if spec.startswith(AGENT_PLAYER):
         return of_class(spec, agent_module, player, action_count)
     if spec.endswith(".onnx"):
-        from trial.policies import onnx  # noqa: PLC0415 - numpy and onnxruntime, which most projects do without
+        from trial.policies import onnx  # noqa: PLC0415 - it imports onnxruntime, which most projects do not need
 
         name = spec.removeprefix(SAMPLE)
         return onnx.load(spec, _file(folder, name), action_count, observation_space, sample=spec != name)
@@ -41,7 +42,7 @@ def load(
 
 
 def _file(folder: Path, name: str) -> Path:
-    """The file of this name below the folder. Raises PolicyError."""
+    """The file of this name in the folder or below it. Raises PolicyError if there is none."""
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise PolicyError(f"{name} leads out of the project's folder")

@@ -1,4 +1,4 @@
-"""How an observation becomes the numbers that a policy's file takes."""
+"""Turns an observation into the array of numbers that a policy's file takes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from trial.core.players import ACTION_MASK
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Shape = Sequence[int | str | None]
-"""Of an input: a text or None is a size that the file leaves open."""
+"""The shape of an input. A text or None stands for a size that the file leaves open."""
 Encoding = Callable[[Any], Array]
+"""Turns an observation into an array."""
 
 MOST_ONE_HOT = 10_000_000
-"""Numbers of an observation whose discrete parts are one-hot; no policy takes more."""
+"""The most numbers of an observation whose discrete parts are one-hot; no policy takes more."""
 
 
 def without_mask(observation: Any) -> Any:
-    """What is to be seen, without the mask that PettingZoo's games put beside it."""
+    """The observation without the `action_mask` that PettingZoo's games put beside it.
+
+    A map with one entry left becomes the value of that entry.
+    """
     if isinstance(observation, Mapping) and ACTION_MASK in observation:
         rest = {key: value for key, value in observation.items() if key != ACTION_MASK}
         return next(iter(rest.values())) if len(rest) == 1 else rest
@@ -29,7 +33,7 @@ def without_mask(observation: Any) -> Any:
 
 
 def flat(observation: Any) -> Array:
-    """All its numbers in one row. Those of a map come in the order of its sorted keys, as RLlib and Gymnasium do it."""
+    """All numbers of an observation in one row; those of a map in the order of its keys, as in RLlib and Gymnasium."""
     if isinstance(observation, Mapping):
         parts = [flat(observation[key]) for key in sorted(observation, key=str)]
     elif isinstance(observation, tuple):
@@ -40,20 +44,23 @@ def flat(observation: Any) -> Array:
 
 
 def numbers(observation: Any) -> Array:
-    """An array stays as it is; of a map or a tuple, all numbers in a row."""
+    """The observation as an array: of a map or a tuple all numbers in a row, anything else in its own shape."""
     return flat(observation) if isinstance(observation, Mapping | tuple) else np.asarray(observation)
 
 
 def encodings(space: Any) -> list[Encoding]:
-    """How observations of this space may be meant, the likeliest first: as they are, or a discrete one as one-hot."""
-    found: list[Encoding] = [numbers]
+    """The encodings that a file may expect for observations of this space, the likeliest first.
+
+    They are the numbers as they are, and those with each discrete value as one-hot.
+    """
+    possible: list[Encoding] = [numbers]
     if space is not None and one_hot_size(space) <= MOST_ONE_HOT:
-        found.append(lambda observation: _one_hot(space, observation))
-    return found
+        possible.append(lambda observation: _one_hot(space, observation))
+    return possible
 
 
 def one_hot_size(space: Any) -> int:
-    """How many numbers an observation of this space has where each `Discrete` is one-hot; 0 if that is not known."""
+    """How many numbers an observation of this space has if each discrete value is one-hot; 0 if that is not known."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         return sum(map(one_hot_size, inner.values()))
@@ -68,7 +75,7 @@ def one_hot_size(space: Any) -> int:
 
 
 def _one_hot(space: Any, observation: Any) -> Array:
-    """The numbers in a row, where each `Discrete` is one-hot, as Gymnasium's `flatten` and RLlib do it."""
+    """The numbers in a row, each discrete value as one-hot, as Gymnasium's `flatten` and RLlib do it."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         parts = [_one_hot(inner[key], observation[key]) for key in sorted(inner, key=str) if key in observation]
@@ -90,7 +97,7 @@ def _one_hot(space: Any, observation: Any) -> Array:
 
 
 def zero(space: Any) -> Any:
-    """An observation of zeros, or of the least value of what cannot be zero. None if the space is not known."""
+    """An observation of zeros, with `start` for each `Discrete`. None if the space is not known."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         return {key: zero(part) for key, part in inner.items()}
@@ -105,8 +112,8 @@ def zero(space: Any) -> Any:
 def fitted(values: Array, shape: Shape) -> Array | None:
     """The values in the shape of an input, with a batch of one; None if they do not fit.
 
-    They fit as they are, with one or two axes of size 1 before them (batch and time), in one row, or as an image whose
-    channels come first.
+    They may fit as they are, with one or two axes of size 1 before them (batch and time), in one row, or as an image
+    with its channels as the first axis.
     """
     if any(size == 0 for size in shape):
         return None
@@ -117,10 +124,10 @@ def fitted(values: Array, shape: Shape) -> Array | None:
         if _fits(candidate, shape):
             return values.reshape(candidate)
     if values.ndim == 3:
-        first = np.moveaxis(values, 2, 0)
-        for candidate in ((1, *first.shape), first.shape):
+        channels_first = np.moveaxis(values, 2, 0)
+        for candidate in ((1, *channels_first.shape), channels_first.shape):
             if _fits(candidate, shape):
-                return first.reshape(candidate)
+                return channels_first.reshape(candidate)
     return None
 
 
@@ -131,7 +138,7 @@ def _fits(sizes: Sequence[int], shape: Shape) -> bool:
 
 
 def shown(shape: Shape) -> str:
-    """A shape in words: `12 numbers` or `84 x 84 x 3`, without the batch."""
+    """The shape as a text, without the batch: `12 numbers` or `84 x 84 x 3`."""
     sizes = [str(size) if isinstance(size, int) else "any" for size in shape]
     if len(sizes) > 1 and sizes[0] in ("any", "1"):
         sizes = sizes[1:]

@@ -1,9 +1,9 @@
-"""Policies that are ONNX files, run by onnxruntime on one thread of the CPU.
+"""Runs policies that are ONNX files, by onnxruntime on one thread of the CPU.
 
-The names of inputs and outputs are those of the exports that researchers have: RLlib's (`obs`, `state_ins` or
-`state_in_0` …, `seq_lens`; `output`, `state_outs` or `state_out_0` …), those of sb3-contrib (`episode_starts`), and any
-pairs with `_in` and `_out` or `h` and `hn`. An older RLlib numbers its states wrongly, so that a second state is called
-`seq_lens`; a second axis tells it from the real one.
+An input or output is known by its name, as the usual exports have it: RLlib's (`obs`, `state_ins` or `state_in_0` …,
+`seq_lens`; `output`, `state_outs` or `state_out_0` …), those of sb3-contrib (`episode_starts`), and any pairs with
+`_in` and `_out` or `h` and `hn`. An older RLlib numbers its states wrongly, so that a second state has the name
+`seq_lens`. That one has two axes; the real `seq_lens` has one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from trial.policies.policy import PolicyError
 
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
-"""Inputs that are no observation, by their value where one observation comes at a time."""
+"""Inputs with a constant value, and that value if the file gets one observation at a time."""
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16,
     "tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(int16)": np.int16, "tensor(int8)": np.int8,
@@ -33,7 +33,7 @@ _TYPES: dict[str, type[np.generic]] = {
 _OUTPUTS = (
     ("_in", "_out"), ("in_", "out_"), ("", "_out"), ("", "n"), ("", "_n"), ("0", "n"), ("_0", "_n"), ("", "_next"),
 )  # fmt: skip
-"""How the name of a state's output comes of that of its input."""
+"""How a state's output is named after its input: the first text in the input's name is replaced by the second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,20 +50,20 @@ class _Port:
 
 @dataclass(frozen=True, slots=True)
 class _Ports:
-    """What the inputs and outputs of a file are for."""
+    """The purposes of the inputs and outputs of a file."""
 
     observation: tuple[_Port, ...]
-    """One, or as many as the observation has parts, which they are named after."""
+    """One input for the whole observation, or one for each part of the observation, with the part's name."""
     states: Mapping[str, _Port]
-    """Recurrent states: by the name of the output, the input that it becomes."""
+    """Recurrent states: by the name of an output, the input that gets its value at the next call."""
     constants: Mapping[str, Array]
     mask: _Port | None
     action: str
-    """The output: of the actions' values, or the action."""
+    """The name of the output with the values of all actions, or with the number of the chosen action."""
 
 
 class OnnxPolicy:
-    """Takes the action with the highest value, or with `sample` one drawn by the softmax of the values."""
+    """Takes the action with the highest value; with `sample`, a random action by the softmax of the values."""
 
     def __init__(
         self, spec: str, session: Any, ports: _Ports, count: int, encode: Encoding, *, sha256: str, sample: bool
@@ -76,16 +76,16 @@ class OnnxPolicy:
         self.reset(0)
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
-        """The action. Raises PolicyError if the observation does not fit, or the answer is no action."""
+        """The number of the action. Raises PolicyError if the observation does not fit, or the output is no action."""
         try:
-            seen = self._seen(observation)
+            inputs = self._inputs(observation)
         except RecursionError:
-            raise PolicyError(f"{self._spec} takes no observation that holds itself") from None
+            raise PolicyError(f"{self._spec} takes no observation that contains itself") from None
         except (TypeError, ValueError) as error:
             raise PolicyError(f"{self._spec} takes an observation of numbers, and this is none: {error}") from error
-        feeds: dict[str, Array] = {**self._ports.constants, **self._state, **seen}
+        feeds: dict[str, Array] = {**self._ports.constants, **self._state, **inputs}
         if self._ports.mask is not None:
-            feeds[self._ports.mask.name] = self._masked(self._ports.mask, mask)
+            feeds[self._ports.mask.name] = self._mask_input(self._ports.mask, mask)
         try:
             values, *states = self._session.run(self._fetched, feeds)
         except Exception as error:
@@ -105,40 +105,42 @@ class OnnxPolicy:
     def description(self) -> Mapping[str, Any]:
         return {"kind": "policy", "policy": self._spec, "sha256": self._sha256}
 
-    def _seen(self, observation: Any) -> dict[str, Array]:
-        seen = without_mask(observation)
+    def _inputs(self, observation: Any) -> dict[str, Array]:
+        """The values of the inputs that take the observation, by the names of the inputs."""
+        observation = without_mask(observation)
         if len(self._ports.observation) == 1:
             port = self._ports.observation[0]
-            if isinstance(seen, Mapping) and set(seen) == {port.name}:
-                seen = seen[port.name]
-            return {port.name: _fit(self._spec, self._encode(seen), port)}
-        return {port.name: _fit(self._spec, np.asarray(seen[port.name]), port) for port in self._ports.observation}
+            if isinstance(observation, Mapping) and set(observation) == {port.name}:
+                observation = observation[port.name]
+            return {port.name: _fit(self._spec, self._encode(observation), port)}
+        parts = self._ports.observation
+        return {port.name: _fit(self._spec, np.asarray(observation[port.name]), port) for port in parts}
 
-    def _masked(self, port: _Port, mask: Mask | None) -> Array:
+    def _mask_input(self, port: _Port, mask: Mask | None) -> Array:
         allowed = np.ones(self._count) if mask is None else np.asarray(mask)
-        found = fitted(allowed, port.shape)
-        if found is None:
+        array = fitted(allowed, port.shape)
+        if array is None:
             raise PolicyError(f"{self._spec} takes {port.name} of {shown(port.shape)}; there are {self._count} actions")
-        return found.astype(port.dtype)
+        return array.astype(port.dtype)
 
-    def _chosen(self, values: Array, mask: Mask | None) -> int:
-        row = values.reshape(-1)
-        if row.size != self._count or (self._count == 1 and values.dtype.kind in "iu"):
-            return self._given(row, mask)
-        found = row.astype(np.float64)
-        if np.isnan(found).any():
+    def _chosen(self, output: Array, mask: Mask | None) -> int:
+        """The action: the one with the best value, or the one whose number the file returned."""
+        row = output.reshape(-1)
+        if row.size != self._count or (self._count == 1 and output.dtype.kind in "iu"):
+            return self._chosen_by_file(row, mask)
+        values = row.astype(np.float64)
+        if np.isnan(values).any():
             raise PolicyError(f"{self._spec} returned NaN instead of the actions' values")
         allowed = legal_actions(self._count, mask)
         if self._sample:
-            return _drawn(found, allowed, self._random)
-        return max(allowed, key=found.__getitem__)
+            return _drawn(values, allowed, self._random)
+        return max(allowed, key=values.__getitem__)
 
-    def _given(self, row: Array, mask: Mask | None) -> int:
-        """The action that the file chose itself."""
+    def _chosen_by_file(self, row: Array, mask: Mask | None) -> int:
         if row.size != 1 or row.dtype.kind not in "iu":
-            said = "one number" if row.size == 1 else f"{row.size} numbers"
+            size = "one number" if row.size == 1 else f"{row.size} numbers"
             raise PolicyError(
-                f"{self._spec} returns {said} as {self._ports.action!r}; expected {self._count}, one for each action"
+                f"{self._spec} returns {size} as {self._ports.action!r}; expected {self._count}, one for each action"
             )
         action = int(row[0])
         if not 0 <= action < self._count:
@@ -149,9 +151,11 @@ class OnnxPolicy:
 
 
 def load(spec: str, file: Path, count: int, space: Any, *, sample: bool) -> OnnxPolicy:
-    """The policy in a file, tried with one observation of zeros if the space is known.
+    """Load the policy in a file, and try it with one observation of zeros if the space is known.
 
-    Raises PolicyError if the file is no ONNX, does not fit the observations and actions, or fails.
+    `count` is the number of the player's actions, and `space` the player's observation space, or None. Raises
+    PolicyError if onnxruntime is missing or cannot read the file, or if the file does not fit the observations and
+    actions.
     """
     session = _session(spec, file)
     inputs, outputs = ([_port(spec, port) for port in ports] for ports in (session.get_inputs(), session.get_outputs()))
@@ -170,14 +174,14 @@ def load(spec: str, file: Path, count: int, space: Any, *, sample: bool) -> Onnx
 
 def _session(spec: str, file: Path) -> Any:
     try:
-        import onnxruntime  # noqa: PLC0415 - a server without such a policy does without
+        import onnxruntime  # noqa: PLC0415 - a server without such a policy may not have it
     except ImportError as error:
         raise PolicyError(
             f"{spec} needs the package onnxruntime, which is not installed; write {ONNXRUNTIME} into requirements.txt"
         ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what is wrong comes as an exception
+    options.log_severity_level = 4  # fatal errors alone: the others are raised as exceptions too
     try:
         return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     except Exception as error:
@@ -191,19 +195,22 @@ def _port(spec: str, port: Any) -> _Port:
 
 
 def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _Ports:
-    """What each input and output is for. Raises PolicyError for an input that nothing can be given for."""
+    """The purposes of all inputs and outputs; `first` is an observation, or None.
+
+    Raises PolicyError for an input of unknown purpose.
+    """
     if not inputs or not outputs:
         raise PolicyError(f"{spec} has no {'output' if inputs else 'input'}")
-    seen = _observed(inputs, first)
-    rest = [port for port in inputs if port not in seen]
+    observation = _observation_inputs(inputs, first)
+    rest = [port for port in inputs if port not in observation]
     mask = next((port for port in rest if port.name in (ACTION_MASK, "mask", "action_masks")), None)
     constants = {
         port.name: port.zeros(_CONSTANT[port.name]) for port in rest if port.name in _CONSTANT and len(port.shape) <= 1
     }
-    wanted = [port for port in rest if port is not mask and port.name not in constants]
-    states = _states(spec, wanted, outputs)
+    state_inputs = [port for port in rest if port is not mask and port.name not in constants]
+    states = _states(spec, state_inputs, outputs)
     return _Ports(
-        observation=seen,
+        observation=observation,
         states=states,
         constants=constants,
         mask=mask,
@@ -211,8 +218,8 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
     )
 
 
-def _observed(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
-    """The inputs that take the observation: those named after its parts, or one of a usual name, or the first."""
+def _observation_inputs(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
+    """The inputs for the observation: those with the names of its parts, or one with a usual name, or the first."""
     if isinstance(first, Mapping):
         parts = tuple(port for port in inputs if port.name in first)
         if len(parts) == len(first):
@@ -221,33 +228,37 @@ def _observed(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
     return ((named or inputs)[0],)
 
 
-def _states(spec: str, wanted: list[_Port], outputs: list[_Port]) -> dict[str, _Port]:
-    """By the name of the output, the input that it becomes: paired by their names, the others in their order."""
-    left = {port.name: port for port in outputs}
+def _states(spec: str, inputs: list[_Port], outputs: list[_Port]) -> dict[str, _Port]:
+    """By the name of an output, the state's input that gets its value at the next call.
+
+    They are paired by their names, and the others by their shapes, in their order. Raises PolicyError for an input
+    without an output.
+    """
+    free = {port.name: port for port in outputs}
     pairs: dict[str, _Port] = {}
     unpaired = []
-    for port in wanted:
-        name = next((name for name in _next_names(port.name) if name in left), None)
+    for port in inputs:
+        name = next((name for name in _output_names(port.name) if name in free), None)
         if name is None:
             unpaired.append(port)
         else:
             pairs[name] = port
-            del left[name]
-    values = next(iter(left), "")  # the first output is not a state
-    others = [port for name, port in left.items() if name != values]
+            del free[name]
+    candidates = list(free.values())[1:]  # the first output is the actions', and no state
     for port in unpaired:
-        out = next((out for out in others if _alike(port.shape, out.shape)), None)
+        out = next((out for out in candidates if _same_shape(port.shape, out.shape)), None)
         if out is None:
             raise PolicyError(
                 f"{spec} takes an input {port.name!r} of {shown(port.shape)}, which is no observation and no state: "
                 "no output has its shape"
             )
-        others.remove(out)
+        candidates.remove(out)
         pairs[out.name] = port
     return pairs
 
 
-def _next_names(name: str) -> Iterable[str]:
+def _output_names(name: str) -> Iterable[str]:
+    """The possible names of a state's output, by the name of its input."""
     for old, new in _OUTPUTS:
         if not old:
             yield name + new
@@ -256,27 +267,28 @@ def _next_names(name: str) -> Iterable[str]:
     yield from (f"next_{name}", f"new_{name}", f"out_{name}")
 
 
-def _alike(one: Shape, other: Shape) -> bool:
+def _same_shape(one: Shape, other: Shape) -> bool:
+    """Whether two shapes are equal, apart from sizes that the file leaves open."""
     return len(one) == len(other) and all(
         a == b or not (isinstance(a, int) and isinstance(b, int)) for a, b in zip(one, other, strict=True)
     )
 
 
 def _encoding(spec: str, ports: _Ports, space: Any, first: Any) -> Encoding:
-    """How observations fit the file's one input. Raises PolicyError if they do not."""
-    ways = encodings(_seen_space(space))
+    """The encoding with which observations fit the file's one input. Raises PolicyError if there is none."""
+    possible = encodings(_without_mask_space(space))
     if first is None or len(ports.observation) > 1:
-        return ways[0]
+        return possible[0]
     port = ports.observation[0]
-    for encode in ways:
+    for encode in possible:
         if fitted(encode(first), port.shape) is not None:
             return encode
-    _fit(spec, ways[0](first), port)
+    _fit(spec, possible[0](first), port)
     raise AssertionError("unreachable")
 
 
-def _seen_space(space: Any) -> Any:
-    """The space of what is to be seen, without the mask."""
+def _without_mask_space(space: Any) -> Any:
+    """The space of observations from which `without_mask` has removed the mask."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping) and ACTION_MASK in inner:
         rest = {key: part for key, part in inner.items() if key != ACTION_MASK}
@@ -286,17 +298,18 @@ def _seen_space(space: Any) -> Any:
 
 
 def _fit(spec: str, values: Array, port: _Port) -> Array:
-    found = fitted(values, port.shape)
-    if found is None:
+    """The values in the shape and type of an input. Raises PolicyError if they do not fit."""
+    array = fitted(values, port.shape)
+    if array is None:
         raise PolicyError(
             f"{spec} takes observations of {shown(port.shape)} (its input {port.name!r}); "
             f"the environment gives {shown(values.shape)}{_fixed_batch(values, port)}"
         )
-    return np.ascontiguousarray(found, port.dtype)
+    return np.ascontiguousarray(array, port.dtype)
 
 
 def _fixed_batch(values: Array, port: _Port) -> str:
-    """What to do about a file that takes several observations at once and no fewer; empty for any other."""
+    """A remedy, for the end of a message, if the file takes only several observations at once; else empty."""
     batch = port.shape[0] if len(port.shape) > 1 else 1
     if not isinstance(batch, int) or batch == 1 or fitted(values, (1, *port.shape[1:])) is None:
         return ""
@@ -304,25 +317,25 @@ def _fixed_batch(values: Array, port: _Port) -> str:
 
 
 def _drawn(values: Array, allowed: list[int], random: Random) -> int:
-    """An action, each as likely as the softmax of the values says."""
-    chosen = values[allowed]
-    best = chosen.max()
-    if not np.isfinite(best):  # all of these are as good as one another
-        return random.choice([action for action, value in zip(allowed, chosen, strict=True) if value == best])
-    return random.choices(allowed, np.exp(chosen - best).tolist())[0]
+    """A random one of the allowed actions, with the probabilities of the softmax of their values."""
+    allowed_values = values[allowed]
+    best = allowed_values.max()
+    if not np.isfinite(best):  # the softmax is not defined: all actions with this value are equally good
+        return random.choice([action for action, value in zip(allowed, allowed_values, strict=True) if value == best])
+    return random.choices(allowed, np.exp(allowed_values - best).tolist())[0]
 
 
 def _sha256(file: Path) -> str:
-    """Of the file, and of the weights that PyTorch's newer export puts beside it."""
+    """The hash of the file and, if there is one, the file of weights that PyTorch's newer export puts beside it."""
     digest = hashlib.sha256(file.read_bytes())
-    beside = file.with_name(f"{file.name}.data")
-    if beside.is_file():
-        digest.update(beside.read_bytes())
+    weights = file.with_name(f"{file.name}.data")
+    if weights.is_file():
+        digest.update(weights.read_bytes())
     return digest.hexdigest()
 
 
 def _short(error: Exception) -> str:
-    """What onnxruntime says, on one line, without its number and the places in its code."""
-    words = " ".join(str(error).split())
-    said = words.rpartition(" : ")[2] or words
-    return said if len(said) <= 200 else f"{said[:200]}…"
+    """onnxruntime's message on one line, without its error number and the places in its code."""
+    line = " ".join(str(error).split())
+    message = line.rpartition(" : ")[2] or line
+    return message if len(message) <= 200 else f"{message[:200]}…"

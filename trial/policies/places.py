@@ -1,4 +1,4 @@
-"""The policies of a trial, by player: loaded, asked, described."""
+"""Loads the policies of a trial's players, asks them for actions, and describes them for recordings."""
 
 from __future__ import annotations
 
@@ -19,40 +19,43 @@ Acted = Callable[[str, int, int | None, Exception | None], None]
 """Takes the player, the id of a question, and the action or else the exception that the policy raised."""
 
 NO_POLICIES: Mapping[str, Policy] = {}
-_AGAIN = -1  # the id of questions whose answers nobody wants
+_UNUSED = -1  # the id of questions whose answers are not used
 
 
 def load_policies(
     players: Iterable[Player], folder: Path, agent_module: Any, observation_spaces: Mapping[str, Any]
 ) -> dict[str, Policy]:
-    """The policies of those players that have one. Blocks. Raises PolicyError with a sentence that names the player."""
-    found = {}
+    """Load the policies of those players that have one, by player. It blocks the thread that calls it.
+
+    Raises PolicyError with a sentence that names the player, and whatever the researcher's classes raise.
+    """
+    loaded = {}
     for player in players:
         if player.human or player.by_program:
             continue
         count, space = len(player.action_space), observation_spaces.get(player.name)
         try:
-            found[player.name] = load(
+            loaded[player.name] = load(
                 player.plays, folder, agent_module, count, space, player=player.name, idle=player.idle
             )
         except PolicyError as error:
             raise PolicyError(f"trial.players: {player.name} cannot be played by {player.plays}: {error}") from error
-    return found
+    return loaded
 
 
 class Places:
-    """Asks the policies of one trial. To be called from the event loop, on which `acted` is called too."""
+    """Asks the policies of one trial. Its methods are for the event loop, which calls `acted` too."""
 
     def __init__(self, acted: Acted) -> None:
         self._acted = acted
-        self._asked: dict[str, PolicyThread | InlinePolicy] = {}
+        self._policies: dict[str, PolicyThread | InlinePolicy] = {}
         self.described: dict[str, Mapping[str, Any]] = {}
-        """What the head of a recording says of each player."""
+        """The description of each player, for the head of a recording."""
 
     @property
     def busy(self) -> bool:
-        """A policy has not returned, and may never."""
-        return any(policy.busy for policy in self._asked.values())
+        """Whether a method of a policy has not returned yet. It may never return."""
+        return any(policy.busy for policy in self._policies.values())
 
     def fill(
         self,
@@ -61,9 +64,10 @@ class Places:
         stand_ins: Mapping[str, Policy] = NO_POLICIES,
         seats: Sequence[str] = (),
     ) -> None:
-        """These play. Each policy is asked from now on in this trial only.
+        """Set who plays. From now on each policy belongs to this trial alone.
 
-        `stand_ins` play for humans who are away, by player; `seats` are the players of the session's seats, in order.
+        `policies` and `stand_ins` are by player; a stand-in plays while the player's human is away. `seats` has the
+        players of the session's members, in the order of their seats.
         """
         for player in players:
             policy, stand_in = policies.get(player.name), stand_ins.get(player.name)
@@ -72,13 +76,13 @@ class Places:
                 self.described[player.name] = {"kind": "human", "substitute": stand_in.description()}
             if player.name in seats:
                 self.described[player.name] = {**self.described[player.name], "seat": seats.index(player.name)}
-            asked = policy or stand_in
-            if asked is not None:
-                self._asked[player.name] = self._place(player, asked)
+            either = policy or stand_in
+            if either is not None:
+                self._policies[player.name] = self._running(player, either)
 
-    def _place(self, player: Player, policy: Policy) -> PolicyThread | InlinePolicy:
+    def _running(self, player: Player, policy: Policy) -> PolicyThread | InlinePolicy:
         def done(ask_id: int, action: int | None, error: Exception | None) -> None:
-            if ask_id != _AGAIN:
+            if ask_id != _UNUSED:
                 self._acted(player.name, ask_id, action, error)
 
         if isinstance(policy, RandomPolicy | IdlePolicy):
@@ -86,19 +90,19 @@ class Places:
         return PolicyThread(policy, done, name=f"policy of {player.name}")
 
     def ask(self, effect: AskPolicy) -> None:
-        """Ask for an action; `acted` follows."""
-        self._asked[effect.player].ask(effect.ask_id, effect.observation, effect.info, effect.mask)
+        """Ask a policy for an action. `acted` is called with the answer."""
+        self._policies[effect.player].ask(effect.ask_id, effect.observation, effect.info, effect.mask)
 
     def reset(self, effect: ResetPolicy) -> None:
-        """Begin an episode, and go through what the policy acted upon in it."""
-        policy = self._asked[effect.player]
+        """Begin an episode for a policy. In a replay, ask it again about each observation on which it has acted."""
+        policy = self._policies[effect.player]
         policy.reset(effect.seed)
-        for seen in effect.observed:
-            policy.ask(_AGAIN, seen.observation, seen.info, seen.mask)
+        for observed in effect.observed:
+            policy.ask(_UNUSED, observed.observation, observed.info, observed.mask)
 
     def close(self) -> None:
-        """The trial is over."""
-        for policy in self._asked.values():
+        """Close all policies: the trial is over."""
+        for policy in self._policies.values():
             policy.close()
 
 

@@ -1,4 +1,4 @@
-"""What a policy is: it chooses the actions of one player of the environment."""
+"""The interface of policies. A policy chooses the actions of one player of the environment."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from trial.core.players import Mask
 
 
 class PolicyError(Exception):
-    """A policy cannot be used, or gave no action. The message is a sentence for the researcher, without its end."""
+    """A policy cannot be used, or chose no action. The message is a sentence for the researcher, without its stop."""
 
 
 class PolicyFileMissing(PolicyError):
-    """There is no such file."""
+    """The policy's file does not exist."""
 
 
 class Policy(Protocol):
     """Chooses the actions of one player. All methods run on the policy's thread (`trial/policies/thread.py`)."""
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
-        """The index of the action to take. Raises PolicyError, and whatever the researcher's code raises."""
+        """The number of the action to take; `mask` says which actions are legal now.
+
+        Raises PolicyError if the policy chooses no legal action, and whatever the researcher's code raises.
+        """
         ...
 
     def reset(self, seed: int) -> None:
@@ -28,9 +31,9 @@ class Policy(Protocol):
         ...
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free the policy's resources."""
         ...
 
     def description(self) -> Mapping[str, Any]:
-        """What a recording says of it: `kind`, `policy` as config.yml has it, `sha256` of a file."""
+        """The policy's fields in a recording: `kind`, `policy` as config.yml has it, and of a file its `sha256`."""
         ...

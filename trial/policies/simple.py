@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
+from trial.agent import signatures
 from trial.core.players import Mask, is_legal, legal_actions
 from trial.policies.policy import PolicyError
 
 
 class RandomPolicy:
-    """Takes a random legal action, each as likely as the others."""
+    """Takes a random action. All legal actions are equally likely."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -32,7 +33,7 @@ class RandomPolicy:
 
 
 class IdlePolicy:
-    """Takes the idle action, or the first legal one where that is not legal."""
+    """Takes the idle action, or the first legal action if the idle action is not legal."""
 
     def __init__(self, count: int, idle: int) -> None:
         self._count, self._idle = count, idle
@@ -52,16 +53,17 @@ class IdlePolicy:
 
 
 class AgentPolicy:
-    """A class of agent.py with `act(observation, info)`; `act` may take the mask as a third argument.
+    """Calls an object of a class of agent.py with `act(observation, info)` or `act(observation, info, mask)`.
 
-    `reset(seed)` and `close()` are called if the class has them. Its `__init__` may have a parameter `player`.
+    `reset(seed)` or `reset()`, and `close()`, are called if the class has them.
     """
 
-    def __init__(self, spec: str, made: Any, count: int) -> None:
-        self._spec, self._made, self._count = spec, made, count
-        self._act: Callable[..., Any] = made.act
-        self._takes_mask = _takes(made.act, 3)
-        self._reset = getattr(made, "reset", None)
+    def __init__(self, spec: str, instance: Any, count: int) -> None:
+        """`instance` is the object, and `count` the number of the player's actions."""
+        self._spec, self._instance, self._count = spec, instance, count
+        self._act: Callable[..., Any] = instance.act
+        self._takes_mask = _takes(instance.act, 3)
+        self._reset = getattr(instance, "reset", None)
         self._reset_takes_seed = callable(self._reset) and _takes(self._reset, 1)
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
@@ -73,7 +75,7 @@ class AgentPolicy:
             self._reset(*((seed,) if self._reset_takes_seed else ()))
 
     def close(self) -> None:
-        close = getattr(self._made, "close", None)
+        close = getattr(self._instance, "close", None)
         if callable(close):
             close()
 
@@ -82,7 +84,7 @@ class AgentPolicy:
 
 
 def checked(action: Any, count: int, mask: Mask | None) -> int:
-    """The action as an index. Raises PolicyError if it is none, or is not legal now."""
+    """The number of the action that `act` returned. Raises PolicyError if it is no action, or is not legal now."""
     try:
         if isinstance(action, bool):
             raise TypeError
@@ -99,25 +101,29 @@ def checked(action: Any, count: int, mask: Mask | None) -> int:
 
 
 def of_class(spec: str, module: Any, player: str, count: int) -> AgentPolicy:
-    """The policy `agent:Name` for this player. Raises PolicyError if agent.py has no fit class of this name."""
+    """Make the policy `agent:Name` for this player. The class gets the player's name if it has a parameter `player`.
+
+    Raises PolicyError if agent.py has no class of this name with a method `act` that can be called, and whatever the
+    class raises.
+    """
     name = spec.partition(":")[2]
-    made = getattr(module, name, None)
+    policy_class = getattr(module, name, None)
     if module is None:
         raise PolicyError(f"{spec} is a class of agent.py, and there is no agent.py")
-    if not isinstance(made, type):
+    if not isinstance(policy_class, type):
         others = [key for key, value in vars(module).items() if isinstance(value, type) and hasattr(value, "act")]
         hint = f"; classes with act() there: {', '.join(others)}" if others else ""
         raise PolicyError(f"there is no class {name} in agent.py{hint}")
-    if not callable(getattr(made, "act", None)):
+    if not callable(getattr(policy_class, "act", None)):
         raise PolicyError(f"class {name} in agent.py has no act(observation, info)")
-    one = made(player=player) if _names_player(made) else made()
-    if _has_signature(one.act) and not (_takes(one.act, 2) or _takes(one.act, 3)):
+    instance = policy_class(player=player) if signatures.names(policy_class, "player") else policy_class()
+    if _has_signature(instance.act) and not (_takes(instance.act, 2) or _takes(instance.act, 3)):
         raise PolicyError(f"act of class {name} in agent.py takes other values; write act(self, observation, info)")
-    return AgentPolicy(spec, one, count)
+    return AgentPolicy(spec, instance, count)
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Whether it can be called with so many values in order."""
+    """Whether the function can be called with `count` positional arguments."""
     try:
         inspect.signature(function).bind(*[None] * count)
     except (TypeError, ValueError):
@@ -128,13 +134,6 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
 def _has_signature(function: Callable[..., Any]) -> bool:
     try:
         inspect.signature(function)
-    except (TypeError, ValueError):  # what is written in C may have none
+    except (TypeError, ValueError):  # such as one written in C
         return False
     return True
-
-
-def _names_player(made: type) -> bool:
-    try:
-        return "player" in inspect.signature(made).parameters
-    except (TypeError, ValueError):
-        return False

@@ -1,4 +1,4 @@
-"""A policy's thread: it asks the policy for actions, so that a slow one never holds up the event loop or the game."""
+"""A policy's thread: it asks the policy for actions, so that a slow policy never blocks the event loop."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Done = Callable[[int, int | None, Exception | None], None]
 
 
 class PolicyThread:
-    """Asks one policy, one question after another, on a thread of its own. To be called from the event loop.
+    """Asks one policy, one question after another, on a thread of its own. Its methods are for the event loop.
 
-    `done` is called there too, once for each question, in their order. The thread is a daemon: a policy that never
-    comes back holds up nothing but its own answers, and cannot keep the process alive.
+    The event loop calls `done` once for each question, in their order. The thread is a daemon: a policy that never
+    returns delays only its own answers, and cannot keep the process alive.
     """
 
     def __init__(self, policy: Policy, done: Done, *, name: str = "policy") -> None:
@@ -36,11 +36,11 @@ class PolicyThread:
 
     @property
     def busy(self) -> bool:
-        """A method of the policy has not returned (it may never)."""
+        """Whether a method of the policy has not returned yet. It may never return."""
         return self._running
 
     def ask(self, ask_id: int, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> None:
-        """Ask for an action; `done(ask_id, action, error)` follows, unless the thread was closed meanwhile."""
+        """Ask for an action. `done(ask_id, action, error)` is called later, unless `close` is called before."""
 
         def answer() -> None:
             try:
@@ -54,7 +54,7 @@ class PolicyThread:
         self._jobs.put(answer)
 
     def reset(self, seed: int) -> None:
-        """Begin an episode: questions asked from now on belong to it. If that fails, they all get its error."""
+        """Begin an episode for the questions asked from now on. If the policy's `reset` raises, they get its error."""
 
         def begin() -> None:
             try:
@@ -66,7 +66,7 @@ class PolicyThread:
         self._jobs.put(begin)
 
     def close(self) -> None:
-        """End the thread after its present question. No answer is told any more."""
+        """End the thread after its present question. `done` is not called any more."""
         if not self._closed:
             self._closed = True
             self._jobs.put(None)
@@ -92,7 +92,7 @@ class PolicyThread:
 
 
 def _plain(problem: BaseException) -> Exception:
-    """SystemExit in a researcher's code is a failure like another."""
+    """The exception itself; a RuntimeError for SystemExit and others that would end the thread."""
     if isinstance(problem, Exception):
         return problem
     return RuntimeError(repr(problem)).with_traceback(problem.__traceback__)

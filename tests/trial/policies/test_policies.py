@@ -82,7 +82,7 @@ def test_a_class_of_agent_py_plays(tmp_path: Path) -> None:
     policy.reset(12)
     assert policy.act(1, {"more": 3}, None) == 4
     assert policy.description() == {"kind": "policy", "policy": "agent:Partner"}
-    assert (policy._made.player, policy._made.seed) == ("player_3", 12)
+    assert (policy._instance.player, policy._made.seed) == ("player_3", 12)
 
 
 def test_a_class_of_agent_py_may_take_the_mask_and_need_nothing_else(tmp_path: Path) -> None:
@@ -337,7 +337,7 @@ def test_an_observation_that_holds_itself_is_a_sentence(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
     loop: dict[str, Any] = {}
     loop["in"] = loop
-    with pytest.raises(PolicyError, match=r"^p\.onnx takes no observation that holds itself$"):
+    with pytest.raises(PolicyError, match=r"^p\.onnx takes no observation that contains itself$"):
         made("p.onnx", tmp_path).act(loop, {}, None)
 
 
