@@ -289,7 +289,7 @@ class AgentAdapter:
         the environment reports it: then the `action` in the info counts only if it differs from the human's. Without
         an agent.py it never counts.
         """
-        if self.reader.due:  # steps of an earlier server are taken again without pictures
+        if self.reader.first_due:  # steps of an earlier server are taken again without pictures
             self.render()
         result = self._agent.step(action) if self._unusual_step is None else self._unusual_step(action)
         outcome = read_step_result(result)

@@ -127,7 +127,7 @@ class JointAdapter:
             for player in self.players
             if player not in self._ended
         }
-        if self._reader.due:  # steps of an earlier server are taken again without pictures
+        if self._reader.first_due:  # steps of an earlier server are taken again without pictures
             self.pictures()
         returned = _read(self._adapter.step_with(given))
         self._end(returned.terminated, self._terminated)

@@ -1,1 +1,1 @@
-"""Pictures of a game: frames, and how they become bytes."""
+"""Pictures of a game: frames (pixels) and scenes (objects), and their bytes on the wire."""

@@ -1,8 +1,8 @@
-"""The images of a project that its sprites show (docs/objects.md, "Images"): found, checked, and packed for a browser.
+"""Finds and checks the images that a project's sprites show, and packs them for browsers (docs/objects.md, "Images").
 
-Of a folder these files count: PNG, JPEG and WebP images, and beside an image a JSON file of the same name, its atlas.
-An image is called by its path below the folder, without its extension. SVG is not among them: it is a document that
-may name other files and hold scripts.
+The images are the PNG, JPEG and WebP files in a folder and below it. A JSON file of the same name beside an image is
+its atlas. The name of an image is its path in the folder, without its extension. SVG files are refused: they are
+documents that may name other files and hold scripts.
 """
 
 from __future__ import annotations
@@ -19,16 +19,18 @@ from typing import Any, TypeGuard
 
 MOST_ASSETS = 500
 MOST_BYTES = 4 * 2**20
-"""Of one image with its atlas."""
+"""The most bytes of one file: an image or an atlas."""
 MOST_BYTES_IN_ALL = 20 * 2**20
+"""The most bytes of all images, packed with their atlases."""
 LONGEST_SIDE = 4096
-"""Pixels; some phones draw no larger images."""
+"""In pixels; some phones draw no larger images."""
 MOST_PIXELS_IN_ALL = 64 * 2**20
-"""A browser needs four bytes for each."""
+"""The most pixels of all images. A browser needs four bytes for each pixel."""
 MOST_FRAMES = 2_000
+"""The most frames of one atlas."""
 
 IMAGE = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)
-"""How the name of an image file ends."""
+"""The end of the name of an image file."""
 _REFUSED = re.compile(r"\.(?:svgz?|gif|bmp|tiff?|avif|ico)$", re.IGNORECASE)
 _TYPES = {"PNG": "image/png", "JPEG": "image/jpeg", "WEBP": "image/webp"}
 _HEAD = struct.Struct("!I")
@@ -38,7 +40,7 @@ Box = tuple[int, int, int, int]
 
 
 class AssetError(ValueError):
-    """A file that cannot be used; the words go on after its name."""
+    """A file cannot be used. The message follows the file's name in a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,46 +54,46 @@ class AtlasAnimation:
 
 @dataclass(frozen=True, slots=True)
 class Asset:
-    """An image, with what its atlas says of it."""
+    """An image, with the frames and animations of its atlas."""
 
     name: str
     image: bytes = field(repr=False)
     size: tuple[int, int]
     """Width and height in pixels."""
     packed: bytes = field(repr=False)
-    """What a browser gets: the length of a JSON object (4 bytes), that object, the image."""
+    """The bytes for browsers: the length of a JSON object (4 bytes), that object, and the image."""
     hash: str
-    """Of `packed`; the same bytes have the same hash."""
+    """The beginning of the SHA-256 of `packed`, as 32 hexadecimal digits."""
     frames: Mapping[str, Box] = field(default_factory=dict)
     animations: Mapping[str, AtlasAnimation] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Assets:
-    """The images of a folder by name, and what is wrong with its files, in sentences for the researcher."""
+    """The images of a folder by name, and the problems of its files, in sentences for the researcher."""
 
     by_name: Mapping[str, Asset] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
 
     def table(self) -> list[dict[str, Any]]:
-        """What a client is told of them: it asks for those whose hash it does not have."""
+        """The table of the images for a client, which asks for those whose hash it does not have."""
         return [{"name": each.name, "bytes": len(each.packed), "hash": each.hash} for each in self.by_name.values()]
 
 
 def load(project: Path, folder: str) -> Assets:
-    """Read the images of a project's folder. Never raises: what cannot be used is named in `problems`."""
-    place = project / folder
-    if not place.is_dir():
+    """Read the images of a project's folder. Does not raise for files that cannot be used: `problems` names them."""
+    assets_folder = project / folder
+    if not assets_folder.is_dir():
         return Assets()
     found: dict[str, Asset] = {}
     problems: list[str] = []
     total = pixels = 0
     try:
-        paths = list(_files(place))
+        paths = list(_files(assets_folder))
     except OSError as error:
         return Assets({}, (f"{folder} cannot be read ({type(error).__name__})",))
     for path in paths:
-        name = path.relative_to(place).with_suffix("").as_posix()
+        name = path.relative_to(assets_folder).with_suffix("").as_posix()
         shown = path.relative_to(project).as_posix()
         try:
             if _REFUSED.search(path.name):
@@ -115,9 +117,9 @@ def load(project: Path, folder: str) -> Assets:
     return Assets(found, tuple(problems))
 
 
-def _files(place: Path) -> Iterator[Path]:
-    """The files below a folder, in the order of their names. Links and hidden files are none of them."""
-    for path in sorted(place.iterdir()):
+def _files(folder: Path) -> Iterator[Path]:
+    """The files in a folder and below it, in the order of their names, without links and hidden files."""
+    for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or path.is_symlink():
             continue
         if path.is_dir():
@@ -137,8 +139,8 @@ def read(path: Path, name: str) -> Asset:
         try:
             frames, animations = read_atlas(json.loads(_bytes(atlas)), size)
         except (ValueError, RecursionError) as error:
-            words = str(error) if isinstance(error, AssetError) else "is no JSON"
-            raise AssetError(f"cannot be shown: {atlas.name} beside it {words}") from None
+            problem = str(error) if isinstance(error, AssetError) else "is no JSON"
+            raise AssetError(f"cannot be shown: {atlas.name} beside it {problem}") from None
     about: dict[str, Any] = {"type": kind}
     if frames:
         about["frames"] = frames
@@ -171,8 +173,8 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
             with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
                 kind, size = _TYPES[str(picture.format)], picture.size
                 if max(size) <= LONGEST_SIDE:
-                    picture.load()  # the whole image: a file that was cut off begins as a good one does
-    except Exception:  # noqa: BLE001 - of a broken file Pillow raises many kinds
+                    picture.load()  # the whole image, since a file that was cut off has a good beginning
+    except Exception:  # noqa: BLE001 - Pillow raises many kinds for a broken file
         raise AssetError("is no PNG, JPEG or WebP image, or is broken") from None
     if max(size) > LONGEST_SIDE:
         raise AssetError(f"has {size[0]} x {size[1]} pixels; at most {LONGEST_SIDE} x {LONGEST_SIDE} are shown")
@@ -183,9 +185,10 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
 
 
 def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[str, AtlasAnimation]]:
-    """The frames and animations of an atlas: TexturePacker's and Phaser's JSON, or frames of one size.
+    """Read the frames and animations of an atlas for an image of this size.
 
-    Raises AssetError. https://docs.phaser.io/phaser/concepts/textures#atlas names the forms.
+    `value` has TexturePacker's or Phaser's form (https://docs.phaser.io/phaser/concepts/textures#atlas), or
+    `frameWidth` and `frameHeight` for frames of one size. Raises AssetError.
     """
     if not isinstance(value, dict):
         raise AssetError("is no atlas")
@@ -214,6 +217,7 @@ def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
 
 
 def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[str, Box]]:
+    """The frames that the atlas lists, by name."""
     frames = value.get("frames")
     textures = value.get("textures")
     if frames is None and isinstance(textures, list) and len(textures) == 1 and isinstance(textures[0], dict):

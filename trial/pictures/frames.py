@@ -19,31 +19,33 @@ try:
 
     # Level 2 of ISA-L packs Ms. Pac-Man's differences smaller than zlib's level 1, in a quarter of its time.
     _deflate, _LEVEL = isal_zlib, 2
-except ImportError:  # no wheel for this machine: slower, the same pixels on arrival
+except ImportError:  # there is no wheel for this machine: zlib is slower, and the client gets the same pixels
     _deflate, _LEVEL = zlib, 1
 
 Frame = npt.NDArray[np.uint8]
 """height x width x channels; channels is 3 (RGB) or 1 (grey)."""
 
 LARGEST = 4096 * 4096
-"""Pixels of a picture. A browser needs four bytes for each, and refuses more (web/game/frames.js)."""
+"""The most pixels of a picture. The page needs four bytes for each, and refuses more (web/game/frames.js)."""
 
 KEY, DIFFERENCE, JPEG, ROWS = 0, 1, 2, 3
+"""Kinds of frames: whole, as XOR with the last exact frame, as a JPEG, or some rows of it."""
 HEADER = struct.Struct("!BIHHB")
+"""Kind, id, width, height, channels."""
 FIRST_ROW = struct.Struct("!H")
-"""Follows the header of ROWS."""
+"""The number of the first row; it follows the header of ROWS."""
 LONGEST_JPEG_SIDE = 65_500
-"""Pixels; libjpeg's JPEG_MAX_DIMENSION."""
+"""In pixels; libjpeg's JPEG_MAX_DIMENSION."""
 
-_FIRST_CHUNK = 131_072  # bytes of pixels until the first look at how much has come out
+_FIRST_CHUNK = 131_072  # bytes of pixels that are packed before the size is compared with the limit
 
 
 class FrameError(ValueError):
-    """A picture that cannot be shown, or bytes that are not a frame."""
+    """A picture cannot be shown, or bytes are no frame."""
 
 
 def as_frame(picture: Any) -> Frame:
-    """A private, contiguous copy of what `render()` returned. Raises FrameError if that is no picture."""
+    """A contiguous copy of the pixels that `render()` returned. Raises FrameError if they are no picture."""
     if picture is None:
         raise FrameError("render() returned nothing; make the environment with render_mode='rgb_array'")
     array = np.asarray(picture)
@@ -62,15 +64,15 @@ def as_frame(picture: Any) -> Frame:
 
 
 def header(kind: int, frame: Frame, frame_id: int) -> bytes:
-    """The first bytes of a binary frame; ids begin again after 2**32."""
+    """The first bytes of a binary frame. Ids begin again at 0 after 2**32 frames."""
     height, width, channels = frame.shape
     return HEADER.pack(kind, frame_id & 0xFFFFFFFF, width, height, channels)
 
 
 def packed(rows: Frame, base: Frame | None = None, limit: float = math.inf) -> bytes | None:
-    """The deflated pixels of some rows, or of their XOR with `base`; None if that is more than `limit` bytes."""
+    """The deflated pixels of some rows, or of their XOR with `base`; None if these are more than `limit` bytes."""
     packer = _deflate.compressobj(_LEVEL, zlib.DEFLATED, -15)
-    # Each call costs time and bytes, so the chunks grow.
+    # Each call takes time and adds bytes, so the chunks grow.
     count = len(rows) if limit == math.inf else max(1, _FIRST_CHUNK // rows[0].nbytes)
     parts: list[bytes] = []
     size = first = 0
@@ -85,29 +87,33 @@ def packed(rows: Frame, base: Frame | None = None, limit: float = math.inf) -> b
     return b"".join(parts) if size + len(parts[-1]) <= limit else None
 
 
-def jpeg(frame: Frame) -> bytes:
-    """The picture as a JPEG, of a little more than Pillow's default quality, which HIPPO's servers send.
+def jpeg(frame: Frame, quality: int = 80) -> bytes:
+    """The picture as a JPEG.
 
-    80 instead of 75 costs 15 % more bytes and no time. WebP takes six times as long for about as many bytes.
+    Quality 80 takes 15 % more bytes and no more time than Pillow's default of 75, which HIPPO's servers send. WebP
+    takes six times as long for about as many bytes.
     """
     from PIL import Image  # noqa: PLC0415 - many games never need it
 
     picture = Image.fromarray(frame if frame.shape[2] == 3 else frame[:, :, 0])
     out = io.BytesIO()
-    picture.save(out, "JPEG", quality=80)
+    picture.save(out, "JPEG", quality=quality)
     return out.getvalue()
 
 
 class Decoder:
-    """Unpacks the frames of one connection; what a browser does, for tests and tools."""
+    """Unpacks the frames of one connection, as a browser does. For tests and tools."""
 
     def __init__(self) -> None:
-        self._exact: Frame | None = None  # the last lossless picture
+        self._exact: Frame | None = None  # the last picture without loss
         self._shown: Frame | None = None
-        self._rows = 0  # of a picture that comes by rows, so far
+        self._rows = 0  # the rows so far of a picture that comes as ROWS
 
     def decode(self, data: bytes) -> tuple[int, Frame]:
-        """The frame's id and the picture that is shown now. Raises FrameError for bytes that are not a frame here."""
+        """The frame's id, and the picture that is shown now.
+
+        Raises FrameError for bytes that are no frame, or that cannot follow the frames before.
+        """
         if len(data) < HEADER.size:
             raise FrameError("too short")
         kind, frame_id, width, height, channels = HEADER.unpack_from(data)
@@ -147,7 +153,7 @@ class Decoder:
 
 
 def _inflated(body: bytes, shape: tuple[int, int, int], *, most: int | None = None) -> Frame:
-    """As many rows as `shape` says; or, if `most` is given, one to `most` rows. Raises FrameError."""
+    """Unpack as many rows as `shape` has; with `most`, 1 to `most` rows. Raises FrameError for anything else."""
     height, width, channels = shape
     expected = (most if most is not None else height) * width * channels
     unpacker = zlib.decompressobj(-15)
@@ -155,8 +161,8 @@ def _inflated(body: bytes, shape: tuple[int, int, int], *, most: int | None = No
         pixels = unpacker.decompress(body, expected + 1)
     except zlib.error as error:
         raise FrameError("not deflate") from error
-    right = 0 < len(pixels) <= expected and len(pixels) % (width * channels) == 0
-    if not unpacker.eof or unpacker.unused_data or not right or (most is None and len(pixels) != expected):
+    whole_rows = 0 < len(pixels) <= expected and len(pixels) % (width * channels) == 0
+    if not unpacker.eof or unpacker.unused_data or not whole_rows or (most is None and len(pixels) != expected):
         raise FrameError("wrong length")
     return np.frombuffer(pixels, dtype=np.uint8).reshape(-1, width, channels)
 
@@ -175,10 +181,5 @@ def _unpacked_jpeg(body: bytes, shape: tuple[int, int, int]) -> Frame:
 
 
 def jpeg_message(frame: Frame, frame_id: int) -> str:
-    """A frame as HIPPO's browsers expect it: JSON holding a base64 JPEG."""
-    from PIL import Image  # noqa: PLC0415 - only for clients that offer no subprotocol
-
-    picture = Image.fromarray(frame if frame.shape[2] == 3 else frame[:, :, 0])
-    out = io.BytesIO()
-    picture.save(out, "JPEG")
-    return json.dumps({"frame": base64.b64encode(out.getvalue()).decode("ascii"), "frameId": frame_id})
+    """A frame as HIPPO's browsers expect it: JSON with the JPEG in base64, in Pillow's default quality."""
+    return json.dumps({"frame": base64.b64encode(jpeg(frame, quality=75)).decode("ascii"), "frameId": frame_id})

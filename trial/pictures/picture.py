@@ -1,4 +1,4 @@
-"""What `render()` may return: a frame (pixels) or a scene (objects). Pure."""
+"""A picture, as `render()` returns it: a frame (pixels) or a scene (objects). Pure."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from trial.pictures.frames import Frame
 from trial.pictures.scene import Scene, SceneError, as_scene, is_scene
 
 Picture = Frame | Scene
-"""What a client is shown. It must not change afterwards."""
+"""A picture that clients are shown. It must not be changed."""
 
 
 def as_picture(value: Any, before: Scene | None = None, *, scenes: bool = True) -> Picture:
-    """The picture that `render()` returned. `before` is the scene before it in the episode (`as_scene`).
+    """Read the picture that `render()` returned. `before` is the scene before it in the same episode (`as_scene`).
 
-    `scenes` is whether config.yml has `trial.scene`. Raises FrameError or SceneError, with a sentence for the
+    `scenes` says whether config.yml has `trial.scene`. Raises FrameError or SceneError, with a sentence for the
     researcher.
     """
     if not is_scene(value):

@@ -1,6 +1,6 @@
-"""Draws scenes as frames, for clients that cannot draw them: without a subprotocol, or with an earlier one.
+"""Draws scenes as frames, for clients that cannot draw scenes: those without a subprotocol, or with an earlier one.
 
-It is what `web/game/painter.js` draws, but for smooth edges, fonts and tweens.
+The frames look as `web/game/painter.js` draws the scenes, apart from smooth edges, fonts and tweens.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trial.pictures.frames import Frame
 from trial.pictures.scene import Scene
 from trial.pictures.scene_object import CheckedObject
 
-_MISSING = "#8080807f"  # what stands where an image is missing
+_MISSING = "#8080807f"  # the color of the box that is drawn if an image is missing
 
 Rgba = tuple[int, int, int, int]
 
@@ -33,10 +33,10 @@ class Raster:
         self._filter = Image.Resampling.NEAREST if section.pixel_art else Image.Resampling.BILINEAR
         self._assets = assets
         self._lock = threading.Lock()
-        self._sprite = lru_cache(maxsize=256)(self._made)
+        self._sprite = lru_cache(maxsize=256)(self._new_sprite)
 
     def draw(self, scene: Scene) -> Frame:
-        """The scene as a picture of RGB values."""
+        """Draw the scene. Return it as a frame of RGB values."""
         with self._lock:
             canvas = Image.new("RGB", self._size, self._background)
             for each in sorted(scene.objects.values(), key=lambda each: float(each.get("depth", 0))):
@@ -86,7 +86,7 @@ class Raster:
 
     def _text(self, canvas: Image.Image, each: CheckedObject) -> None:
         size = each.get("size", 16)
-        most = int(4 * max(self._size) / size) + 1  # letters and lines beyond the picture would cost memory
+        most = int(4 * max(self._size) / size) + 1  # letters and lines outside the picture would only need memory
         text = "\n".join(line[:most] for line in each["text"].split("\n")[:most])
         font, ink = ImageFont.load_default(size), _fill(each)
         _, _, right, bottom = ImageDraw.Draw(canvas).multiline_textbbox((0, 0), text, font)
@@ -107,8 +107,8 @@ class Raster:
         width, height = _length(each.get("width")), _length(each.get("height"))
         self._lay(canvas, self._sprite(each["image"], frame, width, height, each.get("alpha", 1)), each)
 
-    def _made(self, name: str, frame: str | None, width: int, height: int, alpha: float) -> Image.Image:
-        """The picture of a sprite, not turned; a grey box if there is no such image."""
+    def _new_sprite(self, name: str, frame: str | None, width: int, height: int, alpha: float) -> Image.Image:
+        """The picture of a sprite before it is turned; a grey box if there is no such image or frame."""
         asset = self._assets.by_name.get(name)
         picture = None if asset is None else _cut(asset, frame)
         if picture is None:
@@ -123,9 +123,9 @@ class Raster:
         return picture
 
     def _lay(self, canvas: Image.Image, layer: Image.Image, each: CheckedObject) -> None:
-        """Lay a picture on the canvas, turned about its origin."""
+        """Draw a picture on the canvas, turned about its origin."""
         (x, y), (share_x, share_y) = self._place(each), each.get("origin", (0, 0))
-        across, down = (0.5 - share_x) * layer.width, (0.5 - share_y) * layer.height  # from its origin to its middle
+        across, down = (0.5 - share_x) * layer.width, (0.5 - share_y) * layer.height  # from the origin to the middle
         angle = each.get("angle", 0)
         if angle:
             turn = np.radians(angle)
@@ -137,7 +137,7 @@ class Raster:
 
 
 def _cut(asset: Asset, frame: str | None) -> Image.Image | None:
-    """A frame of an image, or all of it; None if it has no such frame."""
+    """A frame of an image, or without a `frame` the whole image; None if the image has no such frame."""
     if frame is not None and frame not in asset.frames:
         return None
     whole = _opened(asset.image)
@@ -155,11 +155,12 @@ def _opened(image: bytes) -> Image.Image:
 
 
 def _bounded(number: float) -> float:
-    """Far outside of the picture is far enough for Pillow, which takes time and memory for what lies there."""
+    """The number, from -20,000 to 20,000: Pillow takes time and memory for shapes far outside of the picture."""
     return max(-20_000.0, min(20_000.0, number))
 
 
 def _length(value: Any) -> int:
+    """A length in pixels, from 1 to 4,096; 0 for None."""
     return 0 if value is None else max(1, min(4_096, round(value)))
 
 
@@ -176,5 +177,6 @@ def _outline_width(each: CheckedObject) -> int:
 
 
 def _ink(color: str, each: CheckedObject) -> Rgba:
+    """The color with the object's `alpha`."""
     red, green, blue, *rest = ImageColor.getcolor(color, "RGBA")  # type: ignore[misc]
     return red, green, blue, round((rest[0] if rest else 255) * each.get("alpha", 1))

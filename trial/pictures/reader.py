@@ -1,4 +1,4 @@
-"""Reads what `render()` returns, picture after picture: a scene refers to the one before it. Pure."""
+"""Reads the pictures that `render()` returns, one after another: a scene refers to the scene before it. Pure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from trial.pictures.assets import Assets
 from trial.pictures.picture import Picture, as_picture
 from trial.pictures.scene import Scene, images_of
 
-_MOST_SAID = 100  # sentences; an agent may find ever new ones
+_MOST_SENTENCES = 100  # for `tell`: a long game may have ever new mistakes
 
 
 class PictureReader:
-    """The pictures of one agent. `tell` gets a sentence about each thing that cannot be drawn, each sentence once.
+    """Reads the pictures of one agent. `tell` gets each sentence about objects that cannot be drawn, once.
 
-    Without a `section`, config.yml has no `trial.scene`, and `render()` returns pixels alone.
+    `section` is `trial.scene` of config.yml. If it is None, `render()` may return pixels alone.
     """
 
     def __init__(
@@ -31,31 +31,32 @@ class PictureReader:
         self._section = section
         self._assets = assets
         self._tell = tell
-        self._before: dict[str, Scene] = {}  # by view
-        self._images: dict[str, frozenset[str]] = {}  # of the scene before, by view
-        self._said: set[str] = set()
-        self.due = False
-        """The episode's first picture has not been drawn. Permanent objects may be in that one alone."""
+        self._before: dict[str, Scene] = {}  # the latest scene, by view
+        self._images: dict[str, frozenset[str]] = {}  # the images of that scene, by view
+        self._told: set[str] = set()
+        self.first_due = False
+        """Whether the episode's first picture must still be read: permanent objects may be in that one alone."""
 
     def begin_episode(self) -> None:
-        """The environment was reset: permanent objects of the episode before are gone."""
+        """Forget the permanent objects of the episode before, since the environment was reset."""
         self._before.clear()
-        self.due = self._section is not None
+        self.first_due = self._section is not None
 
     def read(self, value: Any, view: str = "") -> Picture:
-        """The picture that `render()` returned, for this player's view. Raises FrameError or SceneError."""
-        self.due = False
-        if isinstance(value, np.ndarray):  # the usual case, with nothing around it
+        """Read the picture that `render()` returned for a player's view. Raises FrameError or SceneError."""
+        self.first_due = False
+        if isinstance(value, np.ndarray):  # the usual case: the shortest way for it
             return frames.as_frame(value)
         picture = as_picture(value, self._before.get(view), scenes=self._section is not None)
         if isinstance(picture, Scene):
             self._before[view] = picture
             for sentence in picture.problems:
-                self._say(f"render(): {sentence}")
+                self._tell_once(f"render(): {sentence}")
             self._look_for_images(picture, view)
         return picture
 
     def _look_for_images(self, scene: Scene, view: str) -> None:
+        """Tell which images of the scene are missing."""
         images = images_of(scene)
         if images == self._images.get(view):
             return
@@ -63,11 +64,11 @@ class PictureReader:
         assert self._section is not None
         for name in sorted(images - self._assets.by_name.keys()):
             shown = next(key for key, each in scene.objects.items() if each.get("image") == name)
-            self._say(
+            self._tell_once(
                 f"render(): the object {shown!r} shows the image {name!r}, which is not in {self._section.assets}/"
             )
 
-    def _say(self, sentence: str) -> None:
-        if sentence not in self._said and len(self._said) < _MOST_SAID:
-            self._said.add(sentence)
+    def _tell_once(self, sentence: str) -> None:
+        if sentence not in self._told and len(self._told) < _MOST_SENTENCES:
+            self._told.add(sentence)
             self._tell(sentence)

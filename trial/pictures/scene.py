@@ -1,6 +1,6 @@
-"""Scenes: pictures that are described by objects instead of pixels (docs/objects.md). Pure.
+"""Reads scenes: pictures that are described by objects instead of pixels (docs/objects.md). Pure.
 
-`scene_object.py` reads and checks one object. This module makes a scene of them: which are new, changed, kept or gone.
+`scene_object.py` reads and checks one object. This module makes a scene of the objects, after the scene before it.
 """
 
 from __future__ import annotations
@@ -14,81 +14,82 @@ from typing import Any
 from trial.pictures.scene_object import (
     LONGEST_TEXT,
     CheckedObject,
-    Wrong,
-    called,
+    UnusableValue,
     checked_again,
     checked_object,
     fields_of,
     has_fields,
     is_map,
     mapping_of,
+    shown_name,
 )
 
 MOST_OBJECTS = 2_000
-"""Of one scene, with those that stay from scenes before it."""
+"""The most objects of one scene, with the permanent ones of scenes before it."""
 MOST_POINTS_IN_ALL = 20_000
+"""The most points of all lines and polygons of one scene."""
 MOST_TEXT_IN_ALL = 100_000
-"""Characters of all texts of one scene."""
+"""The most characters of all texts of one scene."""
 MOST_PROBLEMS = 20
-"""Sentences about one scene; what else is wrong goes unsaid until these are mended."""
+"""The most sentences about the mistakes in one scene."""
 
 
 class SceneError(ValueError):
-    """What `render()` returned is no scene. The message is for the researcher."""
+    """`render()` returned something that is no scene. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What is to be seen. It never changes, so connections may keep it."""
+    """A picture as objects. It never changes, so connections may keep it."""
 
     objects: Mapping[str, CheckedObject]
-    """By id, permanent ones first, then in the order of `render()`: at the same depth a later one covers the others."""
+    """By id, permanent ones first, then in the order of `render()`. At the same depth a later one covers the others."""
     hud: str = ""
     """A line of text beside the score."""
     permanent: frozenset[str] = frozenset()
     """The ids of objects that stay until the episode ends, though `render()` does not return them again."""
     problems: tuple[str, ...] = field(default=(), compare=False)
-    """What is wrong with single objects, in sentences for the researcher. What cannot be drawn is left out."""
+    """The mistakes in single objects, in sentences for the researcher. Objects that cannot be drawn are left out."""
     given: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, compare=False, repr=False)
-    """What `render()` returned of objects that need no second check if it returns the same again."""
+    """Objects as `render()` returned them, by id: if it returns one of them unchanged, that needs no second check."""
     images: frozenset[str] | None = field(default=None, compare=False, repr=False)
-    """The names of the images that its sprites show, if they are known; else ask `images_of`."""
+    """The names of the images that its sprites show; None if they are not known yet (see `images_of`)."""
     letters: int = field(default=0, compare=False, repr=False)
-    """Of all texts; more, if texts have changed or gone since they were counted last."""
+    """At least the number of characters of all texts: more, if texts were replaced or removed since the last count."""
 
 
 def is_scene(picture: Any) -> bool:
-    """Whether `render()` returned objects (of whatever quality), and not an array of pixels."""
+    """Whether `render()` returned objects, correct or not, and not an array of pixels."""
     if not isinstance(picture, list | tuple):
         return isinstance(picture, Mapping)
     return not picture or is_map(picture[0]) or has_fields(picture[0]) or isinstance(picture[0], str)
 
 
 def as_scene(value: Any, before: Scene | None = None) -> Scene:
-    """The scene that `render()` returned: a list of objects, or `{"objects": […], "hud": "text"}`.
+    """Read the scene that `render()` returned: a list of objects, or `{"objects": […], "hud": "text"}`.
 
     `before` is the scene before it in the same episode: its permanent objects stay. An object that did not change is
-    the same object in both scenes. Raises SceneError if `value` is neither form or has far too many objects.
+    the same Python object in both scenes. Raises SceneError if `value` has neither form or more than MOST_OBJECTS.
     """
     given, hud = _parts(value)
     if before is not None and (scene := _changed_in_place(before, given, hud)) is not None:
         return scene
-    making = _Making(before or Scene({}))
-    making.add_all(given)
-    return making.scene(hud)
+    builder = _SceneBuilder(before or Scene({}))
+    builder.add_all(given)
+    return builder.scene(hud)
 
 
 def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene | None:
-    """The scene `before` with new values of some objects; None if that is not all that has changed.
+    """The scene `before` with new values of some objects, as most scenes are; None if something else has changed.
 
-    So are most scenes. All objects are compared at once: one after the other, in Python, they cost most of a scene.
+    `map` compares all objects in one call, since a loop in Python over them would take most of the time of a scene.
     """
     names = list(before.objects)[len(before.permanent) :]
     if len(names) != len(values) or list(before.given) != names or not _MAPS.issuperset(map(type, values)):
         return None
     try:
         changed = list(compress(count(), map(ne, before.given.values(), values)))
-    except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_Making` says so
+    except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_SceneBuilder` reports it
         return None
     objects, given, images, letters = dict(before.objects), dict(before.given), before.images, before.letters
     for index in changed:
@@ -105,31 +106,31 @@ def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene |
     return Scene(objects, hud, before.permanent, (), given, images, letters)
 
 
-class _Making:
-    """A scene in the making, after the scene `before`."""
+class _SceneBuilder:
+    """Builds a scene after the scene `before`."""
 
     def __init__(self, before: Scene) -> None:
         self._before = before
-        self._permanent = stays = set(before.permanent)
-        self._objects = {name: each for name, each in before.objects.items() if name in stays} if stays else {}
-        self._kept = set(self._objects)
-        """Permanent objects that were not returned again so far."""
+        self._permanent = permanent = set(before.permanent)
+        self._objects = {name: each for name, each in before.objects.items() if name in permanent} if permanent else {}
+        self._not_returned = set(self._objects)
+        """Permanent objects of `before` that `render()` has not returned again, so far."""
         self._given: dict[str, Mapping[str, Any]] = {}
         self._problems: list[str] = []
         self._points = sum(len(each.get("points", ())) for each in self._objects.values())
-        self._new_letters = 0  # of texts that are not as they were
+        self._new_letters = 0  # characters of texts that have changed
 
     def add_all(self, values: Sequence[Any]) -> None:
-        """Add objects, change them or remove them. Most objects of most scenes are just those of the scene before."""
+        """Add, change or remove objects. Most objects are as in the scene before, so these take the shortest way."""
         objects, before, known = self._objects, self._before.objects, self._before.given
-        passing = before.keys() - self._before.permanent  # of permanent ones `_put` has more to note
+        not_permanent = before.keys() - self._before.permanent  # permanent ones need `_put`
         room = len(objects) + len(values) <= MOST_OBJECTS
         for index, value in enumerate(values):
             name = value.get("id") if room and type(value) is dict else None
-            if type(name) is str and name in passing and name not in objects:
+            if type(name) is str and name in not_permanent and name not in objects:
                 try:
                     same = known.get(name) == value
-                except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_add` says so
+                except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_add` reports it
                     same = False
                 if same:
                     objects[name] = before[name]
@@ -138,8 +139,8 @@ class _Making:
             self._add(value, index)
 
     def _add(self, value: Any, index: int) -> None:
-        """Add one object, change it or remove it."""
-        said = len(self._problems)
+        """Add, change or remove one object."""
+        problems_before = len(self._problems)
         try:
             given = mapping_of(value)
             name = self._unchanged(given)
@@ -156,10 +157,10 @@ class _Making:
             if fields.get("type") == "text" and not self._has_room(fields.get("text")):
                 return
             checked = checked_object(fields, name, self._problems)
-        except Wrong as error:
-            self._problems.append(f"{called(value, index)} {error}")
+        except UnusableValue as error:
+            self._problems.append(f"{shown_name(value, index)} {error}")
             return
-        except Exception as error:  # noqa: BLE001 - methods of the researcher's objects, lists within lists without end
+        except Exception as error:  # noqa: BLE001 - such as a researcher's method that raises, or a list in itself
             self._problems.append(f"object {index + 1} of render() cannot be read ({type(error).__name__})")
             return
         points = self._points + len(checked.get("points", ())) - len(self._objects.get(name, {}).get("points", ()))
@@ -169,15 +170,15 @@ class _Making:
         self._points = points
         earlier = self._before.objects.get(name)
         self._put(name, earlier if earlier is not None and earlier == checked else checked, fields)
-        # What may change in place, and what something was to be said of, is checked again each time.
-        if said == len(self._problems) and _SCALARS.issuperset(map(type, given.values())):
+        # An object with values that may change in place, or with a problem, is checked again each time.
+        if problems_before == len(self._problems) and _SCALARS.issuperset(map(type, given.values())):
             self._given[name] = dict(given)
 
     def _has_room(self, text: Any) -> bool:
-        """Whether the scene may have this text too. To look at far too many would hold up the game."""
+        """Whether the scene may have this text too. To check far too many texts would delay the game."""
         letters = 0 if text is None else len(text if isinstance(text, str) else str(text))
         if letters > LONGEST_TEXT:
-            return True  # of this one something else is said
+            return True  # `checked_object` refuses it
         if self._new_letters + letters > MOST_TEXT_IN_ALL:
             self._problems.append(_TOO_MUCH_TEXT)
             return False
@@ -185,7 +186,7 @@ class _Making:
         return True
 
     def _unchanged(self, given: Mapping[str, Any]) -> str | None:
-        """The object's id if just the same was given before, and found well."""
+        """The object's id if the scene before has it with the same values; else None."""
         name = given.get("id") or given.get("uuid")
         if type(name) is not str or name not in self._before.objects:
             return None
@@ -195,14 +196,14 @@ class _Making:
             return None
 
     def _put(self, name: str, checked: CheckedObject, fields: Mapping[str, Any]) -> None:
-        if name in self._objects and name not in self._kept:
+        if name in self._objects and name not in self._not_returned:
             self._problems.append(f"two objects have the id {name!r}; the later one counts")
         if name not in self._objects and len(self._objects) >= MOST_OBJECTS:
             self._problems.append(
                 f"the scene has more than {MOST_OBJECTS} objects with those that are permanent; some are left out"
             )
             return
-        self._kept.discard(name)
+        self._not_returned.discard(name)
         if fields.get("permanent"):
             self._permanent.add(name)
         else:
@@ -210,11 +211,11 @@ class _Making:
         self._objects[name] = checked
 
     def scene(self, hud: str) -> Scene:
-        """What was made. Permanent objects come first, as they will in the scenes after this one."""
+        """The scene of the objects so far. Permanent ones come first, as they will in the scenes after this one."""
         objects, permanent = self._objects, self._permanent
         if permanent:
-            stays = {name: each for name, each in objects.items() if name in permanent}
-            objects = stays | {name: each for name, each in objects.items() if name not in permanent}
+            first = {name: each for name, each in objects.items() if name in permanent}
+            objects = first | {name: each for name, each in objects.items() if name not in permanent}
         letters = self._before.letters + self._new_letters
         if letters > MOST_TEXT_IN_ALL:
             objects, letters = self._with_few_letters(objects)
@@ -223,8 +224,8 @@ class _Making:
         return Scene(objects, hud, frozenset(permanent), problems, self._given, _images(objects), letters)
 
     def _with_few_letters(self, objects: dict[str, CheckedObject]) -> tuple[dict[str, CheckedObject], int]:
-        """The objects without the texts that are too many, and the letters of the others."""
-        fit: dict[str, CheckedObject] = {}
+        """The objects without the texts for which there is no room, and the number of characters of all texts."""
+        fitting: dict[str, CheckedObject] = {}
         letters = 0
         for name, each in objects.items():
             text = each.get("text", "")
@@ -233,8 +234,8 @@ class _Making:
                 self._given.pop(name, None)
                 continue
             letters += len(text)
-            fit[name] = each
-        return fit, letters
+            fitting[name] = each
+        return fitting, letters
 
 
 _TOO_MUCH_TEXT = f"the scene's texts have more than {MOST_TEXT_IN_ALL} characters; some are left out"
@@ -243,7 +244,7 @@ _SCALARS = frozenset({str, int, float, bool, type(None)})
 
 
 def images_of(scene: Scene) -> frozenset[str]:
-    """The names of the images that its sprites show."""
+    """The names of the images that the scene's sprites show."""
     return _images(scene.objects) if scene.images is None else scene.images
 
 

@@ -1,4 +1,4 @@
-"""Packs the scenes of a connection (docs/wire.md, "A scene"): only what changed. Pure."""
+"""Packs the scenes of a connection: of each scene only what changed (docs/wire.md, "A scene"). Pure."""
 
 from __future__ import annotations
 
@@ -18,53 +18,53 @@ SCENE, PACKED_SCENE, ASSET = 4, 5, 6
 HEADER = struct.Struct("!BI")
 """Kind, id."""
 ASSET_HEADER = struct.Struct("!BHI")
-"""Kind, number of the asset in the table, offset of the bytes that follow."""
+"""Kind, number of the asset in the table of assets, offset of the bytes that follow."""
 
-_PACK_FROM = 1_200  # bytes; what fits into one packet gains nothing
+_PACK_FROM = 1_200  # bytes; a shorter message fits into one packet anyway
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False)
 
 
 class SceneEncoder:
-    """Packs scenes for one connection: the first whole, each other one as what changed since the one sent before.
+    """Packs scenes for one connection: the first scene whole, of each later one the changes since the scene before.
 
-    A WebSocket loses nothing and keeps the order, so what was sent is what the client has.
+    A WebSocket loses no message and keeps their order, so the client has the scene that was sent last.
     """
 
     def __init__(self) -> None:
         self._sent: Scene | None = None
 
     def forget(self) -> None:
-        """The next scene is sent whole: the client was shown something else."""
+        """Let `encode` send the next scene whole, since the client was shown something else."""
         self._sent = None
 
     def encode(self, scene: Scene, scene_id: int) -> bytes:
-        """The bytes of one scene. `scene` is kept for the next one."""
-        kind, body = _LAST.packed(self._sent, scene)
+        """The bytes of one scene. `scene` is kept, to compare it with the next one."""
+        kind, body = _CACHE.packed(self._sent, scene)
         self._sent = scene
         return HEADER.pack(kind, scene_id & 0xFFFFFFFF) + body
 
 
-class _Last:
-    """What was packed last. Those who play together are mostly shown the same scene after the same one."""
+class _Cache:
+    """The changes that were packed last: players of one game mostly see the same scene after the same one."""
 
     def __init__(self) -> None:
-        self._kept: tuple[Scene | None, Scene, tuple[int, bytes]] | None = None  # replaced whole: threads may pack
+        self._last: tuple[Scene | None, Scene, tuple[int, bytes]] | None = None  # never changed: threads may read it
 
     def packed(self, before: Scene | None, scene: Scene) -> tuple[int, bytes]:
-        """The kind of the message and its bytes behind the id."""
-        kept = self._kept
-        if kept is not None and kept[0] is before and kept[1] is scene:
-            return kept[2]
+        """The kind of the message, and its bytes after the header."""
+        last = self._last
+        if last is not None and last[0] is before and last[1] is scene:
+            return last[2]
         packed = _pack(changes(before, scene))
-        self._kept = before, scene, packed
+        self._last = before, scene, packed
         return packed
 
 
-_LAST = _Last()
+_CACHE = _Cache()
 
 
-def _pack(said: Mapping[str, Any]) -> tuple[int, bytes]:
-    body = _JSON.encode(said).encode("utf-8", "replace")
+def _pack(message: Mapping[str, Any]) -> tuple[int, bytes]:
+    body = _JSON.encode(message).encode("utf-8", "replace")
     if len(body) <= _PACK_FROM:
         return SCENE, body
     packer = zlib.compressobj(1, zlib.DEFLATED, -15)
@@ -72,16 +72,16 @@ def _pack(said: Mapping[str, Any]) -> tuple[int, bytes]:
 
 
 def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
-    """What a client that shows `before` has to be told; with `new`, to forget all that it shows."""
+    """The message for a client that shows the scene `before`. With `new`, the client forgets all objects first."""
     if before is None:
         return {"new": True, "set": dict(scene.objects), "hud": scene.hud}
-    said: dict[str, Any] = {}
+    message: dict[str, Any] = {}
     known, objects = before.objects, scene.objects
     changed: dict[str, Any] = {}
     in_place = list(known) == list(objects)
-    # Those that may have changed. Few have, and to look at the others one by one costs more than all else here.
-    others = compress(objects.items(), map(is_not, known.values(), objects.values())) if in_place else objects.items()
-    for name, each in others:
+    # Few objects have changed. A loop over all of them would take longer than the rest of this function.
+    maybe = compress(objects.items(), map(is_not, known.values(), objects.values())) if in_place else objects.items()
+    for name, each in maybe:
         earlier = known.get(name)
         if earlier is each:
             continue
@@ -90,20 +90,20 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
         else:
             changed[name] = _fields(earlier, each)
     if changed:
-        said["set"] = changed
+        message["set"] = changed
     if not in_place:
-        gone = [name for name in known if name not in objects]
-        if gone:
-            said["gone"] = gone
+        removed = [name for name in known if name not in objects]
+        if removed:
+            message["gone"] = removed
         if not _same_order(known, objects):
-            said["order"] = list(objects)
+            message["order"] = list(objects)
     if scene.hud != before.hud:
-        said["hud"] = scene.hud
-    return said
+        message["hud"] = scene.hud
+    return message
 
 
 def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
-    """The fields that changed; None for those that have their default again."""
+    """The fields that changed, with None for those that have their default again."""
     if list(before) == list(now):  # the usual case
         return dict(compress(now.items(), map(ne, before.values(), now.values())))
     changed = {key: value for key, value in now.items() if key not in before or before[key] != value}
@@ -111,13 +111,13 @@ def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
 
 
 def _same_order(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether the objects stand in their order if those that are new are put behind the others."""
+    """Whether the objects get their order if the client puts the new ones behind the others."""
     stayed = [name for name in before if name in now]
     return all(one == other for one, other in zip(stayed, now, strict=False))
 
 
 class SceneDecoder:
-    """What a browser does with them, for tests and tools."""
+    """Unpacks the scenes of one connection, as a browser does. For tests and tools."""
 
     def __init__(self) -> None:
         self.objects: dict[str, dict[str, Any]] = {}
@@ -125,25 +125,25 @@ class SceneDecoder:
         self.hud = ""
 
     def decode(self, data: bytes) -> int:
-        """Take a message; `objects` and `hud` are those of the scene then. Returns its id. Raises ValueError."""
+        """Read a message into `objects` and `hud`. Return the scene's id. Raises ValueError if it is no scene."""
         kind, scene_id = HEADER.unpack_from(data)
         if kind not in (SCENE, PACKED_SCENE):
             raise ValueError("no scene")
         body = data[HEADER.size :]
-        said = json.loads(body if kind == SCENE else zlib.decompress(body, -15))
-        if said.get("new"):
+        message = json.loads(body if kind == SCENE else zlib.decompress(body, -15))
+        if message.get("new"):
             self.objects = {}
-        for name in said.get("gone", ()):
+        for name in message.get("gone", ()):
             del self.objects[name]
-        for name, fields in said.get("set", {}).items():
+        for name, fields in message.get("set", {}).items():
             if "type" in fields:
                 self.objects[name] = dict(fields) if name not in self.objects else self._replaced(name, fields)
             else:
                 merged = self.objects[name] | fields
                 self.objects[name] = {key: value for key, value in merged.items() if value is not None}
-        if "order" in said:
-            self.objects = {name: self.objects[name] for name in said["order"]}
-        self.hud = said.get("hud", self.hud)
+        if "order" in message:
+            self.objects = {name: self.objects[name] for name in message["order"]}
+        self.hud = message.get("hud", self.hud)
         return int(scene_id)
 
     def _replaced(self, name: str, fields: dict[str, Any]) -> dict[str, Any]:

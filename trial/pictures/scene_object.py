@@ -1,7 +1,7 @@
-"""One object of a scene: its id, its type, and its fields with their checked values (docs/objects.md). Pure.
+"""Reads one object of a scene, and checks its fields (docs/objects.md). Pure.
 
-The words are those of Interactive Gym's object contexts (`uuid`, `object_type`, `image_name`, …); `id`, `type` and
-`image` are short for three of them. A checked object has one form, whatever words it was given in.
+A field may have its name in Interactive Gym's object contexts, such as `uuid`, `object_type` or `image_name`, or a
+shorter one, such as `id`, `type` or `image`. A checked object has the shorter names.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from typing import Any, TypeGuard
 import numpy as np
 
 MOST_POINTS = 5_000
-"""Points of one line or polygon."""
+"""The most points of one line or polygon."""
 LONGEST_TEXT = 1_000
-"""Characters."""
+"""The most characters of one text."""
 LONGEST_TWEEN = 10_000
-"""Milliseconds."""
+"""In milliseconds."""
 
-_LONGEST_ID = 100
-_FARTHEST = 1e6
-_DIGITS = 4  # a relative coordinate then names a tenth of a pixel of a picture 1,000 pixels wide
+_LONGEST_ID = 100  # characters
+_FARTHEST = 1e6  # the largest coordinate or length
+_DIGITS = 4  # with them, a relative coordinate is exact to a tenth of a pixel in a picture 1,000 pixels wide
 _HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
-_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # images are called without it
+_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # the names of images are without it
 _FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
 
 CheckedObject = Mapping[str, Any]
-"""What is sent of an object: plain values of JSON. A field that has its default is left out."""
+"""The fields of an object that are sent, as JSON values. A field with its default value is left out."""
 
 
-class Wrong(ValueError):
-    """A value of an object cannot be used; the words go on after the name of the field."""
+class UnusableValue(ValueError):
+    """A value of an object cannot be used. The message follows the object's or the field's name in a sentence."""
 
 
 # ---- what `render()` returns of one object
@@ -42,18 +42,18 @@ class Wrong(ValueError):
 
 def is_map(value: Any) -> TypeGuard[Mapping[str, Any]]:
     """Whether the value is a map."""
-    return type(value) is dict or isinstance(value, Mapping)  # the first is quicker
+    return type(value) is dict or isinstance(value, Mapping)  # the first check is quicker
 
 
 def has_fields(value: Any) -> bool:
-    """Whether the value is an object of Interactive Gym's, or a dataclass."""
+    """Whether the value has `as_dict()`, as Interactive Gym's object contexts have, or is a dataclass."""
     return callable(getattr(value, "as_dict", None)) or (
         dataclasses.is_dataclass(value) and not isinstance(value, type)
     )
 
 
 def mapping_of(value: Any) -> Mapping[str, Any]:
-    """The object as a map: it is one, or has `as_dict()` (as Interactive Gym's have), or is a dataclass."""
+    """The object's fields, of a map, of an object with `as_dict()`, or of a dataclass. Raises UnusableValue."""
     if is_map(value):
         return value
     convert = getattr(value, "as_dict", None)
@@ -62,12 +62,16 @@ def mapping_of(value: Any) -> Mapping[str, Any]:
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
     if not isinstance(value, Mapping):
-        raise Wrong(f"is no map of fields, but {type(value).__name__}")
+        raise UnusableValue(f"is no map of fields, but {type(value).__name__}")
     return value
 
 
 def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[str, Any]]:
-    """The object's id, and its fields under their one name; a field that is None counts as left out."""
+    """The object's id, and its other fields under their shorter names. A field that is None counts as left out.
+
+    An object without a usable id gets one by its `index`, such as `#1`, and a sentence in `problems`. Raises
+    UnusableValue if the object has no fields.
+    """
     fields = {_OTHER_NAMES.get(key, key): each for key, each in mapping_of(value).items() if each is not None}
     name = fields.pop("id", None)
     if isinstance(name, int | np.integer) and not isinstance(name, bool):
@@ -82,8 +86,8 @@ def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[st
     return name, fields
 
 
-def called(value: Any, index: int) -> str:
-    """How a sentence names the object."""
+def shown_name(value: Any, index: int) -> str:
+    """The object's name in a sentence: by its id, or else by its `index`."""
     name = None
     if isinstance(value, Mapping):
         name = value.get("id", value.get("uuid"))
@@ -93,47 +97,54 @@ def called(value: Any, index: int) -> str:
 
 
 def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) -> CheckedObject:
-    """The object's values as they are sent. Raises Wrong if it cannot be drawn."""
+    """The object's fields as they are sent. Appends a sentence to `problems` for each field that its type lacks.
+
+    Raises UnusableValue if the object cannot be drawn.
+    """
     kind = fields.get("type")
     table = TYPES.get(kind) if isinstance(kind, str) else None
     if table is None:
-        raise Wrong(f"has the type {str(kind)[:40]!r}; there are {', '.join(TYPES)}")
+        raise UnusableValue(f"has the type {str(kind)[:40]!r}; there are {', '.join(TYPES)}")
     checked: dict[str, Any] = {"type": kind}
     for key, (check, default) in table.items():
         value = fields.get(key)
         if value is None:
             if default is _NEEDED:
-                raise Wrong(f"has no {key}, which a {kind} needs")
+                raise UnusableValue(f"has no {key}, which a {kind} needs")
             continue
         try:
             value = check(value)
-        except Wrong as error:
-            raise Wrong(f"cannot be drawn: its {key} {error}") from None
+        except UnusableValue as error:
+            raise UnusableValue(f"cannot be drawn: its {key} {error}") from None
         if value != default:
             checked[key] = value
     if fields.get("tween"):
         tween = _tween(fields)
         if tween:
             checked["tween"] = tween
-    for key in fields.keys() - table.keys() - _ANY:
+    for key in fields.keys() - table.keys() - _COMMON_FIELDS:
         problems.append(f"the object {name!r} has a field {str(key)[:40]!r}, which a {kind} does not have")
     return checked
 
 
 def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
-    """The object that was `given` and checked, with the new values of its fields; None if all is to be checked."""
+    """The checked object with the new values of its fields, of which only these are checked.
+
+    `earlier` is the checked object, made of `given`; `value` is what `render()` returned now. Returns None if the whole
+    object must be checked again.
+    """
     if list(given) != list(value) or list(map(type, given.values())) != list(map(type, value.values())):
         return None
-    if not _OTHER_NAMES.keys().isdisjoint(value):  # two words for one field may stand side by side
+    if not _OTHER_NAMES.keys().isdisjoint(value):  # both names of one field may be there
         return None
     table, fields = TYPES[earlier["type"]], {}
     for key, each in value.items() - given.items():
-        if key not in earlier or key not in table:  # at its default before, or what decides on more than itself
+        if key not in earlier or key not in table:  # it had its default, or it concerns other fields too
             return None
         check, default = table[key]
         try:
             fields[key] = check(each)
-        except Wrong:
+        except UnusableValue:
             return None
         if fields[key] == default:
             return None
@@ -143,60 +154,64 @@ def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mappi
 # ---- values
 
 
-_NO_NUMBERS = (bool, np.bool_, str, bytes)  # though `float` takes them
+_NO_NUMBERS = (bool, np.bool_, str, bytes)  # `float` takes them, too
 
 
 def _number(low: float, high: float) -> Callable[[Any], float]:
+    """The check of a number from `low` to `high`."""
+
     def check(value: Any) -> float:
         if isinstance(value, _NO_NUMBERS):
-            raise Wrong("is no number")
+            raise UnusableValue("is no number")
         try:
             number = float(value)
         except (TypeError, ValueError, OverflowError):
-            raise Wrong("is no number") from None
+            raise UnusableValue("is no number") from None
         if not math.isfinite(number):
-            raise Wrong(f"is no finite number ({number})")
+            raise UnusableValue(f"is no finite number ({number})")
         if not low <= number <= high:
-            raise Wrong(f"is {number:g}; it must be from {low:g} to {high:g}")
+            raise UnusableValue(f"is {number:g}; it must be from {low:g} to {high:g}")
         return _short(number)
 
     return check
 
 
 def _short(number: float) -> float:
-    """Rounded, and a whole number without a point: it needs fewer bytes."""
+    """The rounded number, as an int if it is whole: both take fewer bytes in JSON."""
     rounded = round(number, _DIGITS)
     return int(rounded) if rounded == int(rounded) else rounded
 
 
 def _points(least: int) -> Callable[[Any], list[list[float]]]:
+    """The check of a list of at least `least` points, as pairs of numbers."""
+
     def check(value: Any) -> list[list[float]]:
         try:
             count = len(value)
         except TypeError:
-            raise Wrong("are no list") from None
+            raise UnusableValue("are no list") from None
         if not least <= count <= MOST_POINTS:
-            raise Wrong(f"are {count}; there must be {least} to {MOST_POINTS}")
+            raise UnusableValue(f"are {count}; there must be {least} to {MOST_POINTS}")
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise Wrong("are not pairs of numbers") from None
+            raise UnusableValue("are not pairs of numbers") from None
         if array.shape != (count, 2):
-            raise Wrong("are not pairs of numbers")
+            raise UnusableValue("are not pairs of numbers")
         if not np.isfinite(array).all() or np.abs(array).max() > _FARTHEST:
-            raise Wrong("are not all finite numbers, or lie too far away")
+            raise UnusableValue("are not all finite numbers, or lie too far away")
         points: list[list[float]] = np.round(array, _DIGITS).tolist()
         return [[int(x) if x == int(x) else x, int(y) if y == int(y) else y] for x, y in points]
 
     return check
 
 
-def color(value: Any) -> str:
-    """A color as CSS writes it: `#rgb`, `#rrggbb`, with an alpha value at the end, or a name. Raises Wrong."""
+def _color(value: Any) -> str:
+    """The check of a color in CSS: `#rgb`, `#rgba`, `#rrggbb`, `#rrggbbaa` or a name."""
     if not isinstance(value, str):
-        raise Wrong("is no color; write it as '#rrggbb'")
+        raise UnusableValue("is no color; write it as '#rrggbb'")
     if not _HEX.fullmatch(value) and not _is_color_name(value):
-        raise Wrong(f"is no color: {value[:40]!r}; write it as '#rrggbb'")
+        raise UnusableValue(f"is no color: {value[:40]!r}; write it as '#rrggbb'")
     return value.lower()
 
 
@@ -210,7 +225,7 @@ def _is_color_name(value: str) -> bool:
 def _text(value: Any) -> str:
     text = str(value)
     if len(text) > LONGEST_TEXT:
-        raise Wrong(f"has {len(text)} characters; at most {LONGEST_TEXT} are shown")
+        raise UnusableValue(f"has {len(text)} characters; at most {LONGEST_TEXT} are shown")
     if text.isprintable():
         return text
     return "".join(letter for letter in text if letter == "\n" or letter.isprintable())
@@ -218,7 +233,7 @@ def _text(value: Any) -> str:
 
 def _image(value: Any) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 200:
-        raise Wrong("is no name of a file in the folder of assets")
+        raise UnusableValue("is no name of a file in the folder of assets")
     return _EXTENSION.sub("", value)
 
 
@@ -230,53 +245,48 @@ def _frame(value: Any) -> str:
 
 def _word(value: Any) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 200:
-        raise Wrong("is no name")
+        raise UnusableValue("is no name")
     return value
 
 
 def _font(value: Any) -> str:
     if not isinstance(value, str) or not _FONT.fullmatch(value):
-        raise Wrong("is no name of a font, such as 'Arial'")
+        raise UnusableValue("is no name of a font, such as 'Arial'")
     return value
-
-
-def _flag(value: Any) -> bool:
-    return bool(value)
 
 
 def _origin(value: Any) -> list[float]:
     try:
         x, y = value
     except (TypeError, ValueError):
-        raise Wrong("is no pair of numbers from 0 to 1") from None
+        raise UnusableValue("is no pair of numbers from 0 to 1") from None
     share = _number(-10, 10)
     return [share(x), share(y)]
 
 
 def _tween(fields: Mapping[str, Any]) -> float:
-    """Milliseconds: of a `tween` that is a number, or of `tween_duration`, if `tween` is true."""
+    """The milliseconds of a tween: `tween` if it is a number, or `tween_duration` if `tween` is true."""
     value = fields["tween"]
     if isinstance(value, bool | np.bool_):
-        value = fields.get("tween_duration", _TWEEN)
+        value = fields.get("tween_duration", _DEFAULT_TWEEN)
     try:
         return _number(0, LONGEST_TWEEN)(value)
-    except Wrong as error:
-        raise Wrong(f"cannot be drawn: its tween {error}") from None
+    except UnusableValue as error:
+        raise UnusableValue(f"cannot be drawn: its tween {error}") from None
 
 
-_NEEDED: Any = object()
-_TWEEN = 50  # ms; Interactive Gym's
+_NEEDED: Any = object()  # in the place of a default
+_DEFAULT_TWEEN = 50  # ms, as in Interactive Gym
 _OTHER_NAMES = {"uuid": "id", "object_type": "type", "image_name": "image", "opacity": "alpha", "rotation": "angle"}
-_ANY = frozenset(
-    {"type", "permanent", "remove", "tween", "tween_duration", "object_size"}
-)  # what every object may have
+_COMMON_FIELDS = frozenset({"type", "permanent", "remove", "tween", "tween_duration", "object_size"})
+"""The fields that an object of each type may have, apart from those in TYPES."""
 
 _place, _length = _number(-_FARTHEST, _FARTHEST), _number(0, _FARTHEST)
 _Table = Mapping[str, tuple[Callable[[Any], Any], Any]]
 _COMMON: _Table = {"depth": (_place, 0), "alpha": (_number(0, 1), 1)}
 _AT: _Table = {"x": (_place, _NEEDED), "y": (_place, _NEEDED)}
 _TURNED: _Table = {"angle": (_place, 0), "origin": (_origin, [0, 0])}
-_FILLED: _Table = {"color": (color, "#000000"), "outline": (color, None), "outline_width": (_length, 1)}
+_FILLED: _Table = {"color": (_color, "#000000"), "outline": (_color, None), "outline_width": (_length, 1)}
 
 TYPES: Mapping[str, _Table] = {
     "sprite": {
@@ -292,9 +302,9 @@ TYPES: Mapping[str, _Table] = {
     "line": {
         "points": (_points(2), _NEEDED),
         "width": (_length, 1),
-        "color": (color, "#000000"),
-        "fill_below": (_flag, False),
-        "fill_above": (_flag, False),
+        "color": (_color, "#000000"),
+        "fill_below": (bool, False),
+        "fill_above": (bool, False),
         **_COMMON,
     },
     "circle": {**_AT, "radius": (_length, _NEEDED), **_FILLED, **_COMMON},
@@ -304,10 +314,10 @@ TYPES: Mapping[str, _Table] = {
         **_AT,
         "text": (_text, _NEEDED),
         "size": (_number(1, 1_000), 16),
-        "color": (color, "#000000"),
+        "color": (_color, "#000000"),
         "font": (_font, "Arial"),
         **_TURNED,
         **_COMMON,
     },
 }
-"""The fields of each type: the check of a value, and the default. A field at its default is not sent."""
+"""The fields of each type, each with the check of its value and its default. A field with its default is not sent."""

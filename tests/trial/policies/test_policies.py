@@ -82,7 +82,7 @@ def test_a_class_of_agent_py_plays(tmp_path: Path) -> None:
     policy.reset(12)
     assert policy.act(1, {"more": 3}, None) == 4
     assert policy.description() == {"kind": "policy", "policy": "agent:Partner"}
-    assert (policy._instance.player, policy._made.seed) == ("player_3", 12)
+    assert (policy._instance.player, policy._instance.seed) == ("player_3", 12)
 
 
 def test_a_class_of_agent_py_may_take_the_mask_and_need_nothing_else(tmp_path: Path) -> None:
