@@ -10,7 +10,7 @@ from picture import draw
 
 WORDS = {"good": 1.0, "bad": -1.0}
 SHOWN_STEPS = 2
-"""How long the picture says what the robot has heard."""
+"""For so many steps the picture shows the last word that the robot has heard."""
 
 
 class Agent:

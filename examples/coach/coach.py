@@ -9,7 +9,7 @@ Policy-Dependent Human Feedback" (ICML 2017, arXiv:1701.06049). Its ideas that a
   critic's place in an actor-critic, and no reward is needed.
 * The policy climbs its gradient: after a word, each parameter moves along the gradient of log(policy), times the word.
 * An eligibility trace keeps the gradients of the steps before, so that a word also counts for what has led there.
-* People are slow: the trace holds the step that the person saw some steps ago (`delay`), not the newest.
+* People are slow: a step enters the trace `delay` steps later, when the person can have judged it.
 
 The policy is a softmax of preferences, which are linear in features of the state.
 """
@@ -32,7 +32,7 @@ class Coach:
         self._delay = delay
 
     def probabilities(self, features: np.ndarray) -> np.ndarray:
-        """With which probability it takes each action in a state of these features."""
+        """The probability with which the learner takes each action in a state of these features."""
         preferences = self._weights @ features
         weights = np.exp(preferences - preferences.max())
         return weights / weights.sum()
@@ -42,14 +42,14 @@ class Coach:
         return int(chance.choice(len(self._weights), p=self.probabilities(features)))
 
     def took(self, features: np.ndarray, action: int) -> None:
-        """Remember what was done. It enters the trace when the person can have judged it."""
+        """Remember the action. It enters the trace when the person can have judged it."""
         self._trace *= self._decay
         self._unjudged.append((features, action))
         if len(self._unjudged) > self._delay:
             self._trace += self._gradient(*self._unjudged.popleft())
 
     def begin(self) -> None:
-        """A new episode: words are no longer about the one before."""
+        """Begin an episode: words are no longer about the one before."""
         self._trace[:] = 0
         self._unjudged.clear()
 
@@ -58,7 +58,7 @@ class Coach:
         self._weights += self._rate * word * self._trace
 
     def _gradient(self, features: np.ndarray, action: int) -> np.ndarray:
-        """The gradient of log(probability of the action) by the weights, as the policy is now."""
+        """The gradient of log(probability of the action) by the weights, under the present policy."""
         towards = -self.probabilities(features)
         towards[action] += 1
         return np.outer(towards, features)

@@ -7,7 +7,7 @@ import numpy as np
 WIDTH, HEIGHT = 8, 5
 START, STATION = (0, 0), (7, 0)
 FLOWERS = frozenset((column, 0) for column in range(1, 7))
-"""The straight way leads through what is to be avoided."""
+"""They lie on the straight way from START to STATION."""
 MOVES = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
 AT_STATION, ON_FLOWERS = 5.0, -1.0
 LONGEST = 40
@@ -22,7 +22,7 @@ class Garden:
         return self.place
 
     def step(self, move: int) -> tuple[Place, float, bool, bool]:
-        """Drive a field; the fence stops it. Returns place, reward, terminated, truncated."""
+        """Drive to the next field; the fence stops the robot. Returns place, reward, terminated, truncated."""
         self.steps += 1
         self.place = beside(self.place, move)
         reward = AT_STATION if self.place == STATION else ON_FLOWERS if self.place in FLOWERS else 0.0
@@ -30,15 +30,15 @@ class Garden:
 
 
 def beside(place: Place, move: int) -> Place:
-    """Where a move leads."""
+    """The place to which a move leads."""
     right, up = list(MOVES.values())[move]
     return min(max(place[0] + right, 0), WIDTH - 1), min(max(place[1] + up, 0), HEIGHT - 1)
 
 
 def features(place: Place) -> np.ndarray:
-    """What the learner knows of a place: the field itself, its column and its row.
+    """The features by which the learner knows a place: its field, its column and its row.
 
-    What it learns on one field also counts, half as much each, in the same column and in the same row.
+    So what it learns on one field also counts a little in the same column and row.
     """
     found = np.zeros(WIDTH * HEIGHT + WIDTH + HEIGHT)
     column, row = place

@@ -79,7 +79,7 @@ def _words(before: Place, place: Place, move: int | None, heard: str | None) -> 
 
 
 def _arrow(before: Place, place: Place, move: int | None) -> list[Object]:
-    """From where it was towards where it is, or towards the fence that was in the way."""
+    """An arrow from the field before towards the present one, or towards the fence that was in the way."""
     if move is None:
         return []
     right, up = list(MOVES.values())[move]

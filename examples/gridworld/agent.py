@@ -24,9 +24,9 @@ class Agent:
     def step(self, actions):
         points = self.forest.move(actions[self.forest.turn])
         rewards = dict.fromkeys(PLAYERS, points)
-        collected = dict.fromkeys(PLAYERS, not self.forest.acorns)
-        too_late = dict.fromkeys(PLAYERS, self.forest.over and bool(self.forest.acorns))
-        return self._observations(), rewards, collected, too_late, self._infos()
+        terminations = dict.fromkeys(PLAYERS, not self.forest.acorns)
+        truncations = dict.fromkeys(PLAYERS, self.forest.over and bool(self.forest.acorns))
+        return self._observations(), rewards, terminations, truncations, self._infos()
 
     def render(self):
         return draw(self.forest)

@@ -1,4 +1,4 @@
-"""The rules: two players collect acorns in a forest, turn by turn, before the turns are over. No picture here."""
+"""The rules: two players collect acorns in a forest, turn by turn, before the turns are over. picture.py draws them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def inside(place: Place) -> bool:
 
 
 def distances(start: Place, trees: frozenset[Place]) -> dict[Place, int]:
-    """How many moves each place is away that can be reached from `start`."""
+    """The number of moves from `start` to each place that can be reached."""
     found, edge = {start: 0}, deque([start])
     while edge:
         place = edge.popleft()

@@ -8,15 +8,15 @@ from typing import Any
 
 from forest import MOVES, Place, distances
 
-THINKS = 0.4
-"""Seconds that a partner seems to think, so that people see one move after the other."""
+THINKING_SECONDS = 0.4
+"""A partner waits so long before each move, so that people see one move after the other."""
 
 
 class Planner:
-    """Divides the acorns so that both players together need the fewest turns, supposing that the other does so too."""
+    """Divides the acorns so that all are collected soonest, supposing that the other player keeps to the same plan."""
 
     def act(self, observation: dict[str, Any], info: dict[str, Any]) -> int:
-        time.sleep(THINKS)
+        time.sleep(THINKING_SECONDS)
         return step_towards(observation, info, first_of_plan(observation))
 
 
@@ -24,16 +24,16 @@ class Nearest:
     """Goes for the acorn that is nearest to it, whatever the other player does."""
 
     def act(self, observation: dict[str, Any], info: dict[str, Any]) -> int:
-        time.sleep(THINKS)
+        time.sleep(THINKING_SECONDS)
         away = distances(observation["me"], observation["trees"])
         return step_towards(observation, info, min(observation["acorns"], key=lambda acorn: (away[acorn], acorn)))
 
 
 def first_of_plan(observation: dict[str, Any]) -> Place | None:
-    """The acorn to fetch first; None if the other player had better fetch them all.
+    """The acorn to fetch first; None if the plan leaves all acorns to the other player.
 
-    Of all divisions of the acorns, the best is the one in which the later of the two players is done first, and then
-    the one in which both walk least.
+    The best division of the acorns is the one with which all are collected soonest; of equal ones, the one with which
+    the players walk least.
     """
     acorns, trees = sorted(observation["acorns"]), observation["trees"]
     between = [distances(acorn, trees) for acorn in acorns]
@@ -48,7 +48,7 @@ def first_of_plan(observation: dict[str, Any]) -> Place | None:
         )
 
     def tour(start: Place, left: int) -> tuple[int, int | None]:
-        """The fewest moves from a place through all of the set, and the acorn to begin with."""
+        """The fewest moves from a place through all acorns of the set `left`, and the acorn to begin with."""
         ways = ((between[to][start] + onward(to, left & ~(1 << to)), to) for to in _members(left))
         return min(ways, default=(0, None))
 
@@ -62,12 +62,12 @@ def first_of_plan(observation: dict[str, Any]) -> Place | None:
 
 
 def _members(numbers: int) -> list[int]:
-    """The set whose members are the bits of a number."""
+    """The members of a set, which is a number whose bit n stands for member n."""
     return [bit for bit in range(numbers.bit_length()) if numbers >> bit & 1]
 
 
 def step_towards(observation: dict[str, Any], info: dict[str, Any], acorn: Place | None) -> int:
-    """The legal move after which the acorn is nearest; waiting if there is none to fetch."""
+    """The legal move after which the acorn is nearest; without an acorn to fetch, the player waits."""
     if acorn is None:
         return 0
     away = distances(acorn, observation["trees"])

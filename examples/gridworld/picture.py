@@ -1,4 +1,4 @@
-"""The picture, as objects: the images are those of assets/, which make_assets.py draws."""
+"""Draws the forest, by objects. Sprites show the images of assets/, which make_assets.py draws."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _sprite(name: str, image: str, place: Place) -> Object:
 
 
 def _whose_turn(forest: Forest) -> Object:
-    """A ring around the player who is to move. The page says it in words."""
+    """A ring around the player who is to move. The page also says in words whose turn it is."""
     x, y = _corner(forest.places[forest.turn])
     ring: Object = {"x": x + FIELD / 2, "y": y + FIELD / 2, "radius": FIELD / 2 - 3, "color": "#ffffff88"}
     return {**ring, "id": "turn", "type": "circle", "outline": RING, "outline_width": 4, "depth": 1, "tween": GLIDE}

@@ -10,10 +10,10 @@ TILE = 96
 """Pixels of one tile; the kitchen has 5 x 4 tiles, and the scene in config.yml 480 x 384 pixels."""
 
 LARGER = {"width": TILE + 1, "height": TILE + 1}
-"""Of what fills a tile: neighbours overlap, so that no line is seen between them."""
+"""The size of a picture that fills its tile: neighbours overlap, so that no line is seen between them."""
 
 STEPS_PER_SECOND = 10
-"""`startingFrameRate` of config.yml: the clock counts by it."""
+"""As `startingFrameRate` of config.yml: the clock beside the score counts by it."""
 
 WALK = 110
 """Milliseconds in which a chef is seen to walk from one tile to the next."""
@@ -22,7 +22,7 @@ COOK_STEPS = 30
 COLOURS = ("blue", "green")
 FACING = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
 HANDS = {UP: (0.0, -0.16), DOWN: (0.0, 0.22), LEFT: (-0.3, 0.12), RIGHT: (0.3, 0.12)}
-"""Where a chef who faces there holds a thing, in tiles from the middle."""
+"""Where a chef holds a thing, by the direction in which they face: in tiles from the middle."""
 
 
 class Agent:
@@ -36,9 +36,9 @@ class Agent:
         return self.env
 
     def render(self, player):
-        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins.
+        """The scene (docs/objects.md). Objects that never change are `permanent`: sent once, when an episode begins.
 
-        If two people play, each reads who they are. With the policy, the instructions say it.
+        If two people play, each reads which chef they are. With the policy, the instructions say it.
         """
         kitchen = self.env.kitchen()
         objects = _room(kitchen) if self.env.steps_left == self.env.max_steps else []
@@ -53,7 +53,7 @@ class Agent:
 
 
 def _sprite(name, frame, cell, **more):
-    """A picture of the atlas on a tile. Things that lie there, tables and floor have the same size."""
+    """A picture of the atlas, as large as its tile."""
     row, column = cell
     at = {"x": column * TILE, "y": row * TILE, "width": TILE, "height": TILE}
     return {"id": name, "type": "sprite", "image": "kitchen", "frame": frame, **at, **more}
@@ -73,7 +73,7 @@ def _room(kitchen):
 
 
 def _pot(cell, onions, timer):
-    """The pot as full as it is; while it cooks a bar grows."""
+    """The pot with its onions, and a bar that grows while it cooks."""
     ready = onions == POT_HOLDS and timer == 0
     found = [_sprite(f"pot {cell}", "pot-ready" if ready else f"pot-{onions}", cell, **LARGER)]
     if onions == POT_HOLDS and not ready:
@@ -88,7 +88,7 @@ def _pot(cell, onions, timer):
 
 
 def _chef(number, chef):
-    """The chef walks smoothly, and what they hold with them: behind them while they face away."""
+    """The chef, and the thing that they hold: it is behind them while they face away."""
     found = [_sprite(f"chef {number}", f"chef-{COLOURS[number]}-{FACING[chef.facing]}", chef.cell, depth=4, tween=WALK)]
     if chef.holds:
         right, down = HANDS[chef.facing]

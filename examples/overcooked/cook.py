@@ -1,6 +1,7 @@
-"""A cook by rules: what the policy of this study learns from (`train.py`).
+"""A cook by rules, from whom the policy of this study learns (`train.py`).
 
-It sees what stands where, decides what to fetch or bring, and walks there around the other chef. It remembers nothing.
+From the state of the kitchen the cook decides what to fetch or bring, and walks there around the other chef. The cook
+remembers nothing.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from kitchen import NOOP, PICKUP, POT_HOLDS, STEPS, Cell, Kitchen
 
 def act(kitchen: Kitchen, chef: int) -> int:
     """The best action of this chef."""
-    for wanted in _wishes(kitchen, chef):
+    for wanted in _targets(kitchen, chef):
         action = _towards(kitchen, chef, wanted)
         if action is not None:
             return action
     return NOOP
 
 
-def _wishes(kitchen: Kitchen, number: int) -> Iterator[frozenset[Cell]]:
-    """Cells to walk to and use; later ones if none of the earlier can be reached."""
+def _targets(kitchen: Kitchen, number: int) -> Iterator[frozenset[Cell]]:
+    """Sets of cells to walk to and use, the best first. A later set counts if no cell before it can be reached."""
     me, other = kitchen.chefs[number], kitchen.chefs[1 - number]
     filling = [cell for cell, (onions, _) in kitchen.pots.items() if onions < POT_HOLDS]
     full = {cell: timer for cell, (onions, timer) in kitchen.pots.items() if onions == POT_HOLDS}
@@ -32,7 +33,7 @@ def _wishes(kitchen: Kitchen, number: int) -> Iterator[frozenset[Cell]]:
     elif me.holds == "plate":
         if full:
             yield frozenset(full)
-        yield free  # plates are for full pots: hands are needed for onions
+        yield free  # no pot is full: the hands are needed for onions
     elif me.holds == "onion":
         if filling:
             yield frozenset(filling)
@@ -51,13 +52,13 @@ def _wishes(kitchen: Kitchen, number: int) -> Iterator[frozenset[Cell]]:
 
 
 def _places(things: dict[Cell, str]) -> Callable[[str], frozenset[Cell]]:
-    return lambda name: frozenset(cell for cell, what in things.items() if what == name)
+    return lambda name: frozenset(cell for cell, thing in things.items() if thing == name)
 
 
 def _towards(kitchen: Kitchen, number: int, wanted: frozenset[Cell]) -> int | None:
-    """Use what is wanted if it is ahead; else the first step of the shortest way to it, around the other chef.
+    """The action that uses a wanted cell if it is ahead, else the first step of the shortest way to one of them.
 
-    If the other chef stands in the only way, the step leads there all the same: they may go.
+    The way leads around the other chef. If there is none, it leads through them: they may go. None: no way at all.
     """
     me, other = kitchen.chefs[number], kitchen.chefs[1 - number]
     if not wanted:
@@ -83,7 +84,7 @@ def _first_step(kitchen: Kitchen, start: Cell, wanted: frozenset[Cell], blocked:
         cell, first = ways.popleft()
         for action, (down, right) in STEPS.items():
             ahead = cell[0] + down, cell[1] + right
-            if ahead in wanted:  # the last step turns to it
+            if ahead in wanted:  # the last step turns the chef towards it
                 return action if first is None else first
             if ahead not in closed and 0 <= ahead[0] < kitchen.size[0] and 0 <= ahead[1] < kitchen.size[1]:
                 closed.add(ahead)

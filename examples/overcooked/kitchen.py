@@ -1,4 +1,4 @@
-"""Overcooked of the package `cogrid` as PettingZoo's ParallelEnv, and what stands where in it."""
+"""Overcooked of the package `cogrid` as PettingZoo's ParallelEnv, and the state of its kitchen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-# Where these are installed, cogrid loads them for its own drawing: time and memory for what is never drawn here.
+# If these are installed, cogrid imports them to draw pictures of its own. They are hidden, since agent.py draws here.
 HIDDEN = [name for name in ("cv2", "pygame") if name not in sys.modules]
 sys.modules.update(dict.fromkeys(HIDDEN))
 from cogrid.cogrid_env import CoGridEnv  # noqa: E402
@@ -26,12 +26,12 @@ Cell = tuple[int, int]
 
 ACTIONS = ("up", "down", "left", "right", "pickup", "noop")
 UP, DOWN, LEFT, RIGHT, PICKUP, NOOP = range(len(ACTIONS))
-OF_THE_PACKAGE = (0, 1, 2, 3, 4, 6)
-"""The package's numbers of these actions. Its action 5, `toggle`, does nothing in these kitchens."""
+COGRID_ACTIONS = (0, 1, 2, 3, 4, 6)
+"""The package's number of each of ACTIONS. Its action 5, `toggle`, does nothing in these kitchens."""
 
 STEPS = {UP: (-1, 0), DOWN: (1, 0), LEFT: (0, -1), RIGHT: (0, 1)}
 FACING = (RIGHT, DOWN, LEFT, UP)
-"""The package's directions, as the actions that turn there."""
+"""For each direction, by the package's number, the action that turns a chef there."""
 
 CRAMPED = "overcooked_cramped_room_v0"
 SOUP_REWARD = 20.0
@@ -47,7 +47,7 @@ FEATURES = [
     "ordered_pot_features",
     "overcooked_inventory",
 ]
-"""What a chef observes, of the parts that the package has: 202 numbers. By its own choice they are 892, mostly 0."""
+"""The parts of the package's observations that a chef gets: 202 numbers. By default they are 892, mostly 0."""
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Chef:
 
 @dataclass
 class Kitchen:
-    """What stands where."""
+    """The state of the kitchen."""
 
     size: Cell
     chefs: list[Chef]
@@ -75,7 +75,7 @@ class Kitchen:
     lying: dict[Cell, str] = field(default_factory=dict)
     """Things on counters, and on the floor."""
     pots: dict[Cell, tuple[int, int]] = field(default_factory=dict)
-    """How many onions are in it, and how many steps a full one still cooks."""
+    """By the pot's cell: the number of onions in it, and the steps that a full one still cooks."""
 
 
 class Overcooked(ParallelEnv):
@@ -113,7 +113,7 @@ class Overcooked(ParallelEnv):
         return self._game.reset(seed=seed)
 
     def step(self, actions: dict[int, int]) -> tuple[dict[int, Any], ...]:
-        given = {agent: OF_THE_PACKAGE[int(actions[agent])] for agent in self.possible_agents}
+        given = {agent: COGRID_ACTIONS[int(actions[agent])] for agent in self.possible_agents}
         observations, rewards, terminations, truncations, infos = self._game.step(given)
         self.soups += rewards[0] >= SOUP_REWARD
         self.agents = list(self._game.agents)
@@ -124,7 +124,7 @@ class Overcooked(ParallelEnv):
         return self.max_steps - self._game.t
 
     def kitchen(self) -> Kitchen:
-        """What stands where now."""
+        """The present state of the kitchen."""
         state = self._game._env_state
         chefs = [
             Chef(_cell(cell), FACING[int(facing)], self._names.get(int(held[0])))

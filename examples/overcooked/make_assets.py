@@ -17,11 +17,11 @@ TILE = 144
 """Pixels; half as many again as in the scene, for large screens."""
 
 FINER = 4
-"""Pictures are drawn so many times larger, and then made smaller: smooth edges."""
+"""Pictures are drawn so many times larger and then reduced, so that edges are smooth."""
 
 COLUMNS = 6
 EDGE = 2
-"""Around each picture its outermost pixels are repeated so often: a browser that scales it would mix in the next."""
+"""Each picture has a border of so many copies of its outermost pixels: a scaled picture then shows none of the next."""
 
 Colour = tuple[int, ...]
 

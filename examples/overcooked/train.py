@@ -24,7 +24,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 Array = Any
 Player = Callable[[Kitchen, int, Array], int]
-"""Chooses an action from what stands where, the number of the chef, and what it observes."""
+"""Chooses an action from the state of the kitchen, the number of the chef, and the chef's observation."""
 
 HIDDEN = 64
 EPISODE = 250
@@ -96,14 +96,14 @@ def at_random(chance: random.Random) -> Player:
 
 
 def by_rules(chance: random.Random, astray: float) -> Player:
-    """The cook by rules, who now and then does anything: so that the network sees how to go on from there."""
+    """The cook by rules, who sometimes takes a random action, so that the network learns to go on after mistakes."""
     return lambda kitchen, chef, observation: (
         chance.randrange(len(ACTIONS)) if chance.random() < astray else cook.act(kitchen, chef)
     )
 
 
 def play(players: tuple[Player, Player], steps: int, seed: int, layout: str = CRAMPED) -> tuple[Array, Array, float]:
-    """So many steps: what the chefs observed, what the cook by rules would have done, and soups per 100 steps."""
+    """Play. Returns the observations, the actions of the cook by rules for them, and the soups in 100 steps."""
     env, observed, labels, soups = Overcooked(layout, max_steps=EPISODE), [], [], 0
     for number in range(steps):
         if number % EPISODE == 0:
@@ -176,8 +176,8 @@ def export(network: Network, path: Path, about: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=9, help="how often the network learns")
-    parser.add_argument("--steps", type=int, default=1500, help="that are played before each")
-    parser.add_argument("--layout", default=CRAMPED, help="of the kitchen, by the package's name")
+    parser.add_argument("--steps", type=int, default=1500, help="steps that are played before the network learns again")
+    parser.add_argument("--layout", default=CRAMPED, help="the kitchen, by the package's name for it")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--into", type=Path, default=Path(__file__).parent / "policies")
     given = parser.parse_args()

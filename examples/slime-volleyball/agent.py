@@ -8,7 +8,7 @@ from slime_volleyball.core import constants, physics
 from volleyball import LEFT, PLAYERS, RIGHT, Volleyball
 
 WIDTH, HEIGHT = 960, 500
-"""Of the scene in config.yml, in pixels. `assets/court.png` is as large."""
+"""The size of the scene in config.yml, in pixels. `assets/court.png` has the same."""
 
 SCALE = WIDTH / constants.REF_W
 """Pixels of one unit of the package."""
@@ -31,16 +31,16 @@ class Agent:
         return self.env
 
     def render(self, player):
-        """The scene (docs/objects.md). What stands still is `permanent`: it is named once, when an episode begins.
+        """The scene (docs/objects.md). Objects that never change are `permanent`: sent once, when an episode begins.
 
-        If two people play, each reads who they are. Against the policy, the instructions say it.
+        If two people play, each reads which slime they are. Against the policy, the instructions say it.
         """
         places = self.env.places()
         ball = places["ball"]
         objects = [*(STILL if self.env.begins() else ()), *_ball(ball)]
         for each in PLAYERS:
             objects += _slime(each, places[each], ball)
-        if self.env.serve() and any(self.env.scores.values()):  # before the first point the page says so
+        if self.env.serve() and any(self.env.scores.values()):  # before the first point the page itself says "Ready?"
             x, y = _at(0, 14)
             objects.append(
                 {"id": "serve", "type": "text", "text": "Ready?", "x": x, "y": y, "origin": [0.5, 1], "size": 34}
@@ -52,7 +52,7 @@ class Agent:
 
 
 def _at(x, y):
-    """A place of the package (from the net, from the ground's lower edge) in pixels of the scene."""
+    """A place in pixels of the scene. The package measures it from the net, and from the lower edge of the ground."""
     return WIDTH / 2 + x * SCALE, HEIGHT - SAND - (y - constants.REF_U) * SCALE
 
 
@@ -81,7 +81,7 @@ def _slime(player, place, ball):
 
 
 def _ball(place):
-    """It turns as it flies. Above the picture an arrow shows where it is."""
+    """The ball, which turns as it flies. If it is above the picture, an arrow points to it."""
     x, y = _at(*place)
     size = 2 * physics.BALL_RADIUS * SCALE
     if y > -size / 2:

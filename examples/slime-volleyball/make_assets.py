@@ -9,13 +9,13 @@ from PIL import Image, ImageDraw
 
 ASSETS = Path(__file__).parent / "assets"
 FINER = 4
-"""Pictures are drawn so many times larger, and then made smaller: smooth edges."""
+"""Pictures are drawn so many times larger and then reduced, so that edges are smooth."""
 
 WIDTH, HEIGHT, GROUND = 960, 500, 30
-"""Of the court, in pixels; the ground begins so far from the bottom."""
+"""The size of the court, and the height of its ground, in pixels."""
 
 SLIME, BALL = (120, 60), 40
-"""Twice the size at which they are shown."""
+"""Pixels: twice the size at which they are shown."""
 
 Colour = tuple[int, ...]
 

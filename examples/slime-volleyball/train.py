@@ -1,8 +1,8 @@
-"""Train the policies of this study: `python train.py`. It takes a minute or two on one core, and writes `policies/`.
+"""Train the policies of this study: `python train.py`. It takes half a minute on one core, and writes `policies/`.
 
-A small network learns to play like the opponent that the package brings, which was evolved by David Ha. It learns from
-what it meets itself (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686): the network plays, the opponent of the
-package watches and says what it would have done, and the network learns from all of that. Hundreds of games are played
+A small network learns to play like the opponent that the package brings, which was evolved by David Ha. It learns by
+DAgger (Ross et al. 2011, https://arxiv.org/abs/1011.0686): the network plays, the opponent of the package says for each
+observation what it would have done, and the network learns from all of these. Hundreds of games are played
 at once, as arrays, with the package's own physics. Needs `pip install onnx==1.23.2` beside requirements.txt.
 """
 
@@ -24,14 +24,14 @@ from volleyball import ACTIONS, MIRRORED
 
 Array = Any
 Chooser = Callable[[Array], Array]
-"""From the observations of many games, a row each, to the actions of one player."""
+"""Chooses the actions of one player from the observations of many games, a row for each game."""
 
 BUTTONS = np.array(SlimeVolleyEnv.action_table, np.float32)
-"""Of each action: forwards, backwards, jump."""
+"""For each action the pressed buttons: forwards, backwards, jump."""
 
 INPUTS, HIDDEN, OUTPUTS = 12, 48, len(ACTIONS)
 SIDES = (-1, 1)
-"""Of the left and the right player."""
+"""The sign of x on the half of the left player, and on that of the right one."""
 
 
 class Games:
@@ -59,7 +59,7 @@ class Games:
         return (np.concatenate(parts) / 10).T.astype(np.float32)
 
     def step(self, left: Array, right: Array) -> Array:
-        """Take an action of each player in each game, forwards and backwards. Returns the right player's rewards."""
+        """Take an action of each player in each game: forwards or backwards. Returns the right player's rewards."""
         for player, actions in enumerate((left, right)):
             wanted = physics.actions_to_desired_vel(BUTTONS[actions]).T
             self._place[player], self._speed[player], _ = physics.update_agent(
@@ -96,7 +96,7 @@ class Teacher:
         self._output = np.zeros((count, given.nOutput))
 
     def __call__(self, observations: Array) -> Array:
-        """Its actions. Forwards and backwards at once are neither, and there is no such action."""
+        """The opponent's actions. Forwards and backwards at once count as neither, since there is no such action."""
         inputs = np.concatenate([observations[:, :8], self._output], axis=1)
         self._output = np.tanh(inputs @ self._weight + self._bias)
         forwards, backwards, jumps = (self._output[:, :3] > 0.75).T
@@ -125,7 +125,7 @@ class Network:
         return hidden, hidden @ second + last
 
     def learn(self, observations: Array, actions: Array, rate: float) -> float:
-        """One step of Adam towards these actions. Returns the share that it had right."""
+        """Take one step of Adam towards these actions. Returns the share that the network had right before."""
         hidden, values = self._values(observations)
         right = float((values.argmax(1) == actions).mean())
         shares = np.exp(values - values.max(1, keepdims=True))
@@ -144,7 +144,7 @@ class Network:
 
 
 def play(left: Chooser, right: Chooser, games: int, steps: int, seed: int) -> tuple[float, Array, Array]:
-    """The right player's points won less those lost, per game; what it observed; what the teacher would have done."""
+    """Play. Returns the right player's points less the left one's, a game; its observations; the teacher's actions."""
     world, teacher = Games(games, np.random.default_rng(seed)), Teacher(games)
     points, observed, wanted = 0.0, [], []
     for _ in range(steps):
@@ -159,20 +159,20 @@ def train(rounds: int, seed: int, games: int = 200, steps: int = 500) -> Network
     chance = np.random.default_rng(seed)
     network = Network(chance)
 
-    def anything(seen: Array) -> Array:
+    def at_random(seen: Array) -> Array:
         return chance.integers(OUTPUTS, size=len(seen))
 
     lessons = [
         play(Teacher(games), Teacher(games), games, steps, seed)[1:],
-        play(anything, Teacher(games), games, steps, seed + 1)[1:],
+        play(at_random, Teacher(games), games, steps, seed + 1)[1:],
     ]
     for number in range(rounds):
         observed, wanted = (np.concatenate(parts) for parts in zip(*lessons, strict=True))
         rate = 3e-3 * (1 - number / rounds)
         order = chance.permutation(len(wanted))[:300_000]
         right = [network.learn(observed[part], wanted[part], rate) for part in np.array_split(order, len(order) // 500)]
-        # Its opponents are the teacher, itself, and one that does anything.
-        other = [Teacher(games), network, anything][number % 3]
+        # Its opponents are the teacher, itself, and one that acts at random.
+        other = [Teacher(games), network, at_random][number % 3]
         points, *lesson = play(other, network, games, steps, seed + 2 + number)
         lessons.append((lesson[0], lesson[1]))
         if number % 3 == 0:
@@ -184,8 +184,8 @@ def train(rounds: int, seed: int, games: int = 200, steps: int = 500) -> Network
 def export(network: Network, path: Path, *, left: bool, about: str) -> None:
     """Write the network as ONNX: observation (batch, 12) to the values of the actions (batch, 6).
 
-    The network means forwards by its second action, which is to the left for the player of the right half, as the
-    environment has it. For the left half the values are exchanged.
+    The network's second action is forwards. For the player of the right half that is to the left, as in the
+    environment; for the left half the values are exchanged.
     """
     first, bias, second, last = network.weights
     if left:
@@ -210,7 +210,7 @@ def export(network: Network, path: Path, *, left: bool, about: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=30, help="how often it plays, and learns from it")
+    parser.add_argument("--rounds", type=int, default=30, help="how often the network plays and then learns")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--into", type=Path, default=Path(__file__).parent / "policies")
     given = parser.parse_args()

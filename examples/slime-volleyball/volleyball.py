@@ -15,7 +15,7 @@ ACTIONS = ("noop", "left", "leftup", "up", "rightup", "right")
 """In the package's order. `left` is to the left on the screen, for both players."""
 
 MIRRORED = (0, 5, 4, 3, 2, 1)
-"""Each action as the player of the other half means it: forwards instead of to the left."""
+"""Each action mirrored: the number of the same action for the player of the other half."""
 
 STEPS_PER_SECOND = round(1 / constants.TIMESTEP)
 

@@ -13,7 +13,7 @@ from tamer import Bumps, Tamer
 
 WORDS = {"good": 1.0, "bad": -1.0}
 SHOWN_SECONDS = 0.8
-"""How long the picture says what the car has heard."""
+"""For so long the picture shows the last word that the car has heard."""
 
 ACTIONS = 3  # push left, no push, push right
 
@@ -38,7 +38,7 @@ class Agent:
         return self.state, info
 
     def step(self, _action):
-        """The participant takes no action; the car takes the one that it expects most praise for."""
+        """Take the action for which the car expects most praise. The participant takes none."""
         predicted = self.tamer.predict(self.state)
         self.action = self.tamer.choose(self.state, self.action)
         self.tamer.took(self.state, self.action)

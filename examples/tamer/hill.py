@@ -1,4 +1,4 @@
-"""The picture: the hill, the car, an arrow for what its motor does, and the last word that it heard."""
+"""Draws the picture: the hill, the car, an arrow for its action, and the last word that it heard."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DOES = ("pushes left", "does not push", "pushes right")
 
 
 def height(place: float) -> float:
-    """MountainCar's hill."""
+    """The height of MountainCar's hill at a place."""
     return math.sin(3 * place) * 0.45 + 0.55
 
 
@@ -30,7 +30,7 @@ class Hill:
         self._still = self._landscape()
 
     def draw(self, place: float, action: int, heard: str | None) -> np.ndarray:
-        """The car at `place` while it takes `action` (0 pushes left, 1 not at all, 2 right)."""
+        """Draw the car at `place` while it takes `action`: 0 pushes left, 1 does not push, 2 pushes right."""
         picture = self._still.copy()
         pen = ImageDraw.Draw(picture)
         self._car(pen, place)
@@ -91,5 +91,5 @@ def at(x: float, y: float) -> tuple[float, float]:
 
 
 def ground(place: float) -> tuple[float, float]:
-    """Where the hill's surface is in the fine picture."""
+    """The point of the hill's surface at `place`, in pixels before the picture is reduced."""
     return at((place - LEFT) / (RIGHT - LEFT) * WIDTH, HEIGHT - 24 - height(place) * 240)

@@ -20,7 +20,7 @@ from collections import deque
 import numpy as np
 
 FASTEST, SLOWEST = 0.2, 0.8
-"""Seconds in which a person reacts. All delays between these are taken as equally likely."""
+"""Seconds in which a person reacts, at least and at most. All delays between are taken as equally likely."""
 
 
 class Bumps:
@@ -55,17 +55,17 @@ class Tamer:
         return self._weights @ self._features(state)
 
     def choose(self, state: np.ndarray, last: int) -> int:
-        """The action with the highest H. Among equal ones the `last` action goes on, so that a teacher can follow."""
+        """The action with the highest H. Among equal ones it is the `last` action, so that a teacher can follow."""
         predicted = self.predict(state)
         best = np.flatnonzero(predicted >= predicted.max() - 1e-9)
         return last if last in best else int(best[0])
 
     def took(self, state: np.ndarray, action: int) -> None:
-        """Remember what was done, so that the next words can be about it."""
+        """Remember the action, so that the next words can be about it."""
         self._recent.appendleft((action, self._features(state)))
 
     def begin(self) -> None:
-        """A new episode: words are no longer about the one before."""
+        """Begin an episode: words are no longer about the one before."""
         self._recent.clear()
 
     def hear(self, word: float) -> None:
@@ -77,9 +77,9 @@ class Tamer:
         self._weights += self._rate * error * credited
 
     def _credit(self, age: int) -> float:
-        """The share of a word that belongs to the step that `age` other steps have followed.
+        """The share of a word that belongs to a step after which `age` other steps were taken.
 
-        The person saw that step from `age` to `age + 1` steps ago: the probability that the delay lies between.
+        The person saw that step from `age` to `age + 1` steps ago. The share is the probability of such a delay.
         """
         since, until = age * self._step_seconds, (age + 1) * self._step_seconds
         return max(0.0, min(until, SLOWEST) - max(since, FASTEST)) / (SLOWEST - FASTEST)

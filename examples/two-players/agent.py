@@ -43,6 +43,6 @@ class Agent:
         }
 
     def _infos(self):
-        """What a recording has of each step."""
+        """The `info` that the recording holds of each step."""
         garden = self.garden
         return {player: {"place": garden.places[player], "plates": garden.plates} for player in PLAYERS}

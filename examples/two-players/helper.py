@@ -1,4 +1,4 @@
-"""What plays in the place of a participant who is not there."""
+"""The policy that plays in the place of a participant who is not there."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Any
 
 from lanterns import MOVES, PLAYERS, Place, distances
 
-RESTS = 3
-"""It waits at every third step, since people are no faster."""
+WAITS_EVERY = 3
+"""The helper waits at every third step, so that it is no faster than people."""
 
 
 class Helper:
-    """Goes to the plate that it should take, if the other player takes the other one by the shortest way."""
+    """Goes to the plate of `plate_of`, supposing that the other player takes the shortest way to the other plate."""
 
     def __init__(self, player: str) -> None:
         self._player = player
@@ -21,29 +21,29 @@ class Helper:
 
     def act(self, observation: dict[str, Any], info: dict[str, Any]) -> int:
         self._steps += 1
-        if self._steps % RESTS == 0:
+        if self._steps % WAITS_EVERY == 0:
             return 0
         return step_towards(observation, plate_of(observation, self._player))
 
 
 def plate_of(observation: dict[str, Any], player: str) -> Place:
-    """Of the two ways to share the plates, the one in which the later of the two players is there first.
+    """The plate that this player should take, so that both plates are reached as soon as possible.
 
-    If both ways are as good, red takes the first plate: else two helpers might both go to the same one.
+    If it makes no difference, red takes the first plate: otherwise two helpers might both go to the same one.
     """
     me, other, hedges = observation["me"], observation["other"], observation["hedges"]
     first, second = observation["plates"]
 
-    def waits(mine: Place, theirs: Place) -> tuple[int, int]:
+    def moves(mine: Place, theirs: Place) -> tuple[int, int]:
         own, others = distances(mine, hedges)[me], distances(theirs, hedges)[other]
         return max(own, others), own + others
 
     plates = (first, second) if player == PLAYERS[0] else (second, first)
-    return min(plates, key=lambda mine: waits(mine, second if mine == first else first))
+    return min(plates, key=lambda mine: moves(mine, second if mine == first else first))
 
 
 def step_towards(observation: dict[str, Any], plate: Place) -> int:
-    """The move after which the plate is nearest; waiting on the plate."""
+    """The move after which the plate is nearest. On the plate the helper waits."""
     away = distances(plate, observation["hedges"])
     column, row = observation["me"]
     reached = {move: (column + x, row + y) for move, (x, y) in enumerate(MOVES)}

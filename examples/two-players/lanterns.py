@@ -1,4 +1,4 @@
-"""The rules: two people who light a lantern whenever both plates are stood on. No picture here."""
+"""The rules: two players light a lantern whenever each stands on one of the two plates. picture.py draws them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from random import Random
 WIDTH, HEIGHT = 9, 6
 HEDGES, LANTERNS = 9, 12
 APART = 4
-"""Moves at least from one plate to the other."""
+"""The fewest moves from one plate to the other."""
 PLAYERS = ("red", "blue")
 MOVES = ((0, 0), (0, -1), (1, 0), (0, 1), (-1, 0))
 """wait, up, right, down, left: the order of actionSpace in config.yml. Rows count from the top."""
@@ -18,7 +18,7 @@ START: dict[str, Place] = {"red": (0, HEIGHT - 1), "blue": (WIDTH - 1, 0)}
 
 
 class Garden:
-    """One round. Players may pass each other, and stand on one field. They find out whose plate is whose."""
+    """One round. Players may pass each other, and stand on the same field. Either of them may take either plate."""
 
     def __init__(self, seed: int | None = None) -> None:
         self._chance = Random(seed)
@@ -38,7 +38,7 @@ class Garden:
         return self.lit == LANTERNS
 
     @property
-    def stood_on(self) -> set[Place]:
+    def occupied_plates(self) -> set[Place]:
         """The plates on which a player stands."""
         return set(self.plates) & set(self.places.values())
 
@@ -49,7 +49,7 @@ class Garden:
             there = column + MOVES[move][0], row + MOVES[move][1]
             if inside(there) and there not in self.hedges:
                 self.places[player] = there
-        if self.over or self.stood_on != set(self.plates):
+        if self.over or self.occupied_plates != set(self.plates):
             return 0.0
         self.lit += 1
         self.plates = self._next_plates()
@@ -69,7 +69,7 @@ def inside(place: Place) -> bool:
 
 
 def distances(start: Place, hedges: frozenset[Place]) -> dict[Place, int]:
-    """How many moves each field is away that can be reached from `start`."""
+    """The number of moves from `start` to each field that can be reached."""
     found, edge = {start: 0}, deque([start])
     while edge:
         place = edge.popleft()

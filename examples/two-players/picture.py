@@ -1,4 +1,4 @@
-"""What a player sees, as objects: the images are those of assets/, which make_assets.py draws."""
+"""Draws the garden for one player, by objects. Sprites show the images of assets/, which make_assets.py draws."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from lanterns import HEIGHT, LANTERNS, PLAYERS, WIDTH, Garden, Place
 
 FIELD = 72  # pixels: the side of a field
 TOP = 48  # pixels above the garden, where the lanterns hang
-GLIDE = 160  # milliseconds in which a player is seen to move: a step
+GLIDE = 160  # milliseconds in which a player is seen to move: about one step
 GRASS = ((0x22, 0x3A, 0x33), (0x26, 0x40, 0x37))
-BY_LIGHT = (0x62, 0x8A, 0x4E)  # what the grass is like when all lanterns are lit
-ASIDE = {"red": -9, "blue": 9}  # pixels, so that both are seen on one field
+LIT_GRASS = (0x62, 0x8A, 0x4E)  # its colour when all lanterns are lit
+ASIDE = {"red": -9, "blue": 9}  # pixels from the middle of a field, so that both players are seen on the same one
 
 Object = dict[str, object]
 
@@ -18,7 +18,7 @@ def draw(garden: Garden, player: str) -> dict[str, object]:
     objects = [*_ground(garden.lit), *(_lantern(number, garden.lit) for number in range(LANTERNS))]
     objects += [_sprite(f"hedge {place}", "hedge", place) for place in sorted(garden.hedges)]
     for place in garden.plates:
-        objects += _plate(place, lit=place in garden.stood_on)
+        objects += _plate(place, lit=place in garden.occupied_plates)
     objects += [part for each in PLAYERS for part in _figure(each, garden.places[each], me=each == player)]
     return {"objects": objects, "hud": f"You are {player}. {garden.lit} of {LANTERNS} lanterns lit"}
 
@@ -28,13 +28,13 @@ def _corner(place: Place) -> tuple[int, int]:
 
 
 def _ground(lit: int) -> list[Object]:
-    """The garden: lighter with each lantern."""
+    """The grass, which gets lighter with each lantern."""
     found: list[Object] = []
     for column in range(WIDTH):
         for row in range(HEIGHT):
             x, y = _corner((column, row))
             dark = GRASS[(column + row) % 2]
-            mixed = (round(a + (b - a) * lit / LANTERNS) for a, b in zip(dark, BY_LIGHT, strict=True))
+            mixed = (round(a + (b - a) * lit / LANTERNS) for a, b in zip(dark, LIT_GRASS, strict=True))
             color = "#" + "".join(f"{part:02x}" for part in mixed)
             size = {"width": FIELD, "height": FIELD, "color": color}
             found.append({"id": f"grass {column} {row}", "type": "rectangle", "x": x, "y": y, **size})
@@ -70,7 +70,7 @@ def _plate(place: Place, *, lit: bool) -> list[Object]:
 
 
 def _figure(player: str, place: Place, *, me: bool) -> list[Object]:
-    """A player; their own has a ring around it. The page says in words who one is."""
+    """A player. The figure of the participant who sees the picture has a ring around it."""
     x, y = _corner(place)
     found: list[Object] = []
     if me:

@@ -16,7 +16,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "gridworld"
 def modules(load_module: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any, Any]:
     """forest, partners without the time that they seem to think, and agent."""
     forest, partners = load_module("gridworld", "forest"), load_module("gridworld", "partners")
-    monkeypatch.setattr(partners, "THINKS", 0)
+    monkeypatch.setattr(partners, "THINKING_SECONDS", 0)
     return forest, partners, load_module("gridworld", "agent")
 
 
