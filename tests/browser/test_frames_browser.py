@@ -7,6 +7,7 @@ import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -224,6 +225,25 @@ def test_frames_that_are_none_are_refused(new_world: World, tab: Any, bomb: str)
     new_world.connections[0].send(BOMBS[bomb])
     reconnected(new_world, tab)
     assert tab.evaluate("document.getElementById('screen').width") == 2
+
+
+def test_a_small_message_cannot_fill_the_memory(new_world: World, tab: Any) -> None:
+    packer = zlib.compressobj(wbits=-15)
+    zeros = packer.compress(bytes(2**24)) + packer.flush(zlib.Z_FULL_FLUSH)
+    play(new_world, tab)
+    before = most_memory(tab)
+    new_world.connections[0].send(header(KEY, SMALL, 3) + 64 * zeros)  # 1 MB, unpacked 1 GB
+    reconnected(new_world, tab)
+    assert most_memory(tab) - before < 256
+
+
+def most_memory(tab: Any) -> float:
+    """The megabytes that the browser's pages ever had at a time."""
+    asked = tab.context.browser.new_browser_cdp_session()
+    processes = asked.send("SystemInfo.getProcessInfo")["processInfo"]
+    asked.detach()
+    statuses = [Path(f"/proc/{one['id']}/status").read_text() for one in processes if one["type"] == "renderer"]
+    return max(int(status.split("VmHWM:")[1].split()[0]) for status in statuses) / 1024
 
 
 def test_a_browser_that_cannot_decode_gets_what_it_knows(launch: Any, tab: Any, sent: list[int]) -> None:

@@ -2,7 +2,8 @@
 
 export const HEADER = 10; // bytes before the pixels
 export const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
-const LARGEST = 4096 * 4096; // pixels of a picture; trial/pictures/frames.py sends no more
+const PART = 2 ** 14; // bytes that are unpacked at a time; they become at most 17 MB
+const LARGEST = 2 ** 24; // pixels of a picture: 4096 x 4096; trial/pictures/frames.py sends no more
 
 export const canInflate = typeof DecompressionStream === "function";
 export const canDecode = typeof createImageBitmap === "function";
@@ -19,13 +20,13 @@ export function readHeader(buffer) {
 }
 
 // Resolves to `{ picture }` for a JPEG, `{ first, bytes }` for rows, `{ bytes }` otherwise. Rejects what is no such frame.
-export function unpack(header, buffer) {
+export async function unpack(header, buffer) {
   const { kind, width, height, channels } = header;
   const known = width * height > 0 && width * height <= LARGEST && (channels === 1 || channels === 3);
-  if (!known || kind > ROWS || buffer.byteLength < HEADER + 2) return Promise.reject(new Error("no such frame"));
+  if (!known || kind > ROWS || buffer.byteLength < HEADER + 2) throw new Error("no such frame");
   if (kind === JPEG) return decodeLossy(header, buffer);
   if (kind === ROWS) return inflateRows(header, buffer);
-  return inflate(buffer.slice(HEADER), width * height * channels, width * height * channels).then((bytes) => ({ bytes }));
+  return { bytes: await inflate(buffer.slice(HEADER), width * height * channels) };
 }
 
 async function inflateRows({ width, height, channels }, buffer) {
@@ -36,30 +37,32 @@ async function inflateRows({ width, height, channels }, buffer) {
   return { first, bytes };
 }
 
-// No more than the header says is unpacked: a small message must not become a huge picture.
-export async function inflate(packed, least, most) {
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
-  const reader = stream.getReader();
+// No more than the header says is unpacked: a small message must not become a huge picture. A DecompressionStream unpacks
+// what it is given at once, so it gets the next part when the last one has been read. (The bytes of a Blob would come
+// from another process: each frame would wait for it.)
+export async function inflate(packed, least, most = least) {
+  let at = 0;
+  const parts = new ReadableStream({
+    pull: (to) => (at < packed.byteLength ? to.enqueue(packed.slice(at, (at += PART))) : to.close()),
+  });
+  const reader = parts.pipeThrough(new DecompressionStream("deflate-raw")).getReader();
   const pieces = [];
-  let length = 0;
-  for (let piece = await reader.read(); !piece.done; piece = await reader.read()) {
+  let piece, length = 0;
+  while (length <= most && !(piece = await reader.read()).done) {
     pieces.push(piece.value);
     length += piece.value.length;
-    if (length > most) break;
   }
-  if (length < least || length > most) {
-    reader.cancel().catch(() => {});
-    throw new Error("no such frame");
-  }
-  return new Uint8Array(await new Blob(pieces).arrayBuffer());
+  if (length < least || length > most) throw new Error("no such frame");
+  const bytes = new Uint8Array(length);
+  for (const piece of pieces.reverse()) bytes.set(piece, (length -= piece.length));
+  return bytes;
 }
 
 // For the same reason a JPEG's own size is read before it is decoded.
 async function decodeLossy({ width, height }, buffer) {
   const size = jpegSize(new DataView(buffer, HEADER));
   if (size?.width !== width || size.height !== height) throw new Error("no such frame");
-  const blob = new Blob([buffer.slice(HEADER)], { type: "image/jpeg" });
-  const picture = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+  const picture = await createImageBitmap(new Blob([buffer.slice(HEADER)], { type: "image/jpeg" }));
   if (picture.width !== width || picture.height !== height) throw new Error("no such frame");
   return { picture };
 }
