@@ -1,9 +1,10 @@
-"""Reads and checks a researcher's `config.yml`, and makes the project's registration of it.
+"""Reads and checks a researcher's `config.yml`, and makes the project's registration from it.
 
-A project folder (`folder`) and a registration from outside (`registration`) are checked alike: each value by itself
-(`each_value`, with `project_keys` and `protocol.trial`), then values against each other (`consistency`), and in a
-folder the step files (`step_files`). A value with a mistake is left out of the later checks, so that all mistakes are
-reported at once. What passes is a `Config`. Only `read_project` and `remarks` import PyYAML (in `yaml_file`).
+The same checks run for a project folder (`folder`) and for a registration from outside (`registration`): first each
+value by itself (`each_value`, with `project_keys` and `protocol.trial`), then values against each other
+(`consistency`), and in a folder the step files (`step_files`). A value with a mistake is left out of the later checks,
+so that all mistakes are reported at once. A project without mistakes becomes a `Config`. Only `read_project` and
+`remarks` import PyYAML (in `yaml_file`).
 """
 
 from hippodrome.config.config import Config, StepFiles

@@ -19,12 +19,12 @@ from hippodrome.config.texts_file import texts_file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 1 if there are mistakes."""
+    """Run the command line. Return the exit code: 1 if there are mistakes, or remarks with --strict, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m hippodrome.config", description="Check a project's config.yml.")
     commands = parser.add_subparsers(dest="command", required=True)
     check = commands.add_parser("check", help="print every mistake in a project folder")
     check.add_argument("folder", nargs="?", default=".", type=Path, help="the project's folder (default: this one)")
-    check.add_argument("--strict", action="store_true", help="count what is in HIPPO Gym's form as a mistake")
+    check.add_argument("--strict", action="store_true", help="count remarks, such as on HIPPO's form, as mistakes")
     commands.add_parser("schema", help="print the JSON Schema for editors")
     commands.add_parser("texts", help="print all texts that participants read, to be translated")
     chosen = parser.parse_args(arguments)

@@ -1,7 +1,8 @@
-"""Whether what agent.py imports is in the image of the participants' servers: what `infra/Dockerfile` installs.
+"""Checks that the servers' image (`infra/Dockerfile`) has the packages that agent.py imports.
 
-Read without running it: agent.py, and the modules beside it that it imports. The image holds `requirements/trial.txt`,
-the project's `requirements.txt`, and what both bring, as far as the packages installed here say what they need.
+It reads agent.py, and the modules beside it that agent.py imports, without running them. The image has the packages of
+`requirements/trial.txt` and of the project's `requirements.txt`, and their dependencies. Dependencies are known only
+for packages that are installed on this machine.
 """
 
 from __future__ import annotations
@@ -25,25 +26,26 @@ from hippodrome.config.layout import AGENT, REQUIREMENTS
 from protocol import players
 
 _ROOT = Path(__file__).resolve().parents[2]
-_IN_IMAGE = ("trial", "protocol", "pip")  # our own packages there, and what Python's image brings
+_IN_IMAGE = ("trial", "protocol", "pip")  # Hippodrome's packages in the image, and that of Python's base image
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 
 
-Choice = Callable[[ast.AST], Iterator[ast.Import | ast.ImportFrom]]
+ImportFilter = Callable[[ast.AST], Iterator[ast.Import | ast.ImportFrom]]
+"""Yields imports of a syntax tree."""
 
 
 class _Image(NamedTuple):
-    """The canonical names of the packages in the image that are known here, and why others may be there, too."""
+    """The known packages in the image, by their canonical names, and why the image may have others."""
 
     held: set[str]
     unknown: set[str]
-    """Packages asked for that are not installed here, so that what they bring is not known."""
+    """Packages of the requirements that are not installed here, so that their dependencies are not known."""
     unread: bool
-    """Whether a line of a file of requirements names no package that can be looked up."""
+    """Whether the requirements have a line that names no package."""
 
 
 class Import(NamedTuple):
-    """A module that a file imports, by its full name, and the line."""
+    """An import of a module, by its full name, at a line of a file."""
 
     file: str
     line: int
@@ -57,11 +59,11 @@ def may_run_on_aws(config: Config) -> bool:
 
 
 def missing(folder: Path) -> list[Diagnostic]:
-    """A mistake for each package that a file imports and the image lacks, at its first line there; a remark if it may
-    come with a package of requirements.txt that is not installed here.
+    """Return a mistake for each package that a file imports and the image lacks, at its first import in the file.
 
-    Imports whose failure the code expects (`try`, `TYPE_CHECKING`) are left out, and so are packages that are not
-    installed here: which distribution they are is not known, and the agent is tried without them.
+    It is a remark if the package may come with one in requirements.txt that is not installed here. Imports whose
+    failure the code expects (`try`, `TYPE_CHECKING`) are left out. So are packages that are not installed here: their
+    distribution is not known, and `make check` tries the agent without them.
     """
     image = _image(folder)
     found: dict[tuple[str, str], Diagnostic] = {}
@@ -74,15 +76,18 @@ def missing(folder: Path) -> list[Diagnostic]:
 
 
 def of_players(folder: Path, config: Config) -> list[Diagnostic]:
-    """A mistake for each package that config.yml needs and the image lacks: what runs the files of policies, and that
-    of a game which is a module and is made without an agent.py. A remark if it may come with another package."""
+    """Return a mistake for each package that config.yml needs and the image lacks. It is a remark if the package may
+    come with another one.
+
+    Policies' files need ONNX Runtime. Without an agent.py, a game such as `package.module` needs its package.
+    """
     image, source = _image(folder), read_source(folder)
     found: dict[str, Diagnostic] = {}
-    for path, what, line in _needed_by_players(folder, config):
+    for path, user, line in _needed_by_players(folder, config):
         name = canonicalize_name(line.partition("==")[0])
         if name in image.held or line in found:
             continue
-        needs, reason = f"{what} needs the package {name}", _unknown(image)
+        needs, reason = f"{user} needs the package {name}", _unknown(image)
         sentence = f"{needs}, which is not in the servers' image; write {line} into {REQUIREMENTS}"
         if reason:
             sentence = f"{needs}; whether it is in the servers' image is not checked, because {reason}"
@@ -91,7 +96,8 @@ def of_players(folder: Path, config: Config) -> list[Diagnostic]:
 
 
 def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str, str]]:
-    """What in config.yml needs a package, and the line for requirements.txt that brings it."""
+    """The path and the name of each policy's file or game that needs a package, and the package's line for
+    requirements.txt."""
     for path, file in players.files_of(config.trial):
         yield ("trial", *path), file, players.ONNXRUNTIME
     game = config.trial.game or ""
@@ -101,20 +107,23 @@ def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str
 
 
 def loaded(folder: Path, config: Config, names: Iterable[str]) -> list[str]:
-    """What to say of top-level modules that were loaded while the agent played, if the image lacks them and no file of
-    the project imports them itself: such as pygame, with which Gymnasium draws CartPole."""
-    if missing(folder):  # what the missing packages bring is not said again
+    """Return a sentence for each of these top-level modules that the image lacks and no file of the project imports.
+
+    `names` are the modules that were loaded while the agent played, such as pygame, with which Gymnasium draws
+    CartPole.
+    """
+    if missing(folder):  # these packages may load the modules, and are reported already
         return []
     image = _image(folder)
-    named = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
-    named |= {line.partition("==")[0] for _, _, line in _needed_by_players(folder, config)}
-    lacking = (_lacking(name, image)[0] for name in sorted(set(names) - named))
+    imported = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}
+    imported |= {line.partition("==")[0] for _, _, line in _needed_by_players(folder, config)}
+    lacking = (_lacking(name, image)[0] for name in sorted(set(names) - imported))
     return [f"playing loads a package that {AGENT} does not name: {message}" for message in lacking if message]
 
 
 def _lacking(name: str, image: _Image) -> tuple[str, bool]:
-    """What to do about a top-level module that the image lacks, and whether it surely does; empty if it is there or
-    not known."""
+    """The message about a top-level module that the image lacks, and whether this is certain. "" if the image has the
+    module, or if its distribution is not known."""
     if name in sys.stdlib_module_names or name in _IN_IMAGE:
         return "", True
     shown = printable(name, 100)
@@ -122,7 +131,7 @@ def _lacking(name: str, image: _Image) -> tuple[str, bool]:
     if not distributions:
         if not (_ROOT / name / "__init__.py").is_file():
             return "", True
-        return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers lack", True
+        return f"{shown} is not in the servers' image; it is a part of Hippodrome that servers do not have", True
     names = {canonicalize_name(distribution) for distribution in distributions}
     if names & image.held or canonicalize_name(name) in image.unknown:
         return "", True
@@ -134,18 +143,19 @@ def _lacking(name: str, image: _Image) -> tuple[str, bool]:
 
 
 def _unknown(image: _Image) -> str:
-    """Why the image may hold more than is known here; empty if it does not."""
+    """Why the image may have packages that are not known here; "" if all are known."""
     unread = f"a line of {REQUIREMENTS} names no package" if image.unread else ""
     if not image.unknown:
         return unread
     first, *others = sorted(image.unknown)
-    most = [printable(name, 100) for name in (first, *others[:2])]
-    names = f"{', '.join(most)} and {len(others) - 2} more" if len(others) > 2 else " and ".join(most)
+    shown = [printable(name, 100) for name in (first, *others[:2])]
+    names = f"{', '.join(shown)} and {len(others) - 2} more" if len(others) > 2 else " and ".join(shown)
     return f"{names} {'are' if others else 'is'} not installed here"
 
 
 def wanted(name: str) -> str:
-    """The line for requirements.txt that brings this top-level module in the version here; empty if it is not here."""
+    """Return the line for requirements.txt that installs this top-level module in the version of this machine; "" if
+    it is not installed here."""
     distributions = sorted(set(_distributions().get(name, ())))
     return f"{distributions[0]}=={metadata.version(distributions[0])}" if distributions else ""
 
@@ -154,8 +164,10 @@ def wanted(name: str) -> str:
 
 
 def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]]:
-    """The text of the project's requirements.txt as the image installs it; in a clone of HIPPO Gym lines are left out,
-    and remarks name them."""
+    """Return the text of the project's requirements.txt for the image, and remarks on the lines that are left out.
+
+    Lines are left out only in a clone of HIPPO Gym (`hippo_requirements`).
+    """
     file = layout.requirements_file(folder)
     if file is None or layout.agent_folder(folder) == folder:
         return text, []
@@ -164,12 +176,12 @@ def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]
 
 
 def requirement_remarks(folder: Path) -> list[Diagnostic]:
-    """What is left out of the project's requirements.txt."""
+    """Return remarks on the lines of the project's requirements.txt that are left out."""
     return project_requirements(folder, _text(layout.requirements_file(folder)))[1]
 
 
 def _image(folder: Path) -> _Image:
-    """What is in the image, as far as it is known here."""
+    """The packages in the image, as far as they are known here."""
     text, _ = project_requirements(folder, _text(layout.requirements_file(folder)))
     return _closure(_of_trial() + _requirements(text))
 
@@ -179,7 +191,7 @@ def _of_trial() -> list[Requirement | None]:
 
 
 def _requirements(text: str) -> list[Requirement | None]:
-    """The lines that name a package; None for one that cannot be read. Lines of options name none."""
+    """The requirement of each line, None for a line that cannot be read. Lines with options are left out."""
     lines = (line.partition(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
     return [_requirement(line) for line in lines if line and not line.startswith(("#", "--"))]
 
@@ -192,13 +204,13 @@ def _requirement(line: str) -> Requirement | None:
         return None
 
 
-def _closure(asked: Sequence[Requirement | None]) -> _Image:
-    """These packages and all that they bring. None stands for a line that cannot be read.
+def _closure(requirements: Sequence[Requirement | None]) -> _Image:
+    """These packages and their dependencies, with those of extras. None stands for a line that cannot be read.
 
-    An extra's packages come too. What a package needs and is not installed here is not looked into.
+    If a dependency is not installed here, its own dependencies are left out.
     """
-    readable = [requirement for requirement in asked if requirement is not None]
-    image = _Image(set(), set(), unread=len(readable) < len(asked))
+    readable = [requirement for requirement in requirements if requirement is not None]
+    image = _Image(set(), set(), unread=len(readable) < len(requirements))
     seen: set[tuple[str, str]] = set()
     waiting = [(requirement, True) for requirement in readable]
     while waiting:
@@ -218,7 +230,7 @@ def _closure(asked: Sequence[Requirement | None]) -> _Image:
 
 @cache
 def _needs(name: str) -> Sequence[Requirement] | None:
-    """What a package asks for; None for one that is not installed here, or says it so that it cannot be read."""
+    """The dependencies of a package; None if it is not installed here, or its metadata cannot be read."""
     try:
         return [Requirement(need) for need in metadata.requires(name) or ()]
     except (metadata.PackageNotFoundError, InvalidRequirement):
@@ -227,16 +239,18 @@ def _needs(name: str) -> Sequence[Requirement] | None:
 
 @cache
 def _distributions() -> dict[str, list[str]]:
-    """The installed distributions by the top-level modules that they bring."""
+    """The installed distributions, by their top-level modules."""
     return {name: list(found) for name, found in metadata.packages_distributions().items()}
 
 
 # What the code imports
 
 
-def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
-    """The imports (those that must succeed, unless others are chosen) of agent.py and of the modules beside it that it
-    imports, each file once, in the order of lines."""
+def _imports(folder: Path, chosen: ImportFilter | None = None) -> Iterator[Import]:
+    """The imports of agent.py and of the modules beside it that it imports, each file once, in the order of lines.
+
+    By default these are the imports that must succeed (`_needed`). Imports of the project's own files are left out.
+    """
     top, folder = folder.resolve(), layout.agent_folder(folder).resolve()
     waiting, seen = [folder / AGENT], set()
     while waiting:
@@ -245,14 +259,14 @@ def _imports(folder: Path, chosen: Choice | None = None) -> Iterator[Import]:
             continue
         seen.add(path)
         for line, modules in _read(path, folder, chosen or _needed):
-            here = {file for module in modules for file in _beside(folder, module)}
-            waiting += sorted(here)
-            if not here and modules:
+            own_files = {file for module in modules for file in _beside(folder, module)}
+            waiting += sorted(own_files)
+            if not own_files and modules:
                 yield Import(path.relative_to(top).as_posix(), line, modules[0])
 
 
-def _read(path: Path, folder: Path, chosen: Choice) -> list[tuple[int, list[str]]]:
-    """For each import, its line and the modules that it may load. Nothing of a file that Python cannot read."""
+def _read(path: Path, folder: Path, chosen: ImportFilter) -> list[tuple[int, list[str]]]:
+    """The line of each import, and the modules that it may load; [] if Python cannot read the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -283,7 +297,7 @@ def _needed(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
 
 
 def _expects(handler: ast.ExceptHandler) -> bool:
-    """Whether it handles an import that fails."""
+    """Whether the handler catches the exception of a failed import."""
     kinds = handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]
     return any(kind is None or _name(kind) in _MISSING for kind in kinds)
 
@@ -293,7 +307,7 @@ def _name(node: ast.AST) -> str:
 
 
 def _modules(node: ast.Import | ast.ImportFrom, package: tuple[str, ...]) -> list[list[str]]:
-    """The modules of one import, with `from a import b` as `a` and `a.b`, which may be one as well."""
+    """The modules of each name in an import statement. `from a import b` may load `a` and `a.b`."""
     if isinstance(node, ast.Import):
         return [[alias.name] for alias in node.names]
     above = package[: len(package) - node.level + 1] if node.level else ()
@@ -302,7 +316,7 @@ def _modules(node: ast.Import | ast.ImportFrom, package: tuple[str, ...]) -> lis
 
 
 def _beside(folder: Path, module: str) -> list[Path]:
-    """The project's own files that importing the module runs: those of its packages, and its own."""
+    """The project's own files that run when the module is imported: those of its packages, and its own."""
     found, parts = [], module.split(".")
     if not all(part.isidentifier() for part in parts):
         return []
@@ -315,7 +329,7 @@ def _beside(folder: Path, module: str) -> list[Path]:
 
 
 def _text(file: Path | None) -> str:
-    """What the file says; nothing if it is not there or cannot be read, which `register` says."""
+    """The text of the file; "" if it is missing or cannot be read, which `register` reports."""
     try:
         return "" if file is None else file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""A project that passed every check: what is left of its config.yml, and its registration."""
+"""A project that passed every check: the values of its config.yml, and its registration."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from protocol.trial import TrialSection
 class StepFiles:
     """One step: its key ("1" … or "finalStep"), its page (a file name without .html, or "game"), and its files.
 
-    `variants` is 0 for one page for all participants, else the number of files `{page}-0.html`, `{page}-1.html` …
+    `variants` is 0 if all participants get one page, else the number of files `{page}-0.html`, `{page}-1.html` …
     """
 
     key: str
@@ -36,10 +36,10 @@ class StepFiles:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """A project that is free of mistakes.
+    """A project without mistakes.
 
-    `steps` are in order, the last one is where the study ends; `events` are resolved: keys of steps, or None. `remarks`
-    say what was turned from HIPPO's form into ours.
+    `steps` are in order; the study ends with the last one. `events` has keys of steps, with the defaults filled in, or
+    None. `remarks` say what was translated from HIPPO's form, and what else may not be intended.
     """
 
     project: ProjectKeys
@@ -58,18 +58,18 @@ class Config:
         game_pages: Iterable[StepFiles] = (),
         remarks: Iterable[Diagnostic] = (),
     ) -> Config:
-        """The project whose values were checked and found free of mistakes."""
+        """Return the project with these checked values, which have no mistakes."""
         project = checked.root.project
         events = resolve_events(project.events, [step.key for step in steps], project.steps)
         return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks))
 
     def registration(self) -> dict[str, Any]:
-        """The project as it is registered: a dict that JSON can hold, in camelCase with every default filled in."""
+        """Return the project's registration: JSON values by the keys of config.yml, with every default filled in."""
         data = self.project.model_dump(mode="json", by_alias=True)
         return data | {
             "name": self.project.name or self.project.id,
-            "awsSetup": _given(self.project.aws_setup, "cpu", "memory"),
-            "ssl": _given(self.project.ssl, "sslBucket", "fullchain", "privkey"),
+            "awsSetup": _complete(self.project.aws_setup, "cpu", "memory"),
+            "ssl": _complete(self.project.ssl, "sslBucket", "fullchain", "privkey"),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
             "texts": self.project.own_texts,
@@ -79,26 +79,26 @@ class Config:
 
     @property
     def game_steps(self) -> tuple[StepFiles, ...]:
-        """The steps that take place on the participant's server."""
+        """The steps that take place on the participant's server: game steps."""
         return tuple(step for step in self.steps if step.type.on_server)
 
     @property
     def groups(self) -> int:
-        """How many groups of participants there are; 0 if there are none."""
+        """The number of groups of participants; 0 if the study has no groups."""
         return number_of_groups(page.variants for page in (*self.steps, *self.game_pages))
 
     @property
     def each_group(self) -> list[int | None]:
-        """The numbers of the groups of participants; only None if there are no groups."""
+        """The number of each group of participants; [None] if the study has no groups."""
         return [*range(self.groups)] or [None]
 
     @property
     def own_pages(self) -> list[Path]:
-        """The files of Hippodrome's own pages that the study uses. They lie in no folder of the project."""
+        """The files of Hippodrome's own pages that the study uses. They do not lie in the project's folder."""
         return [file for step in self.steps for file in step.files if file == CLOSING]
 
     def summary(self) -> str:
-        """The project in one line: "6 steps, step 4 is the game (CartPole-v1), …"."""
+        """Return the project in one line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
         together = f" for {self.project.players} participants together" if self.project.has_sessions else ""
         parts += [f"{step_name(step.key)} is the game ({self.trial.game}){together}" for step in self.game_steps]
@@ -114,8 +114,8 @@ class Config:
         return ", ".join(parts)
 
 
-def _given(section: AwsSetupKeys | SslKeys, *needed: str) -> dict[str, Any] | None:
-    """The section if all of these keys are given, otherwise None."""
+def _complete(section: AwsSetupKeys | SslKeys, *needed: str) -> dict[str, Any] | None:
+    """The section if it has all of these keys, otherwise None."""
     data = section.model_dump(by_alias=True)
     if any(data[key] is None for key in needed):
         return None

@@ -1,4 +1,4 @@
-"""The second check: values against each other."""
+"""The second check: compares values with each other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from protocol.environment import PLAIN_ORIGINS
 
 
 def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
-    """Run both checks of the file's sections. Paths in `invalid` yield no further mistakes."""
+    """Run both checks on the sections of a file. Paths in `invalid` yield no further mistakes."""
     checked = check_values(sections, invalid)
     checks = (
         _missing,
@@ -39,6 +39,7 @@ def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
 
 
 def _missing(checked: Checked) -> Iterator[Mistake]:
+    """Sections and keys that every study needs."""
     project = checked.root.project
     if not checked.has_project:
         if checked.valid(("project",)):
@@ -54,7 +55,7 @@ def _missing(checked: Checked) -> Iterator[Mistake]:
 
 
 def _hours(checked: Checked) -> Iterator[Mistake]:
-    """A server starts only if maxServerHours still covers its whole maxRuntime."""
+    """`maxServerHours` must cover `maxRuntime`: otherwise no server could start."""
     project, path = checked.root.project, ("project", "maxServerHours")
     if not checked.valid(path, ("project", "maxRuntime")) or project.max_server_hours is None:
         return
@@ -64,7 +65,7 @@ def _hours(checked: Checked) -> Iterator[Mistake]:
 
 
 def _warm(checked: Checked) -> Iterator[Mistake]:
-    """Warm servers get their names before they have a participant, and need a step that takes them."""
+    """`warmServers` needs names without participants, a step that starts servers, and room within `maxServers`."""
     project, path = checked.root.project, ("project", "warmServers")
     if not project.warm_servers:
         return
@@ -79,7 +80,7 @@ def _warm(checked: Checked) -> Iterator[Mistake]:
 
 
 def _plain_clients(checked: Checked) -> Iterator[Mistake]:
-    """HIPPO's front end finds a server by the participant's id, and says by its origin whose it is."""
+    """`plainClients` needs the origin of HIPPO's front end, which finds a server by the participant's id."""
     project, path = checked.root.project, ("project", "plainClients")
     if not project.plain_clients or not checked.valid(path):
         return
@@ -98,28 +99,29 @@ def _starts_nothing(checked: Checked) -> bool:
     return known and not on_server and project.events.start_server_step is None
 
 
-_AWS_NEEDS = {  # where the servers are, the installation knows; a config.yml may say it to be safe
+_AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the installation are used
     "cpu": "the vCPUs of a server, such as 1",
     "memory": "the memory of a server in GB, such as 4",
 }
 
 
 def _aws(checked: Checked) -> Iterator[Mistake]:
+    """`useAWS: true` needs a size of servers, and Fargate must offer this size."""
     setup = checked.root.project.aws_setup
     path: Keys = ("project", "awsSetup")
     project = checked.root.project
     if not checked.valid(("project", "useAWS")) or (project.given("useAWS") and not project.use_aws):
         return
-    for key, what in _AWS_NEEDS.items():
+    for key, needed in _AWS_NEEDS.items():
         if project.use_aws and not setup.given(key) and checked.valid((*path, key)):
-            yield Mistake((*path, key), f"missing; useAWS is true, so give {what}")
+            yield Mistake((*path, key), f"missing; useAWS is true, so give {needed}")
     if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
         fitting = fargate.memory_choices(setup.cpu)
         yield Mistake((*path, "memory"), f"{setup.memory:g} GB do not go with cpu {setup.cpu:g}; choose {fitting}")
 
 
 def _ssl(checked: Checked) -> Iterator[Mistake]:
-    """All three keys of a certificate or none; they matter on AWS only."""
+    """With `useAWS: true`, `ssl` has all three keys or none."""
     ssl = checked.root.project.ssl
     if not checked.root.project.use_aws or not ssl.model_fields_set:
         return
@@ -134,12 +136,14 @@ def _keys_known(checked: Checked) -> bool:
     return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in invalid)
 
 
-_ECS_LIMIT = 8192  # characters of JSON that ECS takes: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
-_OTHER_LENGTH = 1210  # of them for the names of variables, ids, secrets and addresses, each as long as it may be
+_ECS_LIMIT = (
+    8192  # characters of a task's overrides: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
+)
+_OTHER_LENGTH = 1210  # of them for the names of variables, ids, secrets and addresses, each of its greatest length
 
 
 def _environment_size(checked: Checked) -> Iterator[Mistake]:
-    """ECS refuses a task whose environment is too long."""
+    """The environment variables of a server must fit into the RunTask call, or ECS refuses it."""
     if not checked.valid(("trial",), STEPS):
         return
     project, trial = checked.root.project, checked.trial.registered()
@@ -159,6 +163,7 @@ def _json(value: object) -> str:
 
 
 def _step_numbers(checked: Checked) -> Iterator[Mistake]:
+    """The numbers of steps have no gaps."""
     if not _keys_known(checked):
         return
     numbers = [int(key) for key in checked.step_keys if key != FINAL]
@@ -170,6 +175,7 @@ def _step_numbers(checked: Checked) -> Iterator[Mistake]:
 
 
 def _game_step(checked: Checked) -> Iterator[Mistake]:
+    """The last step is no game step."""
     last = checked.root.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
     if last and type_of(last).on_server:
         path = (*STEPS, checked.step_keys[-1])
@@ -181,6 +187,7 @@ _STOP: Keys = ("project", "events", "stopServerStep")
 
 
 def _event_steps(checked: Checked) -> Iterator[Mistake]:
+    """The steps of `events` exist; the server starts at the first game step or before, and stops after the last."""
     steps, events = checked.root.project.steps, checked.root.project.events
     if not _keys_known(checked):
         return

@@ -1,4 +1,4 @@
-"""Mistakes and remarks: where each one is, and what to do about it."""
+"""Mistakes and remarks: the place of each in a file, and the message that says what to do."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ __all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "Remark", "in_order"
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """A mistake or a remark as it is shown: file name, line (None if there is none), key ("" for the file), what to do.
+    """A mistake or a remark as people read it. `str()` is one line, such as `config.yml:17: trial.game: missing; …`.
 
-    A `remark` is about something that works, but most likely not as intended.
+    `line` is None if the message is about no line, and `where` is the path of the key, or "" for the file. A `remark`
+    is about something that works, but most likely not as intended.
     """
 
     file: str
@@ -31,7 +32,7 @@ class Diagnostic:
 
 
 class ConfigErrors(Exception):
-    """All mistakes in a configuration, in line order; str() has one line for each."""
+    """A configuration has mistakes. `diagnostics` has all of them in line order; `str()` has a line for each."""
 
     def __init__(self, problems: Iterable[Diagnostic]) -> None:
         self.diagnostics = list(problems)
@@ -42,7 +43,7 @@ class ConfigErrors(Exception):
 
 
 class Mistake(NamedTuple):
-    """What is wrong with the value at a path of keys, and what to do. `line` is given if it is not the path's own."""
+    """A mistake in the value at a path of keys; `message` says what to do. `line` is None if it is the path's own."""
 
     path: Keys
     message: str
@@ -50,12 +51,12 @@ class Mistake(NamedTuple):
 
 
 class Remark(NamedTuple):
-    """What to say about the value at a path of keys, which works."""
+    """A remark on the value at a path of keys."""
 
     path: Keys
     message: str
 
 
 def in_order(problems: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """The diagnostics in the order of their lines, each once."""
+    """Return the diagnostics in the order of their lines, each once."""
     return sorted(dict.fromkeys(problems), key=lambda problem: problem.line or 0)

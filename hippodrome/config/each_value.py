@@ -1,6 +1,6 @@
-"""The first check: each value by itself. A value with a mistake is left out of later checks.
+"""The first check: each value by itself. Later checks leave out the values with mistakes.
 
-`project_keys` checks `project`; `protocol.trial_check.check` checks `trial`, also its values against each other.
+`project_keys` checks `project`. `protocol.trial_check.check` checks `trial`, and also compares its values.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from protocol.trial_keys import names
 from protocol.trial_sections import Ui
 from protocol.values import show
 
-_EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections without keys of ours
+_EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
 _ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find
 
 
 @dataclass(slots=True)
 class Checked:
-    """What the checks share: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
+    """The state of the checks: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
 
     root: Root
     step_keys: list[str]
@@ -40,17 +40,14 @@ class Checked:
     invalid: list[Keys] = field(default_factory=list)
 
     def valid(self, *paths: Keys) -> bool:
-        """Whether there is no mistake at, in or around these paths."""
+        """Return whether no mistake is at one of these paths, below it or above it."""
         return not any(
             bad[: len(path)] == path or path[: len(bad)] == bad for bad, path in itertools.product(self.invalid, paths)
         )
 
 
 def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
-    """The valid values of the file's sections, and what is wrong with the others.
-
-    Paths in `invalid` yield no further mistakes.
-    """
+    """Check each value of the file's sections by itself. Paths in `invalid` yield no further mistakes."""
     sections = _copy(sections)
     about_trial = sections.pop("trial", None)
     steps = _at(sections, STEPS)
@@ -88,13 +85,13 @@ def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
     for path, section in TRIAL_SECTIONS.items():
         given = _at({"trial": trial}, path)
         known = names(section) | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
-        # other keys of ui are controls of the project's own
+        # other keys of ui are the project's own controls
         unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
         yield from (one for one in unknown if section is not Ui or meant_for(one) is not None)
 
 
 def _copy(data: Any, depth: int = 5) -> Any:
-    """A copy that may be changed, as deep as sections and lists go: a message can be nested without end."""
+    """A copy that may be changed. It is as deep as sections and lists can be: a message may be nested deeper."""
     if isinstance(data, dict) and depth:
         return {str(key): _copy(value, depth - 1) for key, value in data.items()}
     return [_copy(item, depth - 1) for item in data] if isinstance(data, list) and depth else data
@@ -107,7 +104,7 @@ def _at(data: Any, path: Keys) -> Any:
 
 
 def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, Any]) -> None:
-    """Notes the errors in our words, and removes the values that they are about."""
+    """Note pydantic's errors as mistakes, and remove the wrong values from the sections."""
     for error in errors:
         path: Keys = error["loc"]
         if path[:2] in (STEPS, TEXTS):
@@ -131,7 +128,7 @@ def _note(checked: Checked, path: Keys, message: str) -> None:
 
 
 def _remove(data: Any, path: Keys) -> None:
-    """Removes the value at `path`; for an item of a list, the list."""
+    """Remove the value at `path`; for an item of a list, remove the list."""
     keys = list(itertools.takewhile(lambda key: isinstance(key, str), path))
     for key in keys[:-1]:
         data = data.get(key, {})
@@ -139,7 +136,7 @@ def _remove(data: Any, path: Keys) -> None:
 
 
 def message_of(error: ErrorDetails, path: Keys) -> str:
-    """What pydantic found wrong, in our words."""
+    """Return Hippodrome's message for an error of pydantic at this path."""
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])
     known = NAMES.get(path)

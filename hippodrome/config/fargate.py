@@ -1,4 +1,4 @@
-"""The sizes of server that AWS Fargate offers, and the checks of `cpu` and `memory`."""
+"""The sizes of tasks that AWS Fargate offers, and the checks of `cpu` and `memory`."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ SIZES: dict[float, tuple[float, ...]] = {
     8.0: _steps(16, 60, by=4),
     16.0: _steps(32, 120, by=8),
 }
-"""vCPUs → the amounts of memory, in GB, that may go with them."""
+"""The possible amounts of memory, in GB, by vCPUs."""
 
 
 def fits(cpu: float, memory: float) -> bool:
-    """Whether Fargate has a server of `cpu` vCPUs and `memory` GB."""
+    """Return whether Fargate offers tasks with `cpu` vCPUs and `memory` GB."""
     return memory in SIZES.get(cpu, ())
 
 
 def memory_choices(cpu: float) -> str:
-    """The memory that fits `cpu`, in words: "4 to 16" or "16 to 60 in steps of 4". KeyError for an unknown cpu."""
+    """Return the amounts of memory for `cpu` in words: "4 to 16" or "16 to 60 in steps of 4". Raises KeyError for a
+    number of vCPUs that Fargate does not offer."""
     sizes = SIZES[cpu]
     if not float(sizes[0]).is_integer():
         return ", ".join(f"{size:g}" for size in sizes[:-1]) + f" or {sizes[-1]:g}"
@@ -39,13 +40,13 @@ def memory_choices(cpu: float) -> str:
 
 
 def cpu_choices() -> str:
-    """All numbers of vCPUs that Fargate offers, in words."""
+    """Return all numbers of vCPUs that Fargate offers, in words."""
     names = [f"{cpu:g}" for cpu in SIZES]
     return ", ".join(names[:-1]) + f" or {names[-1]}"
 
 
 def cpu(value: object) -> float:
-    """Check a number of vCPUs: it must be one that Fargate offers. Raises ValueError."""
+    """Check a number of vCPUs: Fargate must offer it. Raises ValueError with what to write instead."""
     found = _size(value, "vcpus?")
     if found is not None and found in SIZES:
         return found
@@ -54,7 +55,8 @@ def cpu(value: object) -> float:
 
 
 def memory(value: object) -> float:
-    """Check a number of GB. `fits` says whether Fargate offers it with a number of vCPUs. Raises ValueError."""
+    """Check an amount of memory, in GB. Raises ValueError with what to write instead. (`fits` compares it with the
+    vCPUs.)"""
     found = _size(value, "gi?b")
     if found is not None and 0.5 <= found <= 120:
         return found
@@ -63,6 +65,7 @@ def memory(value: object) -> float:
 
 
 def _size(value: object, unit: str) -> float | None:
+    """The number in a value that may have this unit; None if there is none."""
     if isinstance(value, str):
         value = re.sub(rf"(?i){unit}$", "", value.strip()).rstrip()  # no \s*: long blanks would be tried from each one
     found = number_in(value)

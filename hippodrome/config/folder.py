@@ -1,4 +1,4 @@
-"""A project folder, read: its config.yml and its step files."""
+"""Reads and checks a project folder: its config.yml and its step files."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """A project's config.yml as it was read: its values in our form, and where each of them stands."""
+    """A project's config.yml as read: its values in Hippodrome's form, and the line of each."""
 
     layout: Layout
     parsed: ParsedFile
     adapted: Adapted
 
     def diagnostic(self, path: Keys, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
-        """A mistake or remark on the value at a path of our form, with its line in the file, or with `line`."""
+        """Return a mistake or remark on the value at this path of Hippodrome's form. By default it has the value's
+        line."""
         origin = self.adapted.origin(path)
         return self._diagnostic(origin, message, line, remark)
 
     def remarks(self) -> list[Diagnostic]:
-        """A remark for each thing that was turned from HIPPO's form into ours."""
+        """Return a remark for each value that was translated from HIPPO's form."""
         return in_order(self._diagnostic(path, message, None, True) for path, message in self.adapted.remarks)
 
     def names(self, path: Keys) -> bool:
-        """Whether the file itself has this path of our form."""
+        """Return whether the file has a value for this path of Hippodrome's form."""
         return self.adapted.origin(path) in self.parsed.lines
 
     def _diagnostic(self, origin: Keys, message: str, line: int | None, remark: bool) -> Diagnostic:
@@ -59,16 +60,16 @@ class ConfigSource:
 
 
 def read_source(folder: Path) -> ConfigSource:
-    """The config.yml of the project in `folder`, not checked yet. Raises ConfigErrors if it cannot be read."""
+    """Read the config.yml of the project in `folder`, without checking it. Raises ConfigErrors if it cannot be read."""
     layout = find(folder)
     parsed = _parse(layout)
     return ConfigSource(layout, parsed, adapt(parsed.values, Path(folder).resolve().name))
 
 
 def read_project(folder: Path) -> Config:
-    """The project in `folder`: its config.yml (or config.yaml) and its step files; `layout` says where they may lie.
+    """Read and check the project in `folder`: its config.yml (or config.yaml) and its step files (`layout`).
 
-    Raises ConfigErrors with every mistake found.
+    Raises ConfigErrors with all mistakes.
     """
     source = read_source(folder)
     checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
@@ -94,7 +95,7 @@ def read_project(folder: Path) -> Config:
 
 
 def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
-    """Policies' files that `trial.players` and `trial.substitute` name and that there are not."""
+    """A mistake for each policy's file in `trial.players` and `trial.substitute` that does not exist."""
     for path, file in players.files_of(checked.trial):
         if not (layout.agent_folder / file).is_file():
             hint = players.files_there(layout.agent_folder)
@@ -102,7 +103,7 @@ def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
 
 
 def _loaded_from(source: ConfigSource, steps: list[StepFiles]) -> tuple[str, ...]:
-    """From which sites a project of HIPPO Gym, which has no `allowedHosts`, loads something."""
+    """The sites from which the pages of a HIPPO Gym project without `allowedHosts` load something."""
     if not source.layout.of_hippo or source.names(("project", "allowedHosts")):
         return ()
     return hippo_pages.hosts(file for step in steps for file in step.files)
@@ -123,7 +124,7 @@ def _parse(layout: Layout) -> ParsedFile:
 
 
 def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Mistake]]:
-    """The steps with their files, and what is wrong with files."""
+    """The steps with their files, and the mistakes in files."""
     pages = checked.root.project.steps
     steps: list[StepFiles] = []
     mistakes: list[Mistake] = []
@@ -143,7 +144,7 @@ def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[M
 
 
 def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:
-    """The pages that the game page shows with their files, and what is wrong with files."""
+    """The pages that the game page shows, with their files, and the mistakes in files."""
     found: list[StepFiles] = []
     mistakes: list[Mistake] = []
     for key, page in checked.trial.pages.items() if any(step.type.on_server for step in steps) else ():

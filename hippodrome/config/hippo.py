@@ -1,7 +1,6 @@
-"""What HIPPO Gym takes in a config.yml and Hippodrome does not: turned into Hippodrome's own, with a remark for each.
+"""Translates a config.yml of HIPPO Gym into Hippodrome's form, with a remark on each change.
 
-`adapt` is pure: a document in; the document that Hippodrome reads, and remarks, out. docs/hippo.md has a row for each
-key that HIPPO's documentation and code (v0.1.0 to v1.1.0) know.
+`adapt` is pure. docs/hippo.md has a row for each key of HIPPO's documentation and code (v0.1.0 to v1.1.0).
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, Tria
 from protocol.values import Plain, flag, number_in, show
 
 CLOSING_PAGE = "hippodrome-the-end"
-"""The page that a study without pages ends with (`step_files.CLOSING`)."""
+"""The last page of a study without pages (`step_files.CLOSING`)."""
 
-_CPU, _MEMORY = 2, 10  # what HIPPO's updateProject.py takes where the configuration gives nothing
+_CPU, _MEMORY = 2, 10  # vCPUs and GB: the defaults of HIPPO's updateProject.py
 _SSL = ("sslBucket", "fullchain", "privkey")
 _SPELLINGS: dict[Keys, str] = {
-    ("project", "step"): "steps",  # the heading in HIPPO's documentation
-    ("project", "team_members"): "teamMembers",  # what its update_project_master_list reads
+    ("project", "step"): "steps",  # in HIPPO's documentation
+    ("project", "team_members"): "teamMembers",  # in HIPPO's update_project_master_list
 }
 _GENERATED: dict[Keys, str] = {
     ("project", "ecsTask"): "the task definition is named after the stack and the project's id",
@@ -37,14 +36,14 @@ _GENERATED: dict[Keys, str] = {
     ("trial", "projectId"): "servers know the project's id",
     ("trial", "bucket"): "servers know where recordings go",
 }
-"""Keys that HIPPO's updateProject.py adds, which stand in a configuration that was copied from its files."""
+"""Keys that HIPPO's updateProject.py adds. A configuration that was copied from its files has them."""
 
 
 @dataclass
 class Adapted:
-    """A document in Hippodrome's form. `remarks` name paths as they stand in the original document.
+    """A document in Hippodrome's form. `remarks` have paths of the original document.
 
-    `origins`: where a value stood before, by its path now. Paths that have not moved are not in it.
+    `origins` has the original path of each value that was moved, by its path in `values`.
     """
 
     values: dict[str, Any]
@@ -52,21 +51,21 @@ class Adapted:
     origins: dict[Keys, Keys] = field(default_factory=dict)
 
     def origin(self, path: Keys) -> Keys:
-        """The path in the original document."""
+        """Return the path in the original document."""
         for end in range(len(path), 0, -1):
             if path[:end] in self.origins:
                 return (*self.origins[path[:end]], *path[end:])
         return path
 
     def at(self, path: Keys) -> Any:
-        """The value at the path; None if there is none."""
+        """Return the value at the path; None if there is none."""
         found: Any = self.values
         for key in path:
             found = found.get(key) if isinstance(found, dict) else None
         return found
 
     def section(self, path: Keys) -> dict[str, Any]:
-        """The section at the path; an empty one, which is not part of the document, if there is none."""
+        """Return the section at the path; {}, which is no part of the document, if there is none."""
         found = self.at(path)
         return found if isinstance(found, dict) else {}
 
@@ -75,10 +74,10 @@ class Adapted:
 
 
 def adapt(document: Mapping[str, Any], name: str = "") -> Adapted:
-    """The document as Hippodrome reads it. What it cannot take either stays as it is, so that its check says why.
+    """Return a HIPPO document in Hippodrome's form. Values that are wrong in both forms stay, for the check to report.
 
-    `document` holds the sections as read from YAML or JSON; it is not changed. `name` is what a project with an empty
-    id is called, such as the name of its folder.
+    `document` holds the sections as read from YAML or JSON; it is not changed. `name` is the id of a project whose id
+    is empty, such as the name of its folder.
     """
     adapted = Adapted(_copy(document))
     rules: tuple[Callable[[Adapted], None], ...] = (
@@ -133,7 +132,7 @@ def _generated(adapted: Adapted) -> None:
 
 
 def _id(adapted: Adapted, name: str) -> None:
-    """An id that addresses, S3 keys, ECS and ECR can carry (`hippodrome.model.ids`)."""
+    """Replaces an id that addresses, S3 keys, ECS or ECR do not allow (`hippodrome.model.ids`)."""
     project, path = adapted.section(("project",)), ("project", "id")
     if "id" not in project:
         return
@@ -142,7 +141,7 @@ def _id(adapted: Adapted, name: str) -> None:
     blank = _blank(given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
-    if blank and _is_true(project.get("useAWS")):  # another folder may have this name, and HIPPO refuses it too
+    if blank and _is_true(project.get("useAWS")):  # another folder may have this name; HIPPO refuses an empty id, too
         return
     better = re.sub(r"[^A-Za-z0-9_-]+", "-", name if blank else text).strip("-_")
     if not ids.is_project_id(better):
@@ -159,7 +158,7 @@ def _live(adapted: Adapted) -> None:
 
 
 def _page_names(adapted: Adapted) -> None:
-    """The names of pages without their folder."""
+    """Removes folders from the names of pages."""
     steps = adapted.section(STEPS)
     for key, page in steps.items():
         if not isinstance(page, str) or "://" in page:
@@ -171,7 +170,7 @@ def _page_names(adapted: Adapted) -> None:
 
 
 def _steps(adapted: Adapted) -> None:
-    """Steps 1, 2, 3 … that have a page each."""
+    """Drops steps that HIPPO never shows, and numbers the others 1, 2, 3 …"""
     given = adapted.section(STEPS)
     if not given or not all(_is_page(page) for page in given.values()):
         return
@@ -185,15 +184,15 @@ def _steps(adapted: Adapted) -> None:
         return
     _drop_steps(adapted, [key for key in given if key.isdecimal() and int(key) == 0], "never shown, as in HIPPO Gym")
     numbers = sorted((key for key in given if key.isdecimal() and len(key) < 4), key=int)
-    if len(numbers) == int(numbers[-1] if numbers else 0):  # with a gap, it may be one of them that is misspelt
-        strange = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
-        _drop_steps(adapted, strange, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
+    if len(numbers) == int(numbers[-1] if numbers else 0):  # with a gap, another key may be a misspelt number
+        others = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
+        _drop_steps(adapted, others, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
     without = [key for key in numbers if _blank(given[key])]
     rest = [key for key in numbers if key not in without]
     if not rest and not _blank(given.get(FINAL)):
         _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
         adapted.remark((*STEPS, FINAL), "the study has this page only")
-    elif without and len(numbers) == int(numbers[-1]):  # what has gaps too is not guessed
+    elif without and len(numbers) == int(numbers[-1]):  # steps with gaps stay, for the check to report
         unplayed = "game" not in given.values() and not _blank(adapted.at(("trial", "game")))
         more = "; no step is game, so no participant plays: if this one is to be, write game" if unplayed else ""
         for key in without:
@@ -217,7 +216,7 @@ def _drop_steps(adapted: Adapted, keys: Iterable[str], why: str) -> None:
 
 
 def _renumber(adapted: Adapted, kept: list[str], before: list[str]) -> None:
-    """Number the kept ones of the steps without gaps, also where events name them."""
+    """Number the steps in `kept` without gaps, also in `events`. `before` are all numbered steps."""
     given = adapted.section(STEPS)
     now = {key: str(number) for number, key in enumerate(kept, 1)}
     moved = [key for key in kept if now[key] != key]
@@ -241,7 +240,7 @@ def _put_steps(adapted: Adapted, steps: dict[str, Any], origins: Mapping[str, st
 
 
 def _stop_step(adapted: Adapted) -> None:
-    """A step beyond the end is never reached: HIPPO then ends the server at maxRuntime."""
+    """Replaces a `stopServerStep` beyond the last step, which HIPPO's participants never reach."""
     events, path = adapted.section(("project", "events")), ("project", "events", "stopServerStep")
     stop = number_in(events.get("stopServerStep"))
     steps = adapted.section(STEPS)
@@ -256,14 +255,15 @@ def _stop_step(adapted: Adapted) -> None:
 
 
 def _size(adapted: Adapted) -> None:
-    """The size of a server, where the template's keys were left empty."""
+    """Fills in the size of servers if its keys are empty, as in HIPPO's template."""
     if not _is_true(adapted.at(("project", "useAWS"))):
         return
     setup = adapted.section(("project", "awsSetup"))
-    for key, usual, unit in (("cpu", _CPU, "vCPUs"), ("memory", _MEMORY, "GB")):
+    for key, default, unit in (("cpu", _CPU, "vCPUs"), ("memory", _MEMORY, "GB")):
         if key in setup and _blank(setup[key]):
-            setup[key] = usual
-            adapted.remark(("project", "awsSetup", key), f"is empty: each server has {usual} {unit}, as with HIPPO Gym")
+            setup[key] = default
+            message = f"is empty: each server has {default} {unit}, as with HIPPO Gym"
+            adapted.remark(("project", "awsSetup", key), message)
 
 
 def _is_true(value: object) -> bool:
@@ -281,7 +281,7 @@ def _is_false(value: object) -> bool:
 
 
 def _certificate(adapted: Adapted) -> None:
-    """An incomplete section `ssl`, which has no effect in any case."""
+    """Removes an incomplete section `ssl`, which would have no effect."""
     project, path = adapted.section(("project",)), ("project", "ssl")
     ssl = project.get("ssl")
     if not isinstance(ssl, dict) or not any(_blank(ssl.get(key)) for key in _SSL):
@@ -295,7 +295,7 @@ def _certificate(adapted: Adapted) -> None:
 
 
 def _no_game(adapted: Adapted) -> None:
-    """A blank name, for an agent that needs none."""
+    """Fills in an empty name of the environment, for an agent that does not need it."""
     trial, pages = adapted.section(("trial",)), adapted.section(STEPS).values()
     if "game" in trial and _blank(trial["game"]) and "game" in pages:
         trial["game"] = "none"
@@ -303,7 +303,7 @@ def _no_game(adapted: Adapted) -> None:
 
 
 def _controls(adapted: Adapted) -> None:
-    """Controls as a list, as HIPPO's .trialConfig.yml has them."""
+    """Turns a list of controls, as in HIPPO's .trialConfig.yml, into a map."""
     trial = adapted.section(("trial",))
     ui = trial.get("ui")
     if isinstance(ui, list) and all(isinstance(name, str) for name in ui):
@@ -311,7 +311,7 @@ def _controls(adapted: Adapted) -> None:
 
 
 def _actions(adapted: Adapted) -> None:
-    """Names that differ: HIPPO takes the first of equal ones, and the others only hold the place of a number."""
+    """Renames actions with equal names. HIPPO uses only the first of them, but the others count as actions."""
     names = adapted.section(("trial",)).get("actionSpace")
     if not isinstance(names, list) or not all(isinstance(name, str | Plain) for name in names):
         return
@@ -326,17 +326,17 @@ def _actions(adapted: Adapted) -> None:
 
 
 def _frame_rates(adapted: Adapted) -> None:
-    """Bounds that do not matter, since participants may not change the rate."""
+    """Replaces bounds that do not fit the starting frame rate, if participants may not change the rate."""
     trial = adapted.section(("trial",))
     if any(_is_true(trial.get(key)) for key in (RATE_CHANGE, RATE_CHANGE_MISSPELT)):
         return
-    usual = TrialSection()
+    defaults = TrialSection()
     low, start, high = (
         number_in(trial[key]) if not _blank(trial.get(key)) else default
         for key, default in (
-            ("minFrameRate", usual.min_frame_rate),
-            ("startingFrameRate", usual.starting_frame_rate),
-            ("maxFrameRate", usual.max_frame_rate),
+            ("minFrameRate", defaults.min_frame_rate),
+            ("startingFrameRate", defaults.starting_frame_rate),
+            ("maxFrameRate", defaults.max_frame_rate),
         )
     )
     if low is None or start is None or high is None or low <= start <= high or not 1 <= start <= HIGHEST_RATE:
@@ -344,14 +344,14 @@ def _frame_rates(adapted: Adapted) -> None:
     for key in ("minFrameRate", "maxFrameRate"):
         if not _blank(trial.get(key)):
             adapted.remark(("trial", key), f"no effect, since {RATE_CHANGE} is not true")
-    trial |= {"minFrameRate": min(usual.min_frame_rate, start), "maxFrameRate": max(usual.max_frame_rate, start)}
+    trial |= {"minFrameRate": min(defaults.min_frame_rate, start), "maxFrameRate": max(defaults.max_frame_rate, start)}
 
 
 # Unknown keys
 
 
 def _unknown(adapted: Adapted) -> None:
-    """Keys that no section has, unless they are most likely a typing error or misplaced."""
+    """Removes unknown keys, or gives them to the agent. Typing errors and misplaced keys stay, for the check."""
     for section, known in sorted(NAMES.items(), key=lambda one: one[0] != ("trial",)):
         for key in [key for key in adapted.section(section) if key not in known]:
             path = (*section, key)
@@ -368,14 +368,15 @@ def _unknown(adapted: Adapted) -> None:
 
 
 def _is_mistake(adapted: Adapted, path: Keys) -> bool:
-    """Whether it was most likely meant for a key that is not given. An agent's key may be called like one that is."""
+    """Whether an unknown key was most likely meant for a known key without a value. If the known key has a value, the
+    unknown one may be a similar key of the agent."""
     meant = meant_for(path)
     misplaced = meant is not None and meant[-1] == path[-1] and path[0] != "trial"
     return meant is not None and (misplaced or len(meant) == 1 or _blank(adapted.at(meant)))
 
 
 def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
-    """Put a key of the agent's own under `trial.options`."""
+    """Move an unknown key of `trial` to `trial.options`, for the agent."""
     trial = adapted.section(("trial",))
     options = {} if _blank(trial.get("options")) else trial["options"]
     if not isinstance(options, dict):
@@ -389,7 +390,7 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
 
 
 def _own_control(adapted: Adapted, path: Keys) -> None:
-    """A control of the project's own stays, unless it is neither true nor false."""
+    """Remove one of the project's own controls if it is neither true nor false."""
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]
     if not (_blank(value) or _is_true(value) or _is_false(value)):

@@ -1,7 +1,7 @@
-"""From which other sites the pages of a HIPPO Gym project load images, media and frames.
+"""Finds the sites from which the pages of a HIPPO Gym project load images, media and frames.
 
-HIPPO's front end lets pages load them from anywhere. Here `project.allowedHosts` names the sites, and no
-configuration of HIPPO has it: what its pages load is taken for allowed.
+HIPPO's front end lets pages load them from any site. Hippodrome needs the sites in `project.allowedHosts`, which no
+configuration of HIPPO has. So the sites that its pages load from are allowed.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from hippodrome.config.project_keys import origin
+from hippodrome.config.project_keys import MAX_HOSTS, origin
 from hippodrome.participants.page_parser import PageParser
-
-LIMIT = 50  # as many as `allowedHosts` may have
 
 _LOADED = {
     "img": ("src", "srcset"),
@@ -27,9 +25,9 @@ _ORIGIN = re.compile(r"https://[^\s/?#\"'\\,]+", re.IGNORECASE)
 
 
 def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
-    """The https origins from which these pages load something other than scripts and style sheets, each once.
+    """Return the https origins from which these pages load images, media and frames, each once and at most MAX_HOSTS.
 
-    What cannot be read, or is no origin, is left out: the pages' own check says so.
+    Files that cannot be read and addresses that are no origins are left out: other checks report them.
     """
     found: dict[str, None] = {}
     for page in pages:
@@ -40,7 +38,7 @@ def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
         except OSError:
             continue
         found |= dict.fromkeys(reader.origins)
-    return tuple(found)[:LIMIT]
+    return tuple(found)[:MAX_HOSTS]
 
 
 class _Addresses(PageParser):
@@ -49,9 +47,8 @@ class _Addresses(PageParser):
         self.origins: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        wanted = _LOADED.get(tag, ())
         for name, value in attrs:
-            if name in wanted:
+            if name in _LOADED.get(tag, ()):
                 self._note(value or "", anywhere=name == "srcset")
 
     def _note(self, value: str, anywhere: bool) -> None:

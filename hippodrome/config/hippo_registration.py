@@ -1,4 +1,4 @@
-"""A registration as HIPPO's `updateProject.py` sends it: the section `project` of its config.yml, and more keys."""
+"""Reads a registration that HIPPO's `updateProject.py` sends: the section `project` of its config.yml, and more."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from hippodrome.model.step_order import ordered
 from protocol.values import number_in, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
-_KEPT = (  # HIPPO's script knows none of them, so that it can neither set them nor take them back
+_KEPT = (  # HIPPO's script does not know these keys, so a registration by it keeps their earlier values
     "signedLinks", "maxParticipants", "maxServers", "maxServerHours", "warmServers", "allowedHosts", "cluster",
     "subdomain", "plainClients", "frontEnd", "taskDefinition", "serverPort",
     "players", "matching", "seats", "patience", "afterPatience",
 )  # fmt: skip
-_SHOWN = frozenset(_KEPT) - {"taskDefinition", "serverPort"}  # what a config.yml may say
+_SHOWN = frozenset(_KEPT) - {"taskDefinition", "serverPort"}  # keys that a config.yml may have
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"
 _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, start() of the agent is given "none"'
 
 
 def is_payload(event: Mapping[str, Any]) -> bool:
-    """Whether this comes from HIPPO's script: steps are a map there, or keys are there that ours never had."""
+    """Whether HIPPO's script has sent this event: its `steps` are a map, or it has keys that only HIPPO uses."""
     if any(key in event for key in ("project", "links", "takeOver")):
         return False
     return isinstance(event.get("steps"), dict) or any(key in event for key in _ONLY_HIPPO)
 
 
 def project_id(event: Mapping[str, Any]) -> str | None:
-    """The id under which the payload is registered; None if it can have none."""
+    """Return the id under which the payload is registered; None if its id cannot be used."""
     found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
     return found if ids.is_project_id(found) else None
 
 
 def renamed(event: Mapping[str, Any]) -> list[str]:
-    """After a failure: a sentence if the script uploads to a folder whose name is not the project's id here."""
+    """Return a sentence if the script uploads pages to a folder whose name differs from the project's id here."""
     given, here = event.get("id"), project_id(event)
     if here is None or given == here:
         return []
@@ -47,9 +47,10 @@ def renamed(event: Mapping[str, Any]) -> list[str]:
 
 
 def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
-    """A sentence for each place that the payload names and that is another than `here`; "" there is not compared.
+    """Yield a sentence for each bucket, region and domain in the payload that differs from the one in `here`.
 
-    The script has uploaded the pages to its bucket, and makes repository and task definition in its region.
+    The script has uploaded the pages to its bucket, and makes the repository and the task definition in its region. A
+    value "" in `here` is not compared.
     """
     setup = event.get("awsSetup")
     given = dict(setup) if isinstance(setup, Mapping) else {}
@@ -61,7 +62,7 @@ def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str
 
 
 def lower_runtime(registration: dict[str, Any], most: int) -> list[str]:
-    """Lower `maxRuntime` to what the installation allows, as HIPPO does; return a remark if it was more."""
+    """Lower `maxRuntime` to the `most` minutes of the installation, as HIPPO does. Return a remark if it was more."""
     minutes = number_in(registration.get("maxRuntime"))
     if minutes is None or minutes <= most:
         return []
@@ -70,23 +71,23 @@ def lower_runtime(registration: dict[str, Any], most: int) -> list[str]:
 
 
 def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The payload as our registration, with a remark for each thing that is different here.
+    """Return the payload as a registration of Hippodrome, and a remark on each difference from HIPPO.
 
-    Of an `earlier` registration of the project it keeps the section `trial`, which the payload lacks, and the keys that
-    HIPPO does not have: whoever runs an old copy of the script must not open a study that was by invitation, or lift
-    the limits of what it may cost.
+    The result keeps two parts of an `earlier` registration of the project: the section `trial`, which the payload
+    lacks, and the keys that HIPPO does not have. So an old copy of the script cannot remove signed links, or the limits
+    of a study's cost.
     """
     given = {key: value for key, value in event.items() if key != "trial"}
     adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
-    said = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
+    remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
     kept = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
-    said += [f"project.{key}: {json.dumps(kept[key])} {_STAYS}" for key in kept if key in _SHOWN]
+    remarks += [f"project.{key}: {json.dumps(kept[key])} {_STAYS}" for key in kept if key in _SHOWN]
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):
         trial["game"] = "none"
-        said.append(_NO_GAME)
+        remarks.append(_NO_GAME)
     if steps and all(map(is_step_key, steps)):
-        named = [key for key in ordered(steps) if steps[key] not in (None, "")]
-        project["steps"] = [{"key": key, "page": steps[key]} for key in named]
-    return {**kept, **project, "trial": trial}, said
+        with_page = [key for key in ordered(steps) if steps[key] not in (None, "")]
+        project["steps"] = [{"key": key, "page": steps[key]} for key in with_page]
+    return {**kept, **project, "trial": trial}, remarks

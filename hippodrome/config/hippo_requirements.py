@@ -1,13 +1,16 @@
-"""The requirements.txt of a HIPPO Gym project, as the image of its servers can install it. Pure.
+"""Removes lines from the requirements.txt of a HIPPO Gym project that Hippodrome's image cannot install. Pure.
 
-HIPPO's images have Python 3.7, and its requirements.txt pins what its own programs need: versions that do not exist for
-the Python of Hippodrome's image, of packages that the image has (requirements/trial.txt) or has no use for.
+HIPPO's images have Python 3.7, and its requirements.txt pins the packages of HIPPO's own programs, in versions that do
+not exist for the Python of Hippodrome's image. This image has the packages (requirements/trial.txt) or does not need
+them.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+
+from packaging.utils import canonicalize_name
 
 from hippodrome.config.diagnostics import Diagnostic
 
@@ -18,37 +21,32 @@ _REPLACED = {
     "asyncio": "it is a part of Python",
     "sklearn": "its name is scikit-learn",
 }
-"""Packages that the image does without."""
+"""Packages that the image does not need, and why."""
 
 
 def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diagnostic]]:
-    """The file without the lines that no image needs, and what to say of them.
+    """Return the text without the lines that the image does not need, and remarks on these lines.
 
-    `present` are the names of the packages in requirements/trial.txt: the image has them, in a version of its own. Line
-    numbers stay, since a line that is left out becomes an empty one.
+    `present` are the names of the packages in requirements/trial.txt, which the image has in its own versions. `label`
+    is the file's name in the remarks. An empty line takes the place of each removed one, so line numbers stay.
     """
-    here = {canonical(name) for name in present}
-    kept, replaced, known = [], [], []
+    in_image = {canonicalize_name(name) for name in present}
+    lines, replaced, already_there = [], [], []
     for line in text.splitlines():
         found = _NAME.fullmatch(line)
-        name = canonical(found["name"]) if found else ""
-        kept.append("" if name in _REPLACED or name in here else line)
+        name = canonicalize_name(found["name"]) if found else ""
+        lines.append("" if name in _REPLACED or name in in_image else line)
         if name in _REPLACED:
             replaced.append(f"{name} ({_REPLACED[name]})")
-        elif name in here:
-            known.append(name)
-    said = [
+        elif name in in_image:
+            already_there.append(name)
+    removed = [
         ("left out", replaced),
-        ("left out, since the servers' image has them in versions of its own", known),
+        ("left out, since the servers' image has them in versions of its own", already_there),
     ]
     remarks = [
-        Diagnostic(label, None, "", f"{what}: {', '.join(dict.fromkeys(names))}", remark=True)
-        for what, names in said
+        Diagnostic(label, None, "", f"{message}: {', '.join(dict.fromkeys(names))}", remark=True)
+        for message, names in removed
         if names
     ]
-    return "".join(f"{line}\n" for line in kept), remarks
-
-
-def canonical(name: str) -> str:
-    """The normalized name of a package (PEP 503), by which names are compared."""
-    return re.sub(r"[-_.]+", "-", name).lower()
+    return "".join(f"{line}\n" for line in lines), remarks

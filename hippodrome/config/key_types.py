@@ -1,4 +1,4 @@
-"""What sections and keys are made of: pydantic's models, with checks and messages of our own."""
+"""The types of sections and keys: pydantic's models, with Hippodrome's own checks and messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.values import Check
 
 @dataclass(frozen=True, eq=False)  # equal only to itself, so that it can be hashed
 class Rule:
-    """Validates a field by one of our checks, so that the researcher reads its message, and describes it to editors."""
+    """Validates a field by `check`, whose message the researcher reads; `schema` describes the field to editors."""
 
     check: Check
     schema: Mapping[str, Any] = field(default_factory=lambda: {"type": "string"})
@@ -30,26 +30,26 @@ class Rule:
 
 
 def whole(low: int, high: int | None = None) -> Rule:
-    """A whole number within bounds."""
+    """Return the rule for a whole number from `low` to `high`."""
     bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
     return Rule(values.whole(low, high), {"type": "integer", **bounds})
 
 
 def one_of(*choices: str) -> Rule:
-    """One of these words."""
+    """Return the rule for one of these words."""
     return Rule(values.one_of(*choices), {"enum": list(choices)})
 
 
-def items(what: str, limit: int, single: bool = False) -> BeforeValidator:
-    """A list of at most `limit` of `what`; with `single`, one alone counts as a list of one."""
-    return BeforeValidator(values.items(what, limit, single))
+def items(item: str, limit: int, single: bool = False) -> BeforeValidator:
+    """Return the validator for a list of at most `limit` items (`values.items`)."""
+    return BeforeValidator(values.items(item, limit, single))
 
 
 _ODD_NAMES = {"use_aws": "useAWS"}
 
 
 class Model(BaseModel):
-    """A section of the file. A key left empty counts as not given."""
+    """A section of the file. A key without a value counts as not given."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -59,11 +59,11 @@ class Model(BaseModel):
 
     @classmethod
     def names(cls) -> frozenset[str]:
-        """The names of the keys as they stand in the file."""
+        """Return the names of the section's keys, as they stand in the file."""
         return frozenset(info.alias or name for name, info in cls.model_fields.items())
 
     def given(self, key: str) -> bool:
-        """Whether the key (as in the file) was given and was good."""
+        """Return whether the file has a valid value for this key; `key` is its name in the file."""
         return any(type(self).model_fields[name].alias == key for name in self.model_fields_set)
 
     @model_validator(mode="before")

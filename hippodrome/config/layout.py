@@ -1,7 +1,7 @@
-"""Where the files of a project folder lie: config.yml, the pages, agent.py and requirements.txt.
+"""Finds the files of a project folder: config.yml, the pages, agent.py and requirements.txt.
 
-Everything lies in the folder itself, or as in a clone of HIPPO Gym: agent.py in `App/` (v0.1.0 to v1.1.0) or in
-`src/hippogym_app/` (on the way to its version 2), with the modules beside it; the pages in `StepFiles/`.
+They lie in the folder itself, or in the places of a clone of HIPPO Gym: agent.py and its modules in `App/` (v0.1.0 to
+v1.1.0) or in `src/hippogym_app/` (commits before its version 2), and the pages in `StepFiles/`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ PAGES = ("steps", "StepFiles", "Steps")
 AGENT = "agent.py"
 REQUIREMENTS = "requirements.txt"
 APPS = ("App", "src/hippogym_app")
-"""Where HIPPO Gym has agent.py."""
+"""The folders in which HIPPO Gym has agent.py."""
 
-_VERSION_2 = "src/hippogym"  # HIPPO's own package, whose agent.py is a part of it
+_VERSION_2 = "src/hippogym"  # the package of HIPPO Gym's version 2, which has its own agent.py
 _TRIAL = "trial.py"
-_PROGRAMS = (_TRIAL, "communicator.py")  # HIPPO's own, beside agent.py
+_PROGRAMS = (_TRIAL, "communicator.py")  # HIPPO's own files beside agent.py
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The files of the project in `folder`. `pages`, `agent` and `requirements` are None if there are none."""
+    """The files of the project in `folder`. `pages`, `agent` and `requirements` are None if they do not exist."""
 
     folder: Path
     config: Path
@@ -42,16 +42,16 @@ class Layout:
 
     @property
     def of_hippo(self) -> bool:
-        """Whether agent.py or the pages lie where HIPPO Gym has them."""
+        """Whether agent.py or the pages lie in a folder of HIPPO Gym's layout."""
         pages = self.pages is not None and (self.pages.parent != self.folder or self.pages.name != PAGES[0])
         return pages or self.agent_folder != self.folder
 
     def label(self, file: Path) -> str:
-        """The file as messages name it: its path from the project's folder."""
+        """Return the name of the file for messages: its path from the project's folder."""
         return file.relative_to(self.folder).as_posix() if file.is_relative_to(self.folder) else file.name
 
     def problems(self) -> Iterator[Diagnostic]:
-        """Mistakes and remarks on where agent.py lies; a mistake if a game would be played without it."""
+        """Yield mistakes and remarks on the place of agent.py. It is a mistake if servers would not find it."""
         if self.agent is None:
             yield from self._missing_agent()
             return
@@ -67,8 +67,8 @@ class Layout:
         """A mistake if HIPPO's trial.py, which researchers may change, takes its agent from another file."""
         trial = self.agent_folder / _TRIAL
         names = _imported(trial)
-        there = {name for name in names if (self.agent_folder / f"{name}.py").is_file()}
-        others = sorted(name for name in there if "agent" in name.lower())
+        own = {name for name in names if (self.agent_folder / f"{name}.py").is_file()}
+        others = sorted(name for name in own if "agent" in name.lower())
         if others and AGENT.removesuffix(".py") not in names:
             message = (
                 f"takes the agent from {others[0]}.py, and Hippodrome from {AGENT}: give the file that name, and its "
@@ -96,36 +96,38 @@ class Layout:
 
 
 def find(folder: Path) -> Layout:
-    """Where the files of the project in `folder` lie. Raises ConfigErrors if it has no config.yml, or several."""
+    """Return the files of the project in `folder`. Raises ConfigErrors if it has no config.yml, or several."""
     folder = Path(folder)
     config = _config(folder)
-    return Layout(folder, config, _seen_pages(folder), _agent(folder), requirements_file(folder))
+    return Layout(folder, config, _pages(folder), _agent(folder), requirements_file(folder))
 
 
 def agent_folder(folder: Path) -> Path:
-    """The folder of agent.py and of the modules beside it, whatever else is wrong with the project; it may be gone."""
+    """Return the folder of agent.py and of the modules beside it, whatever else is wrong with the project. The folder
+    need not exist."""
     agent = _agent(folder)
     return folder if agent is None else agent.parent
 
 
 def pages_folder(folder: Path) -> Path | None:
-    """The folder of the pages, whatever else is wrong with the project. Raises OSError if that cannot be seen."""
+    """Return the folder of the pages, whatever else is wrong with the project; None if there is none. Raises OSError
+    if the folders cannot be read."""
     found = (place / name for place in _places(folder) for name in PAGES)
     return next((path for path in found if path.is_dir()), None)
 
 
 def requirements_file(folder: Path) -> Path | None:
-    """The project's requirements.txt: in its folder, or beside agent.py; None if there is none."""
+    """Return the project's requirements.txt, in its folder or beside agent.py; None if there is none."""
     return _first(place / REQUIREMENTS for place in (folder, agent_folder(folder)))
 
 
 def config_names() -> list[str]:
-    """The paths at which a config.yml may lie, from the project's folder. The first that exists counts."""
+    """Return the possible paths of config.yml below the project's folder. The first path that exists counts."""
     return [*CONFIGS, *(f"{app}/{name}" for app in APPS for name in CONFIGS)]
 
 
 def has_config(folder: Path) -> bool:
-    """Whether the folder has a config.yml, with mistakes or without."""
+    """Return whether the folder has a config.yml, with mistakes or without."""
     return any((folder / name).is_file() for name in config_names())
 
 
@@ -147,7 +149,7 @@ def _config(folder: Path) -> Path:
 
 
 def _above(folder: Path) -> str:
-    """What to say if this is a folder within a clone of HIPPO Gym."""
+    """The end of the message about a missing config.yml, if the folder lies within a clone of HIPPO Gym that has it."""
     absolute = folder.absolute()
     for app in APPS:
         if absolute.as_posix().endswith(f"/{app}"):
@@ -158,7 +160,7 @@ def _above(folder: Path) -> str:
 
 
 def _imported(file: Path) -> set[str]:
-    """The names of the modules that a file imports, without their packages; none if it is not there or is no Python."""
+    """The names of the modules that a file imports, without their packages; empty if Python cannot read the file."""
     try:
         tree = ast.parse(file.read_bytes())
     except (OSError, ValueError, SyntaxError, RecursionError):
@@ -172,7 +174,7 @@ def _places(folder: Path) -> list[Path]:
     return [folder, *(folder / app for app in APPS)]
 
 
-def _seen_pages(folder: Path) -> Path | None:
+def _pages(folder: Path) -> Path | None:
     try:
         return pages_folder(folder)
     except OSError:

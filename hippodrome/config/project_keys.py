@@ -1,9 +1,8 @@
-"""The section `project` of config.yml: what a value of each key may be by itself, its default, its meaning.
+"""The section `project` of config.yml: the check, the default and the meaning of each key.
 
-First the checks of single values, then the keys that they check. A check returns the value, or raises ValueError with
-what to write instead; it takes anything: text, `Plain` values from YAML, or whatever JSON can hold. Checks that any
-section can use are in `protocol/values.py`; the keys of `trial` are in `protocol/trial.py`, because the servers check
-them too.
+First come the checks of single values, then the keys. A check accepts a value of any type: texts, `Plain` values from
+YAML, and JSON values. It returns the value, or raises ValueError with what to write instead. `protocol/values.py` has
+the checks that other sections use, too. `protocol/trial.py` has the keys of `trial`, because servers also check them.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ from protocol.trial_sections import SceneSection, Ui
 from protocol.values import Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
+MAX_HOSTS = 50
+"""Origins in `allowedHosts`."""
 LONGEST_TEXT = 500  # characters
 
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
@@ -40,12 +41,12 @@ _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
 _BUCKET_ENDS = ("-s3alias", "--ol-s3", ".mrap", "--x-s3", "--table-s3")
 _STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
-_CERTIFICATES = "SSL"  # where servers may write nothing (infra/template.yml): a study there would keep no answer
-_DNS_ROOM = 253 - 64  # a server's own label, and its dot, stand in front
+_CERTIFICATES = "SSL"  # servers may not write into this folder (infra/template.yml), so a study there keeps no answers
+_DNS_ROOM = 253 - 64  # characters of a DNS name without the server's own label and its dot
 
 
 def project_id(value: object) -> str:
-    """Letters, digits, dashes and underscores, 1 to 64; no underscore at the beginning."""
+    """Check a project's id: 1 to 64 letters, digits, dashes and underscores, with no underscore at the beginning."""
     found = as_text(value, "letters, digits, dashes and underscores")
     if found == _CERTIFICATES:
         raise ValueError(f"must not be {found}: that is the folder of the servers' certificate in the bucket")
@@ -55,9 +56,9 @@ def project_id(value: object) -> str:
         raise ValueError(f"must be at most 64 characters long, not {len(found)}")
     better = re.sub(r"[^A-Za-z0-9_]+", "-", found).strip("-_")
     hint = f'; write for example "{better}"' if better else ""
-    what = "must not begin with an underscore" if found.startswith("_") else ""
-    what = what or f"may hold only letters, digits, dashes and underscores, not {show(found)}"
-    raise ValueError(f"{what}{hint}")
+    if found.startswith("_"):
+        raise ValueError(f"must not begin with an underscore{hint}")
+    raise ValueError(f"may hold only letters, digits, dashes and underscores, not {show(found)}{hint}")
 
 
 def bucket(value: object) -> str:
@@ -78,7 +79,7 @@ def bucket(value: object) -> str:
 
 
 def region(value: object) -> str:
-    """An AWS region's code."""
+    """Check the code of an AWS region."""
     found = as_text(value, "an AWS region such as ca-central-1")
     if _REGION.fullmatch(found):
         return found
@@ -88,7 +89,7 @@ def region(value: object) -> str:
 
 
 def domain(value: object) -> str:
-    """A DNS name of at least two labels, in small letters."""
+    """Check a DNS name of at least two labels, and return it in small letters."""
     found = as_text(value, "a domain name such as example.org")
     name = found.lower().rstrip(".")
     if _DOMAIN.fullmatch(name) and len(name) <= _DNS_ROOM and name == found.lower():
@@ -102,7 +103,7 @@ def domain(value: object) -> str:
 
 
 def origin(value: object) -> str:
-    """An https origin: https://name, perhaps with a port; no path, no wildcard."""
+    """Check an https origin: https://name, perhaps with a port, without a path and without a wildcard."""
     found = as_text(value, "an address such as https://example.org")
     whole_match = _ORIGIN.fullmatch(found.lower())
     if whole_match and len(whole_match["host"]) <= 253:
@@ -116,7 +117,8 @@ def origin(value: object) -> str:
 
 
 def page_origin(value: object) -> str:
-    """An origin as browsers write it: https, or on this machine http (localhost, a name below it, 127.0.0.1)."""
+    """Check the origin of a front end's pages, and return it as browsers write it. It is an https origin, or an http
+    origin of this machine (localhost, a name below it, 127.0.0.1)."""
     found = as_text(value, "an address such as https://play.example.org").lower()
     if _HERE.fullmatch(found):
         return found.removesuffix(":80")
@@ -124,7 +126,7 @@ def page_origin(value: object) -> str:
 
 
 def object_key(value: object) -> str:
-    """The path of a file within a bucket."""
+    """Check the path of a file within a bucket."""
     found = as_text(value, "the path of a file in the bucket, such as SSL/fullchain.pem")
     if "://" in found or found.startswith("/"):
         raise ValueError(f"must be the path within the bucket, such as SSL/fullchain.pem, not {show(found)}")
@@ -134,7 +136,7 @@ def object_key(value: object) -> str:
 
 
 def step_key(value: object) -> str:
-    """A key of `steps`: a number from 1, or finalStep."""
+    """Check a key of `steps`: a number from 1, or finalStep."""
     found = value.text if isinstance(value, Plain) else value
     if isinstance(found, str) and (found == FINAL or (_STEP_NUMBER.fullmatch(found) and int(found) <= MAX_STEPS)):
         return found
@@ -146,7 +148,7 @@ def step_key(value: object) -> str:
 
 
 def step_name(value: object) -> str:
-    """The step that an event names: a number, or finalStep."""
+    """Check the step that an event names: a number, or finalStep."""
     if isinstance(value, str) and value.strip() == FINAL:
         return FINAL
     found = number_in(value)
@@ -156,7 +158,7 @@ def step_name(value: object) -> str:
 
 
 def page(value: object) -> str:
-    """A step's file without `.html`, or `game`."""
+    """Check the page of a step, and return its file without `.html`, or the type of a step such as `game`."""
     if value is None or value == "":
         raise ValueError(f"has no page; write the name of its file, or {step_types.NAMES}")
     found = as_text(value, f"the name of a file, or {step_types.NAMES}")
@@ -167,7 +169,7 @@ def page(value: object) -> str:
 
 
 def who_with_whom(value: object) -> str | dict[str, str]:
-    """Who plays with whom: one of `MATCHINGS`, or a field of an earlier page whose answers are the same or different.
+    """Check `matching`: one of `MATCHINGS`, or a map such as {same: language}, which names a field of an earlier page.
 
     Raises ValueError with what to write instead.
     """
@@ -178,19 +180,19 @@ def who_with_whom(value: object) -> str | dict[str, str]:
         raise ValueError(f"must be {' or '.join(choices)}, not {values.show(value)}")
     if len(value) != 1 or next(iter(value)) not in MATCHED_BY:
         raise ValueError("must name one field, such as {same: language} or {different: role}")
-    how, given = next(iter(value.items()))
-    return {str(how): str(values.text("the name of a field of an earlier page", 64)(given))}
+    how, field = next(iter(value.items()))
+    return {str(how): str(values.text("the name of a field of an earlier page", 64)(field))}
 
 
 def text_name(value: object) -> str:
-    """Check the name of one of our texts (`hippodrome/model/texts.py`). Raises ValueError."""
+    """Check the name of one of Hippodrome's texts (`hippodrome/model/texts.py`). Raises ValueError."""
     if isinstance(value, str) and value in ENGLISH:
         return value
     raise ValueError(f"unknown text{did_you_mean(str(value), ENGLISH) or '; docs/texts.md lists all'}")
 
 
 def own_text(value: object) -> str:
-    """A study's own words for a text. Empty: the English ones."""
+    """Check a study's own words for a text; "" stands for Hippodrome's English ones."""
     return "" if value in (None, "") else str(_OWN_TEXT(value))
 
 
@@ -210,7 +212,7 @@ _StepName = Annotated[str, Rule(step_name, {"anyOf": [{"type": "integer", "minim
 
 
 class AwsSetupKeys(Model):
-    """Where a project lies in AWS, and how large its servers are."""
+    """The project's place on AWS, and the size of its servers."""
 
     bucket: _Bucket | None = None
     """S3 bucket that holds the project's pages and data. Default: the installation's."""
@@ -225,16 +227,16 @@ class AwsSetupKeys(Model):
 
 
 class EventsKeys(Model):
-    """At which steps a participant's server starts and stops."""
+    """The steps at which a participant's server starts and stops."""
 
     start_server_step: _StepName | None = None
-    """The step whose reaching starts the server. Default with a game step: 2, or 1 if the game is step 1."""
+    """The server starts when the participant reaches this step. Default with a game step: 2, or 1 if it is step 1."""
     stop_server_step: _StepName | None = None
-    """The step whose reaching stops the server. Default: the step after the last game step."""
+    """The server stops when the participant reaches this step. Default: the step after the last game step."""
 
 
 class SslKeys(Model):
-    """Where the servers fetch their certificate: three keys or none."""
+    """HIPPO's section for the servers' certificate: three keys or none. It has no effect."""
 
     ssl_bucket: _Bucket | None = None
     """S3 bucket that holds the certificate."""
@@ -245,30 +247,30 @@ class SslKeys(Model):
 
 
 class ProjectKeys(Model):
-    """Who runs the study, its steps, and where its servers run."""
+    """The study: its researchers, its steps, and its servers."""
 
     id: Annotated[str, Rule(project_id, {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"})] = ""
     """The project's id: letters, digits, dashes and underscores; unique in your organization."""
     name: Annotated[str, Rule(values.text("a name"))] = ""
-    """A label for people. Default: the id."""
+    """The name of the study for people. Default: the id."""
     researcher: _Text = ""
-    """Who is responsible for the study."""
+    """The person who is responsible for the study."""
     team_members: Annotated[
         tuple[_Text, ...], items("person", 200, single=True), Field(json_schema_extra={"type": ["array", "string"]})
     ] = ()
-    """Others in the team: one name or a list."""
+    """The other members of the team: one name or a list."""
     live: _Flag = True
     """Whether participants can take part now."""
     max_runtime: Annotated[int, whole(1, 1440)] = 60
     """Minutes after which a server is stopped, whatever happens."""
     use_aws: _Flag = False
-    """Whether the study is for AWS. false keeps it on one machine; left out, deploying it puts it on AWS."""
+    """Whether the study is for AWS. With false it cannot be deployed. Default: it can be deployed."""
     aws_setup: AwsSetupKeys = AwsSetupKeys()
-    """How large the servers are, and where on AWS; needed for AWS."""
+    """The size of the servers, and their place on AWS; needed for AWS."""
     events: EventsKeys = EventsKeys()
-    """When the participant's server starts and stops."""
+    """The steps at which the participant's server starts and stops."""
     ssl: SslKeys = SslKeys()
-    """Has no effect: servers get the installation's certificate. HIPPO's configurations have it."""
+    """No effect: servers get the installation's certificate. HIPPO's configurations have this section."""
     steps: dict[Annotated[str, Rule(step_key)], Annotated[str, Rule(page)]] = Field(
         default={},
         json_schema_extra={
@@ -277,41 +279,41 @@ class ProjectKeys(Model):
             "additionalProperties": False,
         },
     )
-    """The study's steps in order: 1, 2, 3 … and finalStep, each a file of the steps folder or game."""
+    """The study's steps in order: 1, 2, 3 … and finalStep. Each is a file of the steps folder, or game."""
     cluster: Annotated[str, one_of("installation", "participant")] = "installation"
-    """One ECS cluster for the installation, or one for each participant as HIPPO has it."""
+    """One ECS cluster for the installation, or one for each participant as in HIPPO."""
     subdomain: Annotated[str, one_of("hash", "userId")] = "hash"
-    """What a server is called: a hash (keeps ids private), or the userId as in HIPPO."""
+    """The name of a server: a hash, which keeps ids private, or the userId as in HIPPO."""
     plain_clients: _Flag = False
-    """Whether HIPPO's front end plays without a token: then who knows an id can play in that participant's place."""
+    """Whether HIPPO's front end plays without a token. Anybody who knows an id can then play as that participant."""
     front_end: Annotated[
         tuple[Annotated[str, Rule(page_origin)], ...],
         items("https:// address", 5, single=True),
         Field(json_schema_extra={"type": ["array", "string"]}),
     ] = ()
-    """Where that front end is: https:// origins, or http:// ones of this machine. Needed with plainClients."""
-    allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", 50)] = ()
+    """Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients."""
+    allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", MAX_HOSTS)] = ()
     """https:// origins from which step pages may load images, media and frames."""
     max_participants: Annotated[int, whole(1, 100_000)] | None = None
-    """How many may take part; whoever comes later is told that the study is full. Default: no limit."""
+    """The largest number of participants. Later ones are told that the study is full. Default: no limit."""
     max_servers: Annotated[int, whole(1, 10_000)] | None = None
-    """How many servers may run at once. Default: no limit."""
+    """The largest number of servers that run at once. Default: no limit."""
     max_server_hours: Annotated[int, whole(1, 1_000_000)] | None = None
     """Hours that all servers together may run. Default: no limit."""
     warm_servers: Annotated[int, whole(0, 100)] = 0
-    """Servers that are started ahead and wait, so that participants need not. Each is paid for while it waits."""
+    """Servers that are started ahead, so that participants need not wait. Each waiting server costs money."""
     signed_links: _Flag = False
-    """Whether only links that `deploy links` has signed are let in."""
+    """Whether participants need a link that `deploy links` has signed."""
     players: Annotated[int, whole(1, MAX_PLAYERS)] = 1
-    """Participants who play together in one environment. 1: each plays alone, on a server of their own."""
+    """The number of participants who play together in one environment. With 1 each plays alone, on their own server."""
     matching: Annotated[str | dict[str, str], Rule(who_with_whom, _MATCHING)] = "arrival"
     """Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py."""
     seats: Annotated[str, one_of(*SEATS)] = "lot"
-    """Who plays which player: by lot, in the order of the groups, or in the order in which match named them."""
+    """Who plays which player: by lot, in the order of the groups, or in the order in which match returns them."""
     patience: Annotated[float, Rule(values.number(10, 3600), {"type": "number", "minimum": 10, "maximum": 3600})] = 300
-    """Seconds after which a participant no longer waits in the lobby for others."""
+    """Seconds for which a participant waits in the lobby for others."""
     after_patience: Annotated[str, one_of("unmatched", "policies")] = "unmatched"
-    """Then: on to the next step as unmatched, or a game with policies in the empty places (trial.substitute)."""
+    """What follows when patience is over: the next step, or a game with policies (trial.substitute) in empty places."""
 
     texts: dict[Annotated[str, Rule(text_name)], Annotated[str, Rule(own_text)]] = Field(
         default={},
@@ -323,7 +325,7 @@ class ProjectKeys(Model):
             "additionalProperties": False,
         },
     )
-    """The study's own words for what Hippodrome says to participants (docs/texts.md). Default: English."""
+    """The study's own words for Hippodrome's texts (docs/texts.md). Default: English."""
 
     @property
     def has_sessions(self) -> bool:
@@ -332,7 +334,7 @@ class ProjectKeys(Model):
 
     @property
     def own_texts(self) -> dict[str, str]:
-        """The texts for which the study has words of its own."""
+        """The texts for which the study has its own words."""
         return {name: text for name, text in self.texts.items() if text}
 
 

@@ -1,4 +1,4 @@
-"""A registration from outside: checked as if it were a config.yml."""
+"""Checks a registration from outside as if it were a config.yml."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from hippodrome.model.step_order import FINAL, ordered, visited
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
 
-MESSAGE = "message"  # the "file" of problems in a registration
+MESSAGE = "message"  # stands in the place of a file name in the mistakes of a registration
 LIMIT_VARIANTS = 1000
 
-_OURS = ("taskDefinition", "serverPort", "pageFolder", "gamePages")  # what is added, and no config.yml may say
+_OURS = ("taskDefinition", "serverPort", "pageFolder", "gamePages")  # keys that no config.yml may have
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
@@ -34,11 +34,10 @@ class _Step(Model):
 
 
 def parse_registration(data: object) -> dict[str, Any]:
-    """A registration from outside, checked as if it were a config.yml, with defaults filled in.
+    """Check a registration from outside as if it were a config.yml, and return it with all defaults filled in.
 
-    It may name the task definition that its servers run, the port where they listen, and where the pages lie, which no
-    config.yml does.
-    Raises ConfigErrors whose file is "message".
+    Unlike a config.yml, it may name the task definition that its servers run, the port on which they listen, the folder
+    of the pages, and the versions of the pages in the game. Raises ConfigErrors, with "message" for the file name.
     """
     if not isinstance(data, dict):
         raise ConfigErrors([Diagnostic(MESSAGE, None, "", "a registration must be a JSON object")])
@@ -57,16 +56,16 @@ def parse_registration(data: object) -> dict[str, Any]:
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))
-    kept = visited(checked.step_keys, checked.root.project.steps)
-    config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in kept])
+    shown = visited(checked.step_keys, checked.root.project.steps)
+    config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in shown])
     return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
 
 
 def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
     name, port = task.get("taskDefinition", "none"), task.get("serverPort", PORTS[0])
     if not (isinstance(name, str) and _TASK_DEFINITION.fullmatch(name)):
-        what = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
-        yield Mistake(("taskDefinition",), what)
+        message = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
+        yield Mistake(("taskDefinition",), message)
     if isinstance(port, bool) or port not in PORTS:
         yield Mistake(("serverPort",), f"must be {' or '.join(map(str, PORTS))}")
     if task.get("pageFolder", STEPS_FOLDER) not in (STEPS_FOLDER, ""):
@@ -90,7 +89,7 @@ def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
 
 
 def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:
-    """The steps of a registration, each by itself; and that they are in order."""
+    """The steps of a registration, and the mistakes in them: each step is checked by itself, then their order."""
     if not isinstance(data, list) or not data or len(data) > project_keys.MAX_STEPS + 1:
         return [], [Mistake(STEPS, f"must be a list of 1 to {project_keys.MAX_STEPS} steps")]
     steps: list[_Step] = []

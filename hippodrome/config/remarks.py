@@ -1,4 +1,4 @@
-"""Remarks: what works in a configuration, but may cost or do something that was not intended."""
+"""Remarks on a configuration without mistakes that may cost or do something that is not intended."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hippodrome.config import sessions, texts
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import ConfigSource, read_source
+from hippodrome.config.project_keys import STEPS
 from protocol import keyboard
 from protocol.values import printable
 
 START: Keys = ("project", "events", "startServerStep")
-STEPS: Keys = ("project", "steps")
 
 ACTIONS: Keys = ("trial", "actionSpace")
 IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
@@ -23,7 +23,7 @@ IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "
 UI: Keys = ("trial", "ui")
 ARROWS = ("left", "right", "up", "down")
 PARTS = frozenset({*ARROWS, "fire"})
-"""Keys that act together with others: "up" and "right" are "upright" (`trial/core/controls.py`)."""
+"""Keys that are combined with others: "up" and "right" are the action "upright" (`trial/core/controls.py`)."""
 
 KEYS: Keys = ("trial", "keys")
 
@@ -46,15 +46,15 @@ NO_GAME = (
 
 
 def starts_at_link(config: Config) -> bool:
-    """Whether a participant's first visit starts a server, before they have answered anything."""
+    """Return whether a participant's first visit starts a server, before any answer."""
     return bool(config.steps) and config.events.start_server_step == config.steps[0].key
 
 
 def without_a_key(config: Config) -> Remark | None:
-    """What to say about an action that the game takes whenever no key is pressed, and that does something.
+    """Return a remark if the action that the game takes without a key seems to do something.
 
-    The trial then takes `idleAction`, or the action `noop`, or else the first one (`trial/core/players.py`). Turn by
-    turn it takes none.
+    Without a key the trial takes `idleAction`, or the action `noop`, or the first action (`trial/core/players.py`).
+    With `pace: turns` it takes none.
     """
     if config.trial.idle_action is not None or config.trial.pace == "turns":
         return None
@@ -72,7 +72,7 @@ def without_a_key(config: Config) -> Remark | None:
 
 
 def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
-    """What to say about arrows of `ui` that none of these actions is called after, alone or together with others."""
+    """Yield a remark on each arrow of `ui` after which none of these actions is named, alone or with other keys."""
     names = [name.strip().lower() for name in actions]
     if not names or not config.game_steps or config.trial.keys:
         return
@@ -84,7 +84,7 @@ def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator
 
 
 def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
-    """What to say about arrows of `ui` if the environment has so many actions, whose names are not known."""
+    """Yield a remark on the arrows of `ui` if the environment has `count` actions without names."""
     arrows = [arrow for arrow in ARROWS if getattr(config.trial.ui, arrow)]
     if not arrows or not config.game_steps or config.trial.keys:
         return
@@ -99,7 +99,8 @@ def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
 
 
 def combined_after_single(config: Config) -> Iterator[Remark]:
-    """What to say about keys that act together, if one of them acts by itself as soon as it goes down."""
+    """With `input: single`, yield a remark on each combination of which one key is an action by itself: that action is
+    taken before the other keys are down."""
     if config.trial.input != "single":
         return
     for path, keys in config.trial.key_maps():
@@ -113,7 +114,7 @@ def combined_after_single(config: Config) -> Iterator[Remark]:
 
 
 def several_humans(config: Config) -> Iterator[Remark]:
-    """What to say about players whom no participant plays, if each participant plays alone."""
+    """Yield a remark if several players are human although each participant plays alone."""
     if config.project.has_sessions:
         return
     for path, names in config.trial.humans():
@@ -125,7 +126,7 @@ def several_humans(config: Config) -> Iterator[Remark]:
 
 
 def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
-    """What to say about keys of actions that the environment does not have, whose names it gives itself."""
+    """Yield a remark on each key whose action is not among these actions, which are the environment's own."""
     if config.trial.keys_differ:
         return  # players may have different actions
     names = [name.strip().lower() for name in actions]
@@ -136,27 +137,27 @@ def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[R
 
 
 def _names_a_certificate(config: Config) -> bool:
-    """Whether it says where the certificate is, in a study that may go to AWS."""
+    """Whether a study that may run on AWS has the section `ssl`."""
     project = config.project
-    stays = project.given("useAWS") and not project.use_aws
-    return not stays and any(value is not None for value in project.ssl.model_dump().values())
+    local_only = project.given("useAWS") and not project.use_aws
+    return not local_only and any(value is not None for value in project.ssl.model_dump().values())
 
 
 def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:
-    """What to say about recordings without observations, in a project of HIPPO's layout that does not ask for that."""
+    """Yield a remark if a project of HIPPO's layout has no `recordObservations`: HIPPO saved observations."""
     if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not source.names(OBSERVATIONS):
         yield Remark(("trial",), NO_OBSERVATIONS)
 
 
 def keys_of_sessions(source: ConfigSource, config: Config) -> Iterator[Remark]:
-    """What to say about keys that are for several participants, if each participant plays alone."""
+    """Yield a remark on each key for games of several participants if each participant plays alone."""
     if not config.project.has_sessions:
         said = sessions.no_effect(config.trial)
         yield from (Remark(path, said) for path in sessions.OF_SESSIONS if source.names(path))
 
 
 def remarks(config: Config) -> Iterator[Remark]:
-    """What to say about a configuration without mistakes."""
+    """Yield the remarks that need only the values of the configuration."""
     if _names_a_certificate(config):
         yield Remark(CERTIFICATE, NO_EFFECT)
     if config.project.plain_clients:
@@ -184,11 +185,11 @@ def remarks(config: Config) -> Iterator[Remark]:
 
 
 def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
-    """The remarks on the project in `folder`, with the lines of its config.yml."""
+    """Return all remarks on the project in `folder`, with the lines of its config.yml."""
     source = read_source(folder)
     arrows = [
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
-    ]  # without ui all are on
+    ]  # without `ui` in the file all arrows are shown
     own = [*texts.shown_as_they_are(config), *texts.left_in_english(config)]
     found = [*remarks(config), *own, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
-    return [*config.remarks, *(source.diagnostic(path, said, remark=True) for path, said in found)]
+    return [*config.remarks, *(source.diagnostic(path, message, remark=True) for path, message in found)]

@@ -1,4 +1,4 @@
-"""The JSON Schema of config.yml, for editors."""
+"""Makes the JSON Schema of config.yml, for editors."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _OWN_CONTROLS: dict[str, Any] = {
         f"^({'|'.join(sorted(trial.RESERVED_CONTROLS))})$|^.{{{values.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
     },
 }
-"""What other keys of `ui` may be. A pattern, since editors would propose keys that stand under `properties`."""
+"""The values of other keys in `ui`. Reserved names stand in a pattern: editors propose all keys under `properties`."""
 
 
 def config_schema() -> dict[str, Any]:
-    """A JSON Schema (2020-12) of config.yml for editors: names, types and bounds, each key by itself."""
+    """Return a JSON Schema (2020-12) of config.yml: the names, types and bounds of single keys."""
     schema = Root.model_json_schema()
     definitions = schema["$defs"]
     definitions |= {section.__name__: _of_trial(section) for section in (TrialSection, Ui, SceneSection)}
@@ -43,7 +43,7 @@ def config_schema() -> dict[str, Any]:
 
 
 def _of_trial(section: type[TrialSection | Ui | SceneSection]) -> dict[str, Any]:
-    """A section of `trial`, as pydantic describes those of `project`."""
+    """The schema of a section of `trial`, in the form of pydantic's schemas for `project`."""
     properties = {
         key.name: {
             "default": key.default,
@@ -63,7 +63,7 @@ def _of_trial(section: type[TrialSection | Ui | SceneSection]) -> dict[str, Any]
 
 
 def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
-    """The property as an editor should see it; unless required, it may be left empty: the same as not given."""
+    """The property for editors. It may be empty unless it is `required`, since an empty key counts as not given."""
     about = {key: prop[key] for key in ("description", "default", "deprecated") if key in prop}
     if about.get("default") in (None, "", {}) or "$ref" in prop:
         about.pop("default", None)
@@ -74,7 +74,7 @@ def _for_editors(prop: dict[str, Any], required: bool) -> dict[str, Any]:
 
 
 def _meanings() -> dict[tuple[str, str], dict[str, str]]:
-    """What is written below each field, by model and key. Read here, because reading it at import would cost 0.1 s."""
+    """The docstring below each field, by model and key. Reading the source at import would cost 0.1 s."""
     found: dict[tuple[str, str], dict[str, str]] = {}
     for model in SECTIONS.values():
         definition = ast.parse(inspect.getsource(model)).body[0]

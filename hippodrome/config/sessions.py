@@ -1,4 +1,4 @@
-"""Several participants in one environment (`project.players`): how the keys that say it go together."""
+"""Checks of studies in which several participants play in one environment (`project.players`)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Keys, Mistake, Remark
 from hippodrome.config.each_value import Checked
 from hippodrome.model.step_types import type_of
-from protocol import players as who
-from protocol.players import HUMAN
+from protocol.players import HUMAN, by_group
 from protocol.trial import SESSION_KEYS, TrialSection
 from protocol.values import printable
 
@@ -26,29 +25,30 @@ OF_SESSIONS: tuple[Keys, ...] = (
     ("project", "afterPatience"),
     *(("trial", key) for key in SESSION_KEYS),
 )
-"""The keys that matter with `project.players` only."""
+"""The keys that have no effect if `project.players` is 1."""
 
 
 def no_effect(trial: TrialSection) -> str:
-    """A sentence on each of these keys that has no effect because the project has no `players`."""
+    """Return the remark on a key of OF_SESSIONS in a study whose participants play alone."""
     most = max((len(humans) for _, humans in trial.humans()), default=0)
     alone = "project.players is 1, so each participant plays alone"
     return f"no effect: {alone}; write players: {max(2, most)} under project"
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
-    """Keys that do not go together with `project.players`. None if each participant plays alone."""
+    """Yield mistakes in keys that do not fit `project.players`; nothing if each participant plays alone."""
     if not checked.root.project.has_sessions or not checked.valid(PLAYERS):
         return
     yield from _humans(checked)
     yield from _one_game_for_all(checked)
     yield from _empty_places(checked)
     yield from _seats(checked)
-    yield from _names(checked)
+    yield from _of_one_participant(checked)
 
 
 def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
-    """Keys that do not fit the number of groups, which the versions of pages make; 0 if there are none."""
+    """Yield mistakes in keys that need groups if the study has none. `groups` is their number: the versions of a
+    page."""
     project = checked.root.project
     if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return
@@ -60,7 +60,7 @@ def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
 
 
 def _humans(checked: Checked) -> Iterator[Mistake]:
-    """As many players are human, in each group, as participants play together."""
+    """In each group, the number of human players must be `project.players`."""
     wanted, trial = checked.root.project.players, checked.trial
     has_game = any(type_of(page).on_server for page in checked.root.project.steps.values())
     if not checked.valid(WHO_PLAYS) or not has_game:
@@ -81,25 +81,25 @@ def _humans(checked: Checked) -> Iterator[Mistake]:
 
 
 def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
-    """Who plays whom is one thing for all participants of a game."""
+    """`players` may differ between groups only if the participants of each game are of one group."""
     project = checked.root.project
-    if who.by_group(checked.trial.players) and project.matching != "group" and checked.valid(MATCHING, WHO_PLAYS):
+    if by_group(checked.trial.players) and project.matching != "group" and checked.valid(MATCHING, WHO_PLAYS):
         said = "is given group by group, and a game may have participants of several groups"
         yield Mistake(WHO_PLAYS, f"{said}; write matching: group under project, or one map for all")
 
 
 def _empty_places(checked: Checked) -> Iterator[Mistake]:
-    """Something plays in an empty place. (`afterAbsent` is compared in `protocol/trial_rules.py`.)"""
+    """`afterPatience: policies` needs `substitute`. (`protocol/trial_rules.py` checks `afterAbsent: policy`.)"""
     trial = checked.trial
     needs = checked.root.project.after_patience == "policies" and trial.after_absent != "policy"
     path: Keys = ("trial", "substitute")
     if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
-        what = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
-        yield Mistake(path, f"missing; {what}")
+        said = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
+        yield Mistake(path, f"missing; {said}")
 
 
 def _seats(checked: Checked) -> Iterator[Mistake]:
-    """Seats that are not drawn by lot follow from how people are matched, and all of them are taken."""
+    """Seats that are not drawn by lot need a `matching` that orders the participants, and a participant for each."""
     project = checked.root.project
     if project.seats == "lot" or not checked.valid(SEATS, MATCHING):
         return
@@ -115,22 +115,22 @@ def _seats(checked: Checked) -> Iterator[Mistake]:
         yield Mistake(SEATS, f"{project.seats}, {said}; write seats: lot, or afterPatience: unmatched")
 
 
-def _names(checked: Checked) -> Iterator[Mistake]:
-    """What is one participant's alone cannot be a game's."""
+def _of_one_participant(checked: Checked) -> Iterator[Mistake]:
+    """HIPPO's front end, servers named by userId, and clusters of a participant need participants who play alone."""
     project = checked.root.project
     if project.plain_clients:
         said = "HIPPO's front end opens the game of one participant: write plainClients: false, or players: 1"
         yield Mistake(("project", "plainClients"), said)
     elif project.subdomain == "userId":
-        said = "a server is several participants', so it cannot be called after one: use subdomain: hash"
+        said = "several participants share a server, so it cannot have the id of one as its name: use subdomain: hash"
         yield Mistake(("project", "subdomain"), said)
     if project.cluster == "participant":
-        said = "a server is several participants', so no cluster is one participant's: use cluster: installation"
+        said = "several participants share a server, so it cannot run in the cluster of one: use cluster: installation"
         yield Mistake(("project", "cluster"), said)
 
 
 def remarks(config: Config) -> Iterator[Remark]:
-    """What to say about a study in which several participants play together."""
+    """Yield remarks on a study in which several participants play together."""
     project, trial = config.project, config.trial
     if not project.has_sessions:
         return
@@ -155,7 +155,7 @@ def remarks(config: Config) -> Iterator[Remark]:
 
 
 def _without_keys(trial: TrialSection) -> Iterator[Remark]:
-    """Participants of whose keys `keys` says nothing, though it has a section for each player."""
+    """A remark if `keys` has a map for each player, but none for some human players."""
     humans = dict.fromkeys(name for _, names in trial.humans() for name in names)
     lacking = [name for name in humans if trial.keys_differ and name not in trial.keys]
     if lacking:
@@ -164,7 +164,7 @@ def _without_keys(trial: TrialSection) -> Iterator[Remark]:
 
 
 def _too_short(config: Config) -> Iterator[Remark]:
-    """All episodes and the breaks between them take longer than a server runs."""
+    """A remark if all episodes and the breaks between them can take longer than a server runs."""
     trial, most = config.trial, config.project.max_runtime
     between = trial.between_seconds if math.isfinite(trial.between_seconds) else 0
     takes = math.ceil((trial.max_episodes * trial.episode_seconds + (trial.max_episodes - 1) * between) / 60)
@@ -175,6 +175,7 @@ def _too_short(config: Config) -> Iterator[Remark]:
 
 
 def _one_for_all(trial: TrialSection) -> Iterator[Remark]:
+    """A remark on each control with which one participant ends something for all."""
     for control, does in (("stop", "ends the game"), ("reset", "ends the episode")):
         if getattr(trial.ui, control):
-            yield Remark(("trial", "ui", control), f"one participant who presses it {does} for all of them")
+            yield Remark(("trial", "ui", control), f"one participant who presses it {does} for all")

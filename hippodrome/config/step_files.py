@@ -1,4 +1,4 @@
-"""Finds the step files of a project on disk: which pages are there, and in how many variants."""
+"""Finds the files of a project's pages: one file, or one for each group."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from hippodrome.config import layout
 from protocol.similar import SIMILAR_FILES, did_you_mean
 
 CLOSING = Path(__file__).with_name("pages") / "hippodrome-the-end.html"
-"""The page that ends a study which has no pages (`hippo.CLOSING_PAGE`)."""
+"""The file of the last page of a study without pages (`hippo.CLOSING_PAGE`)."""
 LIMIT_BYTES = 1024 * 1024
 
 _VERSION = re.compile(r"(.+)-(?:0|[1-9][0-9]{0,5})")
 
 
 class StepFileError(Exception):
-    """A page's files are not as they must be; str() says what to do, in a sentence."""
+    """A page's files have a mistake; `str()` says what to do, in a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepFolder:
-    """A project's folder of pages and the exact names in it."""
+    """A project's folder of pages, and the names of its files as the disk has them."""
 
     path: Path
     names: tuple[str, ...]
 
     def find(self, page: str) -> tuple[int, tuple[Path, ...]]:
-        """The page's number of variants (0: one page for all participants) and its files. Raises StepFileError."""
+        """Return the page's number of variants and its files. It is 0 if all participants get one page. Raises
+        StepFileError."""
         groups = sorted(self._groups(page))
         single = f"{page}.html"
         if single in self.names and 0 in groups:
@@ -53,17 +54,17 @@ class StepFolder:
         return {int(found[1]) for name in self.names if (found := pattern.fullmatch(name))}
 
     def _nearest(self, wanted: str) -> str:
-        """The page that was meant, if one has nearly that name: as config.yml names it, without -k and .html."""
+        """The end of the message about a missing page: the page that was probably meant, as config.yml names it."""
         return did_you_mean(wanted, self._pages(), SIMILAR_FILES) or ("" if self.names else ", which is empty")
 
     def _pages(self) -> list[str]:
-        """What may stand in config.yml: the names of all pages, one for all versions of a page."""
+        """The names of all pages for config.yml: without `.html`, and without the number of a group."""
         stems = [name.removesuffix(".html") for name in self.names if name.endswith(".html")]
         versions = {stem: found[1] for stem in stems if (found := _VERSION.fullmatch(stem))}
         return [page if f"{page}-0" in stems else stem for stem in stems for page in [versions.get(stem, stem)]]
 
     def _read(self, name: str) -> Path:
-        """The file, once it is known to be readable text of a decent size."""
+        """The file, after a check that it is text in UTF-8 of at most LIMIT_BYTES. Raises StepFileError."""
         file, label = self.path / name, f"{self.path.name}/{name}"
         try:
             if not file.is_file():
@@ -83,7 +84,8 @@ class StepFolder:
 
 
 def open_folder(project: Path) -> StepFolder:
-    """The project's folder of pages: `steps`, or as in HIPPO Gym. Raises StepFileError if there is none."""
+    """Return the project's folder of pages: `steps`, or that of HIPPO Gym's layout. Raises StepFileError if there is
+    none, or it cannot be read."""
     try:
         path = layout.pages_folder(project)
         if path is not None:

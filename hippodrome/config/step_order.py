@@ -1,4 +1,4 @@
-"""Steps as messages name them, and what events name by default; `hippodrome.model.step_order` has their order."""
+"""Names steps in messages, and fills in the default steps of `events`. `hippodrome.model.step_order` orders steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hippodrome.model.step_types import type_of
 
 
 def is_step_key(key: str) -> bool:
-    """Whether it is 1, 2, 3 … or finalStep."""
+    """Return whether the key is 1, 2, 3 … or finalStep."""
     try:
         return bool(project_keys.step_key(key))
     except ValueError:
@@ -19,21 +19,22 @@ def is_step_key(key: str) -> bool:
 
 
 def step_name(key: str) -> str:
-    """The step as a message names it."""
+    """Return the step's name for messages: "step 3", or "finalStep"."""
     return key if key == FINAL else f"step {key}"
 
 
 def step_range(keys: list[str]) -> str:
-    """The steps in words: "1 to 4 and finalStep"."""
+    """Return the steps in words: "1 to 4 and finalStep"."""
     numbered = [key for key in keys if key != FINAL]
     words = f"{numbered[0]} to {numbered[-1]}" if len(numbered) > 1 else "".join(numbered)
     return words if numbered == keys else f"{words} and {FINAL}"
 
 
 def changed_pages(before: Mapping[str, str], after: Mapping[str, str]) -> str:
-    """Which steps have another page than before, in words: "step 3 is sleep (was rules), step 4 is rules (new)".
+    """Return the steps whose page has changed, in words: "step 3 is sleep (was rules), step 4 is rules (new)".
 
-    Both map keys of steps to pages. Empty if no answer can come from another page: a final step has other words only.
+    `before` and `after` map keys of steps to pages. Another page of finalStep does not count, since that step has no
+    answers. Returns "" if no page has changed.
     """
     words = [
         f"{step_name(key)} is {page} {_was(before.get(key))}"
@@ -53,7 +54,7 @@ def _was(page: str | None) -> str:
 
 
 def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]) -> EventsKeys:
-    """The events with defaults, as keys of steps. The events have been checked."""
+    """Return the checked events as keys of steps, with defaults filled in."""
     start, stop = (position(key, keys) for key in (events.start_server_step, events.stop_server_step))
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if games:

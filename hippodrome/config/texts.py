@@ -1,4 +1,4 @@
-"""A study's own words for what Hippodrome says to participants: mistakes in them, and what is left in English."""
+"""Checks a study's own words for Hippodrome's texts (`project.texts`): mistakes, and texts that stay in English."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
 _QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
 _SHOWN = 3  # names of texts in a remark
-_SENTENCE = 3  # words that are the same in no two languages
+_SENTENCE = 3  # words from which on a text is not the same in two languages
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
-    """Mistakes in texts that are well formed by themselves: places that nothing fills, and no language."""
+    """Yield mistakes in texts: places such as `{seconds}` that the text does not have, and wrong languages."""
     for name, text in checked.root.project.own_texts.items():
         if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
@@ -33,6 +33,7 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
 
 
 def _known(name: str) -> str:
+    """The places of this text, in words."""
     known = [f"{{{place}}}" for place in places(ENGLISH[name])]
     if not known:
         return "this text has no places"
@@ -41,7 +42,7 @@ def _known(name: str) -> str:
 
 
 def shown_as_they_are(config: Config) -> Iterator[Remark]:
-    """Remarks on texts with signs that were meant for a program, and that participants would read."""
+    """Yield remarks on texts with HTML or quotation marks, which participants would read as characters."""
     for name, text in config.project.own_texts.items():
         if found := _HTML.search(text):
             yield Remark((*TEXTS, name), f"participants read {found[0]} as it stands here: a text is no HTML")
@@ -51,9 +52,10 @@ def shown_as_they_are(config: Config) -> Iterator[Remark]:
 
 
 def left_in_english(config: Config) -> Iterator[Remark]:
-    """Remarks on a study in another language: texts of ours that its participants may read in English.
+    """Yield a remark if a study in another language leaves texts of Hippodrome in English.
 
-    Its `texts` say which language it is in, or its pages do. If neither does, the words of both tell.
+    The study's language is that of its `texts` or of its pages. If neither names one, their words tell whether the
+    study is in English.
     """
     own = config.project.own_texts
     pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
@@ -66,6 +68,7 @@ def left_in_english(config: Config) -> Iterator[Remark]:
 
 
 def _unnamed(own: Mapping[str, str]) -> Remark:
+    """The remark on a study that is not in English, and names no language."""
     said = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are"
     if own:
         return Remark(TEXTS, f"{said}; give the language of these texts, such as language: fr")
@@ -74,6 +77,7 @@ def _unnamed(own: Mapping[str, str]) -> Remark:
 
 
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
+    """The remark on a study that names another language, and does not translate all texts that it needs."""
     named = own.get(LANGUAGE)
     foreign = [each for each in (named, *languages) if each and not _is_english(each)]
     if not foreign or (named and _is_english(named)):
@@ -89,7 +93,7 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
 
 
 def _is_untouched(name: str, text: str) -> bool:
-    """Whether a text has been copied and not translated. Short ones, such as Pause, can be the same in both."""
+    """Whether a text was copied and not translated. Short texts, such as Pause, can be the same in both languages."""
     return text == ENGLISH[name] and len(words_of(text)) >= _SENTENCE
 
 

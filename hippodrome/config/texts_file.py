@@ -1,4 +1,4 @@
-"""All texts in English as lines of config.yml, to be translated (`docs/texts.en.yml`)."""
+"""Writes all English texts as lines of config.yml, for translators (`docs/texts.en.yml`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ project:
 
 
 def texts_file() -> str:
-    """The content of `docs/texts.en.yml`. The language is left empty, so that `make check` asks for it."""
+    """Return the content of `docs/texts.en.yml`. The language is empty, so that `make check` asks for it."""
     groups = ("".join(_group(title, texts)) for title, texts in GROUPS.items())
     return HEAD + "\n".join(groups)
 

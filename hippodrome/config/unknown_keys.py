@@ -1,4 +1,4 @@
-"""What to say about a key that no section has: a typing error, a key in the wrong section, or neither."""
+"""Explains an unknown key: as a typing error, as a key in the wrong section, or as neither."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from hippodrome.model.texts import ENGLISH
 from protocol.similar import nearest
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
-"""How alike two names must be for one to be most likely a slip of the other, in the same section or in another."""
+"""How similar an unknown key must be to a known one to be most likely a typing error: for a key of the same section,
+and for a key of another section (difflib's ratio, from 0 to 1)."""
 
 
 _ELSEWHERE = {section: names for section, names in NAMES.items() if section != ("trial", "scene")}
-"""Where a key may have been meant to stand. The names in a scene, such as width, may be those of anything else."""
+"""The sections to which an unknown key may belong. The keys of `scene`, such as width, are too common to tell."""
 
 
 _AROUND_TEXTS = ((), TEXTS[:-1])
-"""Where texts stand if they are not indented far enough."""
+"""The sections in which texts stand if they are not indented far enough."""
 
 
 def explain(path: Keys) -> tuple[str, list[Keys]]:
-    """What to say about an unknown key, and the path it was meant for, if there is a good guess."""
+    """Return the message about an unknown key, and a list with the path that was probably meant, if there is one."""
     section, key = path[:-1], str(path[-1])
     own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
     home = _home(key, section)
@@ -40,7 +41,10 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
 
 
 def meant_for(path: Keys) -> Keys | None:
-    """The path of the key that was most likely meant by an unknown one: misplaced, or with a typing error."""
+    """Return the path of the key that was most likely meant by an unknown key; None if no known key is similar enough.
+
+    The unknown key is a known key in the wrong section, or has a typing error.
+    """
     section, key = path[:-1], str(path[-1])
     home = _home(key, section)
     if home is not None:
@@ -53,7 +57,7 @@ def meant_for(path: Keys) -> Keys | None:
 
 
 def _home(key: str, section: Keys) -> Keys | None:
-    """The section that has this key, which stands in `section`."""
+    """The section to which a key belongs that stands in `section`; None if no section has this key."""
     if key == FINAL or key.isdecimal():
         return STEPS
     texts = TEXTS if key in ENGLISH and section in _AROUND_TEXTS else None

@@ -1,7 +1,7 @@
-"""Reads a YAML file into plain values and remembers the line of each, for messages.
+"""Reads a YAML file into plain values, with the line of each for messages.
 
-Only the safe core of YAML is read: maps, lists, text, numbers, true/false. Size, depth and the number of values
-(aliases repeat what they name) are limited.
+It reads only a safe part of YAML: maps, lists, texts, numbers, true and false. The file's size, its depth and its
+number of values are limited; an alias counts as all the values that it repeats.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _TRUE = {"true", "yes", "on", "y"}
 _WIDE_BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)
 
 _NO_SPACE = re.compile(r"\s*(?:- +)?(?P<key>[\w-]+):(?P<value>[^\s:/].*)")
-"""`key:value`, which YAML takes for a text."""
+"""`key:value`, which YAML reads as a text."""
 _MATCHED_BY = re.compile(r"\s*matching: +(?P<how>same|different): +(?P<field>[^\s{}#][^{}#]*?)\s*(?:#|$)")
-"""`matching: same: language`: a map in one line needs braces."""
+"""`matching: same: language`, which lacks the braces of a map in one line."""
 _ENDED = re.compile(r"""\s*(?:- +)?[\w-]+: +(?P<read>"[^"]*"|'[^']*'|\{[^{}]*\})\s*""")
-"""A text in quotes, or a map in braces, behind which the line goes on."""
+"""A text in quotes or a map in braces, after which the line does not end."""
 _NOT_ENDED = {
     '"': 'inside of "…" write \\" for a quotation mark',
     "'": 'put a text with an apostrophe into "…"',
@@ -44,7 +44,7 @@ _NOT_ENDED = {
 
 
 class UnreadableConfig(Exception):
-    """The file cannot be read at all. `line` is where, or None; str() says why and what to do, in a sentence."""
+    """The file cannot be read at all. `str()` says why and what to do; `line` is the line of the mistake, or None."""
 
     def __init__(self, message: str, line: int | None = None) -> None:
         super().__init__(message)
@@ -53,14 +53,14 @@ class UnreadableConfig(Exception):
 
 @dataclass(slots=True)
 class ParsedFile:
-    """A YAML file: its values, the line of each path of keys (lines count from 1), and what is wrong with the YAML."""
+    """A YAML file: its values, the line of each path of keys (lines count from 1), and the mistakes in its YAML."""
 
     values: dict[str, Value] = field(default_factory=dict)
     lines: dict[Keys, int] = field(default_factory=dict)
     mistakes: list[Mistake] = field(default_factory=list)
 
     def line(self, path: Keys) -> int:
-        """The line of `path`, or of the nearest section around it that is in the file."""
+        """Return the line of `path`, or of the nearest section around it that is in the file; 1 if there is none."""
         for end in range(len(path), 0, -1):
             if path[:end] in self.lines:
                 return self.lines[path[:end]]
@@ -68,7 +68,8 @@ class ParsedFile:
 
 
 def parse_yaml(data: bytes) -> ParsedFile:
-    """The file's content. What is wrong with single values is in `.mistakes`. Raises UnreadableConfig."""
+    """Return the file's content; its `mistakes` are those in single values. Raises UnreadableConfig if the file cannot
+    be read at all."""
     text = _decode(data)
     root = _compose(text)
     if root is None:
@@ -111,14 +112,14 @@ def _compose(text: str) -> yaml.Node | None:
 
 
 def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
-    """What PyYAML says, with the line; in other words where its own do not lead to the mistake."""
+    """PyYAML's error with its line, in plainer words for common mistakes."""
     lines = text.splitlines()
     mark = error.problem_mark or error.context_mark
     problem = error.problem or error.context or ""
     if mark is None:
         return UnreadableConfig(f"YAML cannot read this file: {problem}")
     if ("end of stream" in problem or "expected ':'" in problem) and error.context_mark is not None:
-        mark = error.context_mark  # where the quotation or the key begins, not where the file or the next key does
+        mark = error.context_mark  # the beginning of the text or the key, not the place where PyYAML stopped
         problem = f"{error.context}, {problem}"
     number = mark.line
     source = lines[number] if number < len(lines) else ""
@@ -148,7 +149,7 @@ def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
 
 
 def _has_tab(line: str) -> bool:
-    """Whether the line is indented with a tab, or has one behind the dash of a list's item."""
+    """Whether the line is indented with a tab, or has a tab after the dash of a list's item."""
     text = line.lstrip()
     return "\t" in line[: len(line) - len(text)] or text.startswith("-\t")
 
@@ -216,7 +217,7 @@ class _Reader:
 
 
 def _scalar(node: yaml.Node) -> str | Plain | None:
-    """A plain scalar as YAML reads it, except that 010 is ten, and that 1:30, 0x1F and 1_000 stay text."""
+    """The value of a scalar as YAML reads it, except that 010 is ten, and that 1:30, 0x1F and 1_000 stay texts."""
     text = str(node.value)
     if node.tag == _TAG + "null":
         return None

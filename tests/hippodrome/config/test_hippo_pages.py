@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import read_project
-from hippodrome.config.hippo_pages import LIMIT, hosts
+from hippodrome.config.hippo_pages import hosts
+from hippodrome.config.project_keys import MAX_HOSTS
 from tests.hippodrome.config.folder import SMALL, folder
 
 __all__ = ["folder"]
@@ -38,8 +39,8 @@ def test_what_a_page_loads_from_elsewhere(page: Path, html: str, found: tuple[st
 
 
 def test_pages_that_cannot_be_read_load_nothing_and_sites_are_bounded(page: Path) -> None:
-    page.write_text("".join(f'<img src="https://a{n}.example/">' for n in range(LIMIT + 1)))
-    assert len(hosts([page.with_name("gone.html"), page])) == LIMIT
+    page.write_text("".join(f'<img src="https://a{n}.example/">' for n in range(MAX_HOSTS + 1)))
+    assert len(hosts([page.with_name("gone.html"), page])) == MAX_HOSTS
 
 
 def write(folder: Path, pages: str, config: str = SMALL) -> Path:

@@ -107,11 +107,11 @@ def test_two_people_in_one_game(folder: Path) -> None:
         ),
         (
             "subdomain: userId\n", TWO,
-            "project.subdomain: a server is several participants', so it cannot be called after one: use subdomain: hash",
+            "project.subdomain: several participants share a server, so it cannot have the id of one as its name: use subdomain: hash",
         ),
         (
             "cluster: participant\n", TWO,
-            "project.cluster: a server is several participants', so no cluster is one participant's: use cluster: "
+            "project.cluster: several participants share a server, so it cannot run in the cluster of one: use cluster: "
             "installation",
         ),
     ],
@@ -190,8 +190,8 @@ def test_nothing_is_said_of_two_people_who_wait_play_and_leave(folder: Path) -> 
             "maxRuntime: 10\n", "episodeSeconds: 240\nbetweenEpisodes: 5\nmaxEpisodes: 3\n",
             "project.maxRuntime: 10 minutes: the server ends then, and 3 episodes of 240 seconds can take 13",
         ),
-        ("", "ui: {stop: true}\n", "trial.ui.stop: one participant who presses it ends the game for all of them"),
-        ("", "ui: {reset: true}\n", "trial.ui.reset: one participant who presses it ends the episode for all of them"),
+        ("", "ui: {stop: true}\n", "trial.ui.stop: one participant who presses it ends the game for all"),
+        ("", "ui: {reset: true}\n", "trial.ui.reset: one participant who presses it ends the episode for all"),
         (
             "", "pace: turns\n",
             "trial.turnSeconds: 0: a participant who does nothing keeps the others waiting without end; write "

@@ -126,7 +126,10 @@ def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
 def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
     begin(folder, "import trial.agent, protocol\nimport hippodrome.model.ids")
     (line,) = found(folder)
-    assert line == "agent.py:2: hippodrome is not in the servers' image; it is a part of Hippodrome that servers lack"
+    assert (
+        line
+        == "agent.py:2: hippodrome is not in the servers' image; it is a part of Hippodrome that servers do not have"
+    )
 
 
 @pytest.mark.parametrize(
