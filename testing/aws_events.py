@@ -1,7 +1,8 @@
-"""Events as AWS hands them to the functions: the only place where tests and benches build them.
+"""Builds the events that AWS passes to the functions, for all tests and benches.
 
-`load` reads a whole payload from `tests/events`, one file per event source; ids in them are made up. `http_event`, `queue_event`
-and `task_event` have only the keys that the functions read. `sqs_event` and `ecs_event` have all that AWS sends.
+`load` reads a whole payload from `tests/events`; the ids in these payloads are made up. The events of `http_event`,
+`queue_event` and `task_event` have only the keys that the functions read. Those of `sqs_event` and `ecs_event` have all
+keys that AWS sends.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ REASONS = {
 
 
 def load(name: str) -> Any:
-    """The payload in `tests/events/{name}.json`."""
+    """Return the payload in `tests/events/{name}.json`."""
     return json.loads((EVENTS / f"{name}.json").read_text())
 
 
@@ -45,7 +46,7 @@ def http_event(
     path: str = "/next",
     headers: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """A request as an HTTP API gives it to a function (payload format 2.0). A body of bytes comes as base64."""
+    """Return a request as an HTTP API passes it to a function (payload format 2.0). A body of bytes becomes base64."""
     event: dict[str, Any] = {
         "version": "2.0",
         "rawPath": path,
@@ -61,13 +62,13 @@ def http_event(
 
 
 def program_event(method: str, query: Mapping[str, str] | str, form: Mapping[str, str] | str = "") -> dict[str, Any]:
-    """The request of a program that sends forms and wants JSON."""
-    given, sent = (text if isinstance(text, str) else urlencode(text) for text in (query, form))
-    return http_event(method, given, sent, headers={"accept": JSON, "content-type": FORM, "host": "study.example.org"})
+    """Return the request of a program that sends a form and accepts JSON."""
+    query, form = (fields if isinstance(fields, str) else urlencode(fields) for fields in (query, form))
+    return http_event(method, query, form, headers={"accept": JSON, "content-type": FORM, "host": "study.example.org"})
 
 
 def queue_event(bodies: Sequence[Any], ids: Sequence[str] = ()) -> dict[str, Any]:
-    """A batch of messages; a body that is not text is written as JSON. `ids` are counted from 1 unless given."""
+    """Return a batch of messages of a queue. A body that is no text becomes JSON. The `ids` are 1, 2, … unless given."""
     texts = [body if isinstance(body, str) else json.dumps(body) for body in bodies]
     named = ids or [str(number) for number in range(1, len(texts) + 1)]
     return {"Records": [{"messageId": id, "body": text} for id, text in zip(named, texts, strict=True)]}
@@ -86,7 +87,11 @@ def task_event(
     exit_code: int | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """An "ECS Task State Change" event. `stop_code`, `reason` and `exit_code` are left out of events that do not have them."""
+    """Return an "ECS Task State Change" event; `last` and `desired` are the task's lastStatus and desiredStatus.
+
+    `stop_code`, `reason` and `exit_code` are only in events of tasks that end, as on ECS. `more` are further keys of
+    the detail.
+    """
     ended = last in ("DEPROVISIONING", "STOPPED")
     container: dict[str, Any] = {"name": "trial", "lastStatus": "STOPPED" if ended else "RUNNING"}
     if ended and exit_code is not None:
@@ -109,7 +114,7 @@ def task_event(
 
 
 def sqs_event(bodies: Sequence[Any], queue_arn: str, region: str) -> dict[str, Any]:
-    """What Lambda gets for these messages; a body that is not text is written as JSON."""
+    """Return the event that Lambda gets for these messages of an SQS queue. A body that is no text becomes JSON."""
     now = str(int(datetime.now(UTC).timestamp() * 1000))
     return {
         "Records": [
@@ -156,8 +161,11 @@ def ecs_event(
     time: datetime,
     ids: Iterator[str] | None = None,
 ) -> dict[str, Any]:
-    """An "ECS Task State Change" event for a Fargate task, as EventBridge delivers it (Amazon ECS Developer Guide, task
-    state change events, and events of real tasks). Containers and attachments carry no public address."""
+    """Return an "ECS Task State Change" event of a Fargate task with all its keys, as EventBridge delivers it.
+
+    Source: Amazon ECS Developer Guide, task state change events, and events of real tasks. Containers and attachments
+    have no public address. `ids` gives the ids of attachment, container and event; without it they are random.
+    """
     fresh = ids or iter(lambda: str(uuid.uuid4()), "")
     attachment, container, event_id = next(fresh), next(fresh), next(fresh)
     at = LIFE.index(status)
@@ -247,5 +255,5 @@ def _stamp(time: datetime) -> str:
 
 
 def last(arn: str) -> str:
-    """The part of an ARN after its last slash."""
+    """Return the part of an ARN, URL or path after its last slash."""
     return arn.rpartition("/")[2]

@@ -1,14 +1,16 @@
-"""Faults of AWS as botocore meets them: in the answers to single HTTP requests of the functions, one call at a time.
+"""Faults of AWS in the HTTP answers that botocore receives, at one call of the functions at a time.
 
-Everything is injected *below* botocore, where moto stands in for the network: the bodies are those of each service's own
-protocol, and botocore parses them, decides what to try again, and gives up, as it does on AWS. How far a fault reaches
-says what the functions see of it:
+Faults are injected *below* botocore, where moto takes the place of the network. The bodies have the form of each
+service's own protocol, so botocore parses them, decides whether to try again, and gives up, as it does on AWS. A fault
+has one of these reaches:
 
-* `Reach.ATTEMPT`: one bad attempt. What botocore tries again by itself (at most 3 attempts), the functions should not notice.
-* `Reach.CALL`: every attempt of one call. botocore gives up, and the port meets the error.
-* `Reach.SPELL`: every call of the operation until the invocation ends; for what the ports try again themselves.
+* `Reach.ATTEMPT`: one attempt of a call fails. Where botocore tries again by itself (at most 3 attempts), the functions
+  should not notice the fault.
+* `Reach.CALL`: every attempt of one call fails. botocore gives up, and the port gets the error.
+* `Reach.SPELL`: every call of the operation fails until the invocation ends; for errors after which the ports try again
+  themselves.
 
-Nothing sleeps: the pauses of botocore and of the ports are added up in `AwsFaultInjector.waited`, each wait at its longest.
+Nothing sleeps: `AwsFaultInjector.waited` adds up the pauses of botocore and of the ports, each at its longest.
 """
 
 from __future__ import annotations
@@ -38,15 +40,15 @@ class FaultKind(StrEnum):
 
     THROTTLED = "throttled"  # in the service's own words
     INTERNAL = "internal error"  # 500, and nothing was done
-    NOT_NOW = "not now"  # what only this operation says, see `NOT_NOW`
+    NOT_NOW = "not now"  # the error of `NOT_NOW` that is particular to the operation
     CONNECT = "connect timeout"  # nothing was done
-    CLOSED = "connection closed"  # of a connection that was kept; nothing was done
-    READ = "reply lost"  # read timeout: it was done, and the caller cannot know
-    BROKEN = "body breaks off"  # of a document that is read
+    CLOSED = "connection closed"  # a kept connection was closed; nothing was done
+    READ = "reply lost"  # read timeout: the call was carried out, but the caller cannot know
+    BROKEN = "body breaks off"  # the body of a document that is read
 
 
 class Reach(StrEnum):
-    """How long it goes wrong, see above."""
+    """How long a fault lasts; the module's docstring says what each value means."""
 
     ATTEMPT = "one attempt"
     CALL = "the call"
@@ -54,7 +56,7 @@ class Reach(StrEnum):
 
 
 class AwsFault(NamedTuple):
-    """The `number`-th call of the functions (from 1) goes wrong."""
+    """A fault of the `number`-th call of the functions, counted from 1."""
 
     number: int
     kind: FaultKind
@@ -62,7 +64,7 @@ class AwsFault(NamedTuple):
 
 
 class MadeCall(NamedTuple):
-    """A call: which function made it, and what it was, as `service:Operation`."""
+    """A call: the function that made it, and the action, as `service:Operation`."""
 
     function: str
     action: str
@@ -76,7 +78,8 @@ class Error(NamedTuple):
     message: str
 
 
-# Each service's own way (API references of the services, their common errors; retry codes of botocore 1.44).
+# The error with which each service throttles (API references of the services, their common errors; retry codes of
+# botocore 1.44).
 THROTTLED = {
     "s3": Error(503, "SlowDown", "Please reduce your request rate."),
     "ecs": Error(400, "ThrottlingException", "Rate exceeded"),
@@ -100,14 +103,14 @@ _CHANGING = "The schedule is being changed or deleted."
 NOT_NOW: dict[str, Error | dict[str, Any]] = {
     "s3:PutObject": Error(409, "ConditionalRequestConflict", "A conflicting conditional operation is under way."),
     "route53:ChangeResourceRecordSets": Error(400, "PriorRequestNotComplete", _PRIOR),
-    # Throttling of EC2, in ECS's clothes.
+    # EC2 throttles, and ECS reports that with an error code of its own.
     "ecs:RunTask": Error(400, "InvalidParameterException", "Error retrieving subnet information: Request limit exceeded."),
     "ecs:DeleteCluster": Error(400, "ClusterContainsTasksException", "The Cluster cannot be deleted yet."),
-    "scheduler:CreateSchedule": Error(409, "ConflictException", _CHANGING),  # there is none: so an update finds nothing
+    "scheduler:CreateSchedule": Error(409, "ConflictException", _CHANGING),  # an update finds no such schedule
     "scheduler:DeleteSchedule": Error(409, "ConflictException", _CHANGING),
-    # An interface that EC2 does not know yet. {interface} is filled in.
+    # EC2 does not know the interface yet. {interface} is filled in.
     "ec2:DescribeNetworkInterfaces": Error(400, "InvalidNetworkInterfaceID.NotFound", "The ID '{interface}' does not exist"),
-    # Gap: moto's lists are never behind. On ECS they may be; here they then say nothing of a task run a moment ago.
+    # Gap: moto's lists are always up to date. On ECS they may be late; here the list then lacks a task that was just run.
     "ecs:ListTasks": {"taskArns": []},
 }  # fmt: skip
 
@@ -115,7 +118,7 @@ SOLD_OUT = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at thi
 
 
 def kinds(action: str) -> list[FaultKind]:
-    """What can go wrong with a call of `service:Operation`."""
+    """Return the kinds of faults that a call of this action, `service:Operation`, can have."""
     return [
         FaultKind.THROTTLED,
         FaultKind.INTERNAL,
@@ -127,7 +130,7 @@ def kinds(action: str) -> list[FaultKind]:
     ]
 
 
-# What the ports try again themselves, beyond botocore: documents.py, dns.py, timers.py.
+# Errors after which the ports try again themselves, after botocore has given up: documents.py, dns.py, timers.py.
 PATIENT = {
     ("s3:PutObject", FaultKind.NOT_NOW),
     ("route53:ChangeResourceRecordSets", FaultKind.NOT_NOW),
@@ -137,55 +140,56 @@ PATIENT = {
 
 
 def reaches(action: str, kind: FaultKind) -> list[Reach]:
-    """How far it can reach. botocore retries neither a body nor an error that it does not count as transient."""
+    """Return the reaches that such a fault can have. botocore retries no body, and no error that it takes as final."""
     single = kind is FaultKind.BROKEN or (kind is FaultKind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
     spell = [Reach.SPELL] if (action, kind) in PATIENT else []
     return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
 
 
 def invisible(fault: AwsFault, made: MadeCall) -> bool:
-    """Whether botocore alone should hide the fault from the functions.
+    """Return whether botocore alone should hide the fault from the functions.
 
-    It cannot hide the lost reply of a conditional write: S3 answers the second attempt with 412, as to a slower writer.
-    The outcome must still be right, but a message may come again.
+    botocore cannot hide the lost reply of a conditional write: S3 answers the second attempt with 412, as if another
+    writer had been faster. The outcome must still be right, but a message may come again.
     """
     again = fault.kind is FaultKind.READ and made.action == "s3:PutObject"
     return fault.reach is Reach.ATTEMPT and fault.kind not in (FaultKind.NOT_NOW, FaultKind.BROKEN) and not again
 
 
 class AwsFaultInjector:
-    """Counts the calls of one botocore session, and injects `fault` into its call."""
+    """Counts the calls of one botocore session, and injects `fault` into the call that it names."""
 
     def __init__(self) -> None:
-        """Make it while a `MotoWorld` is open."""
+        """To be made while a `MotoWorld` is open."""
         self.session = botocore.session.get_session()
         self.session.register("before-call", self._before_call)
         self.session.register("after-call", self._after_call)
         self.session.register("after-call-error", self._after_call)
-        self.spot = True  # False: there is no room on Spot
+        self.spot = True  # False: ECS has no capacity on Fargate Spot
         self.begin(None)
 
     def begin(self, fault: AwsFault | None) -> None:
         """Count from 1 again, with this fault."""
         self.fault = fault
         self.calls: list[MadeCall] = []  # so far
-        self.struck = 0  # HTTP requests that went wrong
-        self.waited = 0.0  # seconds: timeouts and pauses since `invocation`
+        self.struck = 0  # HTTP requests that the fault has changed
+        self.waited = 0.0  # seconds of timeouts and pauses since `invocation`
         self._action = ""  # of the call under way
         self._attempts = 0
         self._function = self._spell = ""
         self._config: Any = None
 
     def invocation(self, function: str) -> None:
-        """A function begins: spells are over, and nothing has been waited for."""
+        """Begin an invocation of this function: a spell is over, and `waited` is 0 again."""
         self._function, self._spell, self.waited = function, "", 0.0
 
     def wait(self, seconds: float) -> None:
+        """Count a pause instead of sleeping."""
         self.waited += seconds
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
-        """Stand between botocore and moto within the block."""
+        """Inject the fault, and count pauses instead of sleeping, within the block."""
         serve, delay = BotocoreStubber.__call__, standard.ExponentialBackoff.delay_amount
 
         def served(stubber: Any, event_name: str, request: Any, **kwargs: Any) -> Any:
@@ -202,7 +206,7 @@ class AwsFaultInjector:
             for patch in (
                 mock.patch.object(BotocoreStubber, "__call__", served),
                 mock.patch.object(standard.ExponentialBackoff, "delay_amount", at_once),
-                # Clients live through hundreds of runs here, each of which stands for a function's first trouble.
+                # Clients outlive hundreds of runs here; in each run a client must have its full quota of retries.
                 mock.patch.object(quota.RetryQuota, "acquire", return_value=True),
                 mock.patch.object(
                     dns,
@@ -225,7 +229,7 @@ class AwsFaultInjector:
         self._action = ""
 
     def _due(self) -> bool:
-        """Whether the present attempt goes wrong."""
+        """Return whether the fault strikes the present attempt."""
         fault, number = self.fault, len(self.calls)
         if fault is None or not self._action:
             return False
@@ -270,7 +274,7 @@ class AwsFaultInjector:
         return self._answer(request, answer._replace(message=answer.message.format(interface=found and found[0])))
 
     def _answer(self, request: Any, error: Error) -> Any:
-        """The error in the words of the service's protocol."""
+        """Return the error in the form of the service's protocol."""
         plain = f"<Code>{error.code}</Code><Message>{error.message}</Message>"
         headers = {"x-amzn-RequestId": "made-up"}
         if self._action.startswith("s3:"):
@@ -295,7 +299,7 @@ def _response(request: Any, status: int, headers: dict[str, str], body: str) -> 
 
 
 def _cut(whole: AWSResponse) -> AWSResponse:
-    """The same answer without the second half of its body."""
+    """Return the answer without the second half of its body."""
     body = whole.raw.read()
     headers = {**whole.headers, "content-length": str(len(body))}
     return AWSResponse(whole.url, whole.status_code, headers, MockRawResponse(body[: len(body) // 2]))

@@ -1,4 +1,4 @@
-"""The game page in a real Chromium, with a trial server behind it and without a control plane. Loopback only."""
+"""Shows the game page in a real Chromium, with a trial server but without a control plane. Everything is on loopback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hippodrome.model.project import Project, Step
 from hippodrome.participants import pages
 
 NO_CHROMIUM = "there is no Chromium on this machine; to measure this row: apt-get install chromium"
-# What Playwright 1.65 switches off itself: of two lists Chromium takes the last.
+# The features that Playwright 1.65 itself disables. Chromium takes only the last of two lists, so ours repeats them.
 PLAYWRIGHT_OFF = (
     "AvoidUnnecessaryBeforeUnloadCheckSync",
     "DestroyProfileOnBrowserClose",
@@ -34,8 +34,8 @@ PLAYWRIGHT_OFF = (
     "msForceBrowserSignIn",
     "msEdgeUpdateLaunchServicesPreferredVersion",
 )
-# Two pages of the browser's own in each new window, below its address bar, took twice as long as the window's page; and a
-# process for a page that may be opened next.
+# Two pages of the browser's own below the address bar, which took twice as long to load as the page of each new window;
+# and a process that is started ahead for the next page.
 OFF = ("WebUIOmniboxPopup", "WebUIOmniboxAimPopup", "SpareRendererForSitePerProcess")
 ARGUMENTS = (
     "--no-sandbox",
@@ -50,11 +50,11 @@ ARGUMENTS = (
 
 
 class NoChromium(Exception):
-    """There is no browser to measure in; the message says how to install one."""
+    """There is no Chromium on this machine; the message says how to install it."""
 
 
 def chromium_path() -> str:
-    """Where Debian's Chromium is. Raises NoChromium."""
+    """Return the path of Chromium: where Debian installs it, or else from PATH. Raises NoChromium."""
     path = "/usr/bin/chromium" if Path("/usr/bin/chromium").exists() else shutil.which("chromium")
     if path is None:
         raise NoChromium(NO_CHROMIUM)
@@ -63,7 +63,7 @@ def chromium_path() -> str:
 
 @contextlib.contextmanager
 def chromium() -> Iterator[Any]:
-    """A Chromium without window, as Playwright's Browser. Raises NoChromium."""
+    """Run Chromium without a window within the block, as a Browser of Playwright. Raises NoChromium."""
     path = chromium_path()
     from playwright.sync_api import sync_playwright
 
@@ -79,9 +79,9 @@ def chromium() -> Iterator[Any]:
 def game_page(
     url: str, *, user: str, token: str, step: str = "1", trial: Mapping[str, Any] | None = None, players: int = 1
 ) -> Iterator[str]:
-    """The address of Hippodrome's own game page, for the trial server at `url` of a project with this `trial`.
+    """Serve the game page for the trial server at `url` within the block; give the page's address.
 
-    With `players` more than 1, `user` is a member of a full session.
+    `trial` is the section of the project. With `players` more than 1, `user` is a member of a full session.
     """
     state = {"state": "ready", "seconds": 0, "attempt": 1, "url": url, "userId": user, "token": token}
     if players > 1:
@@ -96,7 +96,7 @@ def game_page(
 
 @contextlib.contextmanager
 def html_page(html: str, headers: dict[str, str] | None = None, answers: dict[str, str] | None = None) -> Iterator[str]:
-    """The address of a page, and of JSON answers at other paths beside it."""
+    """Serve this page within the block; give its address. `answers` are JSON documents by the paths that have them."""
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:

@@ -1,4 +1,7 @@
-"""Certificate authorities for tests and benches, with all that RFC 5280 asks for: from 3.13 on, Python's clients check it."""
+"""Certificate authorities for tests and benches.
+
+Their certificates have all extensions that RFC 5280 asks for, since Python's clients check them from version 3.13 on.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from local.backend.authority import SIGNS_CERTIFICATES, general_name
 
-_AGO = timedelta(hours=1)  # since when all of them are valid
+_AGO = timedelta(hours=1)  # all certificates have been valid for so long
 
 
 class CertificateAndKey(NamedTuple):
-    """A certificate and its key, both PEM."""
+    """A certificate and its private key, both as PEM."""
 
     certificate: bytes
     key: bytes
@@ -24,14 +27,14 @@ class CertificateAndKey(NamedTuple):
 
 @dataclass(frozen=True)
 class SigningAuthority:
-    """Who signs. Its certificate, PEM, is what clients trust."""
+    """A certificate authority. `certificate` is its own certificate as PEM, which clients trust."""
 
     certificate: bytes
     _name: x509.Name
     _key: ec.EllipticCurvePrivateKey
 
     def issue(self, *names: str, serial: int | None = None, days: float = 60) -> CertificateAndKey:
-        """A certificate for these names and addresses."""
+        """Issue a certificate for these names and IP addresses, valid for so many days, with a new key."""
         key = ec.generate_private_key(ec.SECP256R1())
         made = _builder(_named(names[0]), key.public_key(), days, serial).issuer_name(self._name)
         made = made.add_extension(x509.SubjectAlternativeName([general_name(name) for name in names]), critical=False)
@@ -45,7 +48,7 @@ class SigningAuthority:
 
 
 def authority(name: str = "Test authority", days: float = 60) -> SigningAuthority:
-    """A new authority."""
+    """Make a new authority with this common name, valid for so many days."""
     key, own = ec.generate_private_key(ec.SECP256R1()), _named(name)
     made = _builder(own, key.public_key(), days).issuer_name(own)
     made = made.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)

@@ -1,4 +1,4 @@
-"""One clock for everything that is simulated: seconds pass only from one thing that is due to the next."""
+"""The clock of all simulations: it goes from one call that is due to the next, and no real time passes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EPOCH = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
 
 
 class Clock:
-    """Seconds since the beginning, and what is due when. What is due at the same second happens in the order of the calls."""
+    """The seconds since the beginning, and the calls that are due. Calls of one second are made in the order of `after`."""
 
     def __init__(self, began: datetime = EPOCH) -> None:
         self.seconds = 0.0
@@ -21,10 +21,11 @@ class Clock:
         self._numbers = itertools.count()
 
     def now(self) -> datetime:
-        """The time as the platform tells it."""
+        """Return the date and time, as a platform's `now` does."""
         return self._began + timedelta(seconds=self.seconds)
 
     def seconds_at(self, moment: datetime) -> float:
+        """Return the seconds from the beginning to this moment."""
         return (moment - self._began).total_seconds()
 
     def after(self, seconds: float, act: Callable[[], object]) -> None:
@@ -32,19 +33,19 @@ class Clock:
         heapq.heappush(self._due, (self.seconds + max(seconds, 0.0), next(self._numbers), act))
 
     def next(self) -> float:
-        """The second of the next thing that is due; infinite if nothing is."""
+        """Return the second of the next call that is due; infinity if none is."""
         return self._due[0][0] if self._due else math.inf
 
     def step(self) -> None:
-        """Go to the next thing that is due and do it."""
+        """Go to the next call that is due, and make it."""
         self.seconds, _, act = heapq.heappop(self._due)
         act()
 
     def forget(self) -> None:
-        """Nothing is due any more."""
+        """Drop all calls that are due."""
         self._due.clear()
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is due."""
+        """Whether no call is due."""
         return not self._due

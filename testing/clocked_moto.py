@@ -1,8 +1,8 @@
-"""An installation on moto where time passes: queues deliver again, tasks start and end, timers fire, the sweep comes.
+"""An installation on moto where time passes: queues deliver again, tasks start and end, timers fire, the sweep runs.
 
-The functions are the real handlers on the real adapters, each with a platform of its own, judged by its role (see
-`testing/iam/enforcement.py`). What AWS does between them happens here, on a clock that jumps from one event to the next, always
-in the same order, so that the n-th call of a journey is the same call whenever it is run again.
+The functions are the real handlers on the real adapters. Each has a platform of its own, and its calls are judged by
+its role (see `testing/iam/enforcement.py`). This module does what AWS does between them, on a clock that jumps from one
+event to the next, always in the same order, so that the n-th call of a journey is the same call in every run.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ RECEIVES = 8  # deliveries until a message is a dead letter; `maxReceiveCount`
 SWEEP_EVERY = 300.0  # seconds
 STARTS = 25.0  # seconds from RunTask to RUNNING
 ENDS = 4.0  # seconds from StopTask until the containers have ended: DEPROVISIONING
-GONE = 15.0  # seconds from then until the network interface is gone: STOPPED
+GONE = 15.0  # seconds from DEPROVISIONING until the network interface is gone: STOPPED
 HORIZON = 4 * 3600.0  # seconds until everything must be over
 
 
 class ClockedPlatform(AwsPlatform):
-    """The adapters with the installation's clock. All functions share the clients, which cost more than a journey to make."""
+    """The AWS adapters with the installation's clock. Functions share clients: making some takes longer than a journey."""
 
     def __init__(self, env: Any, clock: Clock, session: Any, clients: dict[str, Any]) -> None:
         super().__init__(env, session)
@@ -89,12 +89,12 @@ class ClockedPlatform(AwsPlatform):
         return self._clock.now()
 
     def run_all(self, acts: Any) -> Any:
-        """One after the other: the n-th call must be the same in every run."""
+        """Run them one after the other, so that the n-th call is the same in every run."""
         return [act() for act in acts]
 
 
 def outputs(world: MotoWorld) -> dict[str, str]:
-    """Those of the stack that erasing needs, in this account."""
+    """Return the stack outputs that `erase` needs, with the values of this account."""
     names = {
         "Bucket": "BUCKET", "Cluster": "CLUSTER", "ScheduleGroup": "SCHEDULE_GROUP", "HostedZoneId": "HOSTED_ZONE_ID",
     }  # fmt: skip
@@ -102,7 +102,7 @@ def outputs(world: MotoWorld) -> dict[str, str]:
 
 
 class Mail(NamedTuple):
-    """A message that waits in a queue."""
+    """A message in a queue: the second at which it becomes visible, and how often it was received before."""
 
     at: float
     body: str
@@ -110,7 +110,7 @@ class Mail(NamedTuple):
 
 
 class TimedInstallation:
-    """The installation. `begin` starts a run; `live` lets time pass until nothing more can happen."""
+    """The installation. `begin` starts a run; `live` lets time pass until nothing is left that could still happen."""
 
     def __init__(self) -> None:
         self.clock = Clock(datetime.now(UTC).replace(microsecond=0))
@@ -136,7 +136,7 @@ class TimedInstallation:
             world.iam.exists = lambda bucket, key: key in self._keys  # type: ignore[method-assign]  # without a call
         self._account = Account(self.injector.session, world.region)
         self._installation = Installation("hippodrome", world.region, "CREATE_COMPLETE", outputs(world))
-        assert self._account.id  # asked for now, and not in some run
+        assert self._account.id  # looked up now, so that no run makes this call
         platform = self._platform(world.env)
         self._stack.enter_context(mock.patch.object(self._account, "platform", return_value=platform))
         self._pages = self._contents()
@@ -155,7 +155,7 @@ class TimedInstallation:
         return iam.environment(function) if iam else self.world.env
 
     def hold_study(self, **changes: Any) -> None:
-        """Register the example study with these changes; what was there before is forgotten."""
+        """Register the example study with these changes of its registration, and forget the study before it."""
         self._s3_before = self._pages
         self.begin()
         self.registration = {**read_project(ROOT).registration(), **changes}
@@ -168,7 +168,7 @@ class TimedInstallation:
     # A run
 
     def begin(self, fault: AwsFault | None = None) -> None:
-        """Forget the last run: its people, tasks, documents; and start another one with cold functions."""
+        """Start a new run with this fault and cold functions, without participants, tasks and documents of the last one."""
         now = self._contents()
         for key in now.keys() - self._s3_before.keys():
             self._keys.pop(key)
@@ -200,28 +200,28 @@ class TimedInstallation:
         self.waiting: dict[str, list[Mail]] = {queue: [] for queue in QUEUES}
         self.dead: list[str] = []
         self.people: list[Any] = []
-        self.kept: dict[str, dict[str, Any]] = {}  # by key, answers that a participant was told are kept
-        self.begun: dict[str, float] = {}  # tasks, and when they were run
+        self.promised: dict[str, dict[str, Any]] = {}  # by key: the answers that a participant was told are stored
+        self.begun: dict[str, float] = {}  # by task: the second of its RunTask
         self.running: set[str] = set()
         self.ended: set[str] = set()
-        self.failures: list[str] = []  # what failed in the open: messages that came again, pages that did not come
-        self.too_long: list[str] = []
-        self.hold: dict[str, float] = {}  # seconds that messages to a queue take longer
-        self.sweeps_from = 0.0  # the sweep does not come before
-        self.ran: Callable[[str], None] = lambda task: None  # told of every task that runs
-        for _, made in self._rooms.values():
-            made.clear()
+        self.failures: list[str] = []  # visible failures: messages that came again, pages that did not come
+        self.too_long: list[str] = []  # invocations beyond the timeout of their function
+        self.delays: dict[str, float] = {}  # by queue: additional seconds until a message is visible
+        self.sweeps_from = 0.0  # the sweep does not run before this second
+        self.on_running: Callable[[str], None] = lambda task: None  # called with each task that has started
+        for _, cache in self._rooms.values():
+            cache.clear()
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     def live(self) -> None:
-        """Let time pass until all is over, or until everything should have been."""
+        """Let time pass until no participant and no resource is left, but for HORIZON seconds at most."""
         end = self.clock.seconds + HORIZON
         self._collect()
         while not self._quiet() and self.clock.seconds < end:
             self._step()
 
     def live_for(self, seconds: float) -> None:
-        """Let this much time pass."""
+        """Let so many seconds pass."""
         done: list[int] = []
         self.clock.after(seconds, lambda: done.append(1))
         while not done:
@@ -241,7 +241,7 @@ class TimedInstallation:
         return not (self.people or any(self.left().values()) or self.begun.keys() - self.ended)
 
     def left(self) -> dict[str, int]:
-        """What is still there, or on its way."""
+        """Count what is left of each kind: resources, records, messages that wait."""
         records = [self.stored(key) for key in list(self._keys) if key.startswith("_servers/")]
         places = [self.stored(key) for key in list(self._keys) if key.startswith("_places/")]
         return {
@@ -256,11 +256,11 @@ class TimedInstallation:
         }
 
     def lost(self) -> list[str]:
-        """Answers that were said to be kept and are not, or are others now."""
-        return [key for key, answers in self.kept.items() if (self.stored(key) or {}).get("answers") != answers]
+        """Return the keys of answers that a participant was told are stored, and that are missing or differ now."""
+        return [key for key, answers in self.promised.items() if (self.stored(key) or {}).get("answers") != answers]
 
     def go_on(self, walk: Iterator[float]) -> None:
-        """Run a participant's walk; it yields the seconds until its next step."""
+        """Start a participant's walk: a generator that yields the seconds until its next step."""
         self.people.append(walk)
 
         def step() -> None:
@@ -274,7 +274,7 @@ class TimedInstallation:
     # Functions
 
     def invoke(self, function: str, event: dict[str, Any]) -> Any:
-        """One invocation, in the function's own room."""
+        """Invoke a function with its own platform and cache; return its answer. Raises what the handler raises."""
         self.injector.invocation(function)
         installed._platform, installed._made = self._rooms[function]
         try:
@@ -287,7 +287,7 @@ class TimedInstallation:
         return answer
 
     def ask(self, function: str, method: str, query: dict[str, str], form: dict[str, str] | None = None) -> Any:
-        """One request as a program makes it; the JSON of the answer, or None where there was an error."""
+        """Send a request as a program does. Return its JSON with its `status`; None for a status of 500 or more."""
         answer = self.invoke(function, aws_events.program_event(method, query, form or {}))
         if answer["statusCode"] >= 500:
             self.failures.append(f"{function} answered {answer['statusCode']}")
@@ -300,22 +300,22 @@ class TimedInstallation:
             return
         try:
             swept = self.invoke("sweep", {})
-        except Exception as error:  # noqa: BLE001 - Lambda does not try again, the next sweep does
+        except Exception as error:  # noqa: BLE001 - Lambda does not try again, but the next sweep comes
             self.failures.append(f"the sweep failed: {type(error).__name__}")
         else:
             if swept["failed"]:
-                self.failures.append("the sweep could not do all")
+                self.failures.append("the sweep could not finish everything")
 
     # Queues
 
     def publish(self, topic: str, message: dict[str, Any]) -> None:
-        """A message of an administrator."""
+        """Publish a message to the topic, as an administrator may."""
         arn = self.world.env[f"{topic.upper()}_SERVER_TOPIC_ARN"]
         self.world.client("sns").publish(TopicArn=arn, Message=json.dumps(message))
         self._collect()
 
     def _send(self, queue: str, body: str, delay: float, receives: int = 0) -> None:
-        seconds = math.ceil(delay + HOP + self.hold.get(queue, 0))  # what comes in the same second is one batch
+        seconds = math.ceil(delay + HOP + self.delays.get(queue, 0))  # messages of the same second are one batch
         self.waiting[queue].append(Mail(self.clock.seconds + seconds, body, receives))
         self.clock.after(seconds, partial(self._deliver, queue))
 
@@ -337,7 +337,7 @@ class TimedInstallation:
                     self._send(queue, mail.body, AGAIN, mail.receives + 1)
 
     def _collect(self) -> None:
-        """What the functions' calls have set going."""
+        """Take up what the functions' calls have caused: messages that were sent, tasks that were run or stopped."""
         for name, url in (("start", "start_queue"), ("stop", "stop_queue"), ("task", "task_queue")):
             messages = self._queues[self.world.ids[url].rpartition("/")[2]]._messages
             for message in messages:
@@ -356,7 +356,7 @@ class TimedInstallation:
     # The administrator
 
     def erase(self, project: str, user: str) -> FoundOfParticipant:
-        """What `deploy erase` does; time passes while it waits. What the last look found."""
+        """Do what `deploy erase` does; time passes while it waits. Return what its last look found."""
         self.injector.invocation("erase")
         eraser = Eraser(
             self._account,
@@ -370,10 +370,11 @@ class TimedInstallation:
     # Tasks
 
     def living(self) -> list[str]:
+        """Return the ARNs of the tasks that are not STOPPED."""
         return [arn for arn in self.world.task_arns() if self.world.task(arn).last_status != "STOPPED"]
 
     def task_with(self, token: str) -> str | None:
-        """The living task whose trial has this token."""
+        """Return the running task whose trial has this token; None if there is none."""
         for arn in self.world.task_arns():
             environment = self.world.task(arn).overrides["containerOverrides"][0]["environment"]
             if {"name": "TOKEN", "value": token} in environment and arn not in self.ended and arn in self.running:
@@ -381,7 +382,7 @@ class TimedInstallation:
         return None
 
     def end(self, arn: str, stop_code: str = "EssentialContainerExited", exit_code: int | None = 0) -> None:
-        """The task ends without anybody asking."""
+        """Let a task end that no function has stopped."""
         if arn not in self.ended:
             self.ended.add(arn)
             self._tell_end(arn, stop_code=stop_code, exit_code=exit_code)
@@ -390,22 +391,23 @@ class TimedInstallation:
         if arn not in self.ended:
             self.running.add(arn)
             self._tell(arn, "RUNNING")
-            self.ran(arn)
+            self.on_running(arn)
 
     def _tell_end(self, arn: str, **more: Any) -> None:
-        """Twice, as ECS does."""
+        """Send the events DEPROVISIONING and, `GONE` seconds later, STOPPED, as ECS does."""
         self._tell(arn, "DEPROVISIONING", desired="STOPPED", **more)
         self.clock.after(GONE, lambda: self._tell(arn, "STOPPED", desired="STOPPED", **more))
 
     def _tell(self, arn: str, status: str, **more: Any) -> None:
         self._send("task", json.dumps(self.world.task_event(arn, status, **more)), 0)
 
-    # Documents, as others see them
+    # Documents
 
     def put(self, key: str, body: bytes) -> None:
         self.world.client("s3").put_object(Bucket=self.world.env["BUCKET"], Key=key, Body=body)
 
     def stored(self, key: str) -> Any:
+        """Return the JSON of a document; None if there is none."""
         found = self._keys.get(key)
         return json.loads(found.value) if found else None
 
@@ -413,16 +415,18 @@ class TimedInstallation:
         return {key: found.value for key, found in self._keys.items()}
 
     def stored_keys(self) -> list[str]:
+        """Return the keys of all documents."""
         return list(self._keys)
 
     def token(self, user: str) -> str:
-        """What opens the participant's server."""
+        """Return the token of the participant's server."""
         return derived.token(self._keys[SECRET].value, self.record(user))
 
     def record(self, user: str) -> Any:
+        """Return the record of the participant's server; None if there is none."""
         return self.stored(server.key(ids.server_label(PROJECT, user)))
 
-    # moto's own
+    # moto's own objects
 
     @property
     def _keys(self) -> Any:
@@ -446,10 +450,13 @@ class TimedInstallation:
 
 
 class VisitorOnMoto:
-    """A participant: reads, answers, waits, plays, comes back after trouble. Ends `finished`, or `told` how things are."""
+    """A participant who reads, answers, waits and plays, and who comes back after a fault.
 
-    READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; the last at an address where no server answers
-    TRIES, PATIENCE = 5, 1800  # of a page; seconds at the waiting page
+    At the end `finished` is true, or `told` is the reason why the study was over for them.
+    """
+
+    READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; UNREACHABLE: at an address where no server answers
+    TRIES, PATIENCE = 5, 1800  # requests of one page; seconds at the waiting page
 
     def __init__(
         self,
@@ -460,9 +467,10 @@ class VisitorOnMoto:
         leaves: bool = False,
         comes: float = 0,
     ) -> None:
-        """`at_game`: has answered all before the game, and the start message has just gone out; finishes after it.
+        """`at_game`: they begin at the game, with all answers before it stored and the start message just sent.
 
-        `leaves`: closes the page of the game for good. `comes`: only after so many seconds.
+        With `at_game` they have finished after the game. `leaves`: they close the page of the game for good. `comes`:
+        they come after so many seconds.
         """
         self.installation, self.user, self.leaves = installation, user, leaves
         self.goal = AFTER if at_game else FINAL
@@ -473,6 +481,7 @@ class VisitorOnMoto:
 
     @property
     def served_or_told(self) -> bool:
+        """Whether they have finished, or were told why they cannot."""
         return self.finished or bool(self.told)
 
     def _has_come_to_the_game(self) -> None:
@@ -484,10 +493,11 @@ class VisitorOnMoto:
                 break
             record = participant.new_answer(project, self.user, step, {"said": "before"}, self.installation.clock.now())
             self.installation.put(self._answer(step.key), msgspec.json.encode(record))
-            self.installation.kept[self._answer(step.key)] = {"said": "before"}
+            self.installation.promised[self._answer(step.key)] = {"said": "before"}
         self.installation.publish("start", {"projectId": PROJECT, "userId": self.user})
 
     def walk(self) -> Iterator[float]:
+        """Take part, from the link to the end; yield the seconds until each next step."""
         page = yield from self.ask("GET")
         while page and not self.served_or_told:
             if "state" in page:
@@ -508,10 +518,10 @@ class VisitorOnMoto:
                 form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], **said}
                 page = yield from self.ask("POST", form)
                 if page and page.get("step") != step:
-                    self.installation.kept[self._answer(step)] = said
+                    self.installation.promised[self._answer(step)] = said
 
     def ask(self, method: str, form: dict[str, str] | None = None, **more: str) -> Generator[float, None, Any]:
-        """A page; without one the participant tries again after a moment, and gives up after `TRIES`."""
+        """Request a page, up to `TRIES` times, 4 seconds apart; return its JSON, or None if none came."""
         for _ in range(self.TRIES):
             query = {"projectId": PROJECT, "userId": self.user, **more}
             if (page := self.installation.ask("next_step", method, query, form)) is not None:
@@ -532,7 +542,7 @@ class VisitorOnMoto:
                     score = {"score": 120}
                     body = json.dumps({"step": GAME, "answers": score}).encode()
                     self.installation.put(self._answer(GAME), body)
-                    self.installation.kept[self._answer(GAME)] = score
+                    self.installation.promised[self._answer(GAME)] = score
                     return
             elif state["state"] in ("failed", "ended"):
                 if not state["again"] or restarts == 2:

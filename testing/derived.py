@@ -1,4 +1,4 @@
-"""Derives tokens and project secrets from stored documents, for tests that have only those."""
+"""Tokens and project secrets computed from stored documents, for tests that have only those documents."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from hippodrome.model.server import Server
 from hippodrome.storage.secret import Secret
 
 
-def project_secret(kept: bytes, project: Mapping[str, Any]) -> str:
-    """The secret that signs this project's tickets. `kept` is `_secret.json`, `project` an entry of the master list."""
-    return from_json(kept, Secret).project_secret(from_data(project, Project))
+def project_secret(secret: bytes, project: Mapping[str, Any]) -> str:
+    """Return the secret that signs a project's tickets. `secret` is `_secret.json`, `project` a master list's entry."""
+    return from_json(secret, Secret).project_secret(from_data(project, Project))
 
 
-def token(kept: bytes, record: Mapping[str, Any]) -> str:
-    """The token of the server of this record. `kept` is `_secret.json`."""
-    return from_json(kept, Secret).token(from_json(json.dumps(record).encode(), Server))
+def token(secret: bytes, record: Mapping[str, Any]) -> str:
+    """Return the token of the server with this record. `secret` is `_secret.json`."""
+    return from_json(secret, Secret).token(from_json(json.dumps(record).encode(), Server))

@@ -1,11 +1,11 @@
-"""How far the tests explore: `make test` a sample that is always the same, `make hunt` everything, and other examples.
+"""How much the tests explore: `make test` always takes the same sample, `make hunt` all cases and new examples.
 
-`make test` runs each exploration on a sample and each property on the same few examples, so that the same commit gets the
-same verdict within minutes. `make hunt` (the environment variable HUNT) runs only
+`make test` runs each exploration on a sample, and each property on the same few examples, so that the same commit gets
+the same verdict within minutes. `make hunt` sets the environment variable HUNT, and runs only
 
-* tests marked `hunt`, which `make test` leaves out,
-* tests marked `explores`, which then take all their cases instead of a sample (`sample`),
-* hypothesis tests, with other examples each time (`--hypothesis-seed` repeats them) and `HUNT` times as many.
+* tests with the mark `hunt`, which `make test` leaves out,
+* tests with the mark `explores`, which then take all their cases instead of a sample (`sample`),
+* hypothesis tests, with HUNT times as many examples, different ones each time (`--hypothesis-seed` repeats them).
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from hypothesis.internal.conjecture import providers
 T = TypeVar("T")
 
 TIMES = int(os.environ.get("HUNT") or 0)
-"""By how much the hunt multiplies the examples of a property; 0 in `make test`."""
-
+"""The factor by which the hunt multiplies the examples of a property; 0 in `make test`."""
 
 SECONDS = float(os.environ.get("HUNT_SECONDS") or "inf")
-"""How long the hunt may begin new tests; what it has not reached by then is told as skipped."""
+"""The seconds after which the hunt begins no new test; it reports the tests that are left as skipped."""
 
 PAGE = 1000 if TIMES else 40
-"""Keys in a page of S3's listings while a test has the fixture `pages`; on AWS, and in the hunt, 1,000."""
+"""The number of keys in a page of S3's listings while a test has the fixture `pages`; on AWS, and in the hunt, 1,000."""
 
 
 def examples(number: int) -> int:
-    """How many examples of a property to play; `number` is what `make test` plays."""
+    """Return how many examples of a property to run: `number` in `make test`, `TIMES` times as many in the hunt."""
     return number * max(1, TIMES)
 
 
 def sample(cases: Iterable[T], share: int, seed: int = 0) -> list[T]:
-    """All cases in the hunt; else one of each `share` of them, in their order, chosen by `seed` and always the same."""
-    everything = list(cases)
+    """Return all cases in the hunt; else one of each `share` cases, in order. The same `seed` chooses the same cases."""
+    all_cases = list(cases)
     if TIMES:
-        return everything
+        return all_cases
     chance = random.Random(seed)
-    groups = [everything[start : start + share] for start in range(0, len(everything), share)]
+    groups = [all_cases[start : start + share] for start in range(0, len(all_cases), share)]
     return [chance.choice(group) for group in groups]
 
 
 def load_profile() -> None:
-    """Make the one profile of hypothesis that all tests share the default.
+    """Make one profile of hypothesis the default of all tests.
 
-    In `make test` examples hold no constants from our modules: hypothesis 6.170 takes them from those that the process has
-    loaded, and what a worker has run before would decide what it plays.
+    In `make test` examples hold no constants from our modules: hypothesis 6.170 takes constants from the modules that the
+    process has loaded, so the tests that a worker has run before would decide which examples it runs.
 
-    No deadline: a busy machine is no mistake. No database: an example that failed once belongs into a test. Health
-    checks measure time, too, and function-scoped fixtures here hold nothing that an example leaves changed.
+    The profile has no deadline, because a slow machine is no fault of the code; no database, because an example that
+    failed once belongs in a test; and no health checks, because they measure time, too, and because no example changes
+    anything that a function-scoped fixture here holds.
     """
     settings.register_profile(
         "hippodrome",
@@ -66,4 +66,4 @@ def load_profile() -> None:
     )
     settings.load_profile("hippodrome")
     if not TIMES:
-        providers._get_local_constants = lambda: providers._local_constants  # nothing adds to these
+        providers._get_local_constants = lambda: providers._local_constants  # loaded modules add nothing to these

@@ -1,6 +1,6 @@
-"""A platform in memory, with a clock that only tests move: for the services' tests, where no emulator is wanted.
+"""A platform in memory, with a clock that only tests move, for tests of the services.
 
-It keeps the ports' contracts (see `tests/contract`) and delivers messages only when a test says so.
+It keeps the ports' contracts (see `tests/contract`). It delivers no message: tests pass published messages on.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class FakeDocuments:
         self.kept: dict[str, tuple[bytes, str, datetime]] = {}
         self.versions = 0
         self.calls: list[str] = []
-        self.before_write: list[Any] = []  # callables run once before the next write: a faster writer
+        self.before_write: list[Any] = []  # each write first removes and calls one of these: a faster writer
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
         self.calls.append("get")
@@ -67,13 +67,13 @@ class FakeDocuments:
         self.kept.pop(key, None)
 
     def put(self, key: str, body: bytes) -> None:
-        """Write without conditions."""
+        """Write without conditions; the call is counted."""
         self.calls.append("put")
         self._interfere()
         self._write(key, body)
 
     def keep(self, key: str, body: bytes) -> None:
-        """Write as an outsider does: no call of ours, so nothing comes before it."""
+        """Write as another process does: `calls` does not have it, and no function of `before_write` is called."""
         self._write(key, body)
 
     def _interfere(self) -> None:
@@ -94,7 +94,7 @@ class FakeTasks:
         self.stopped: dict[str, str] = {}
         self.own_clusters: set[str] = set()
         self.pending: set[str] = set()  # tasks that do not run yet
-        self.fail: list[Exception] = []  # raised by the next calls of run
+        self.fail: list[Exception] = []  # the next calls of `run` raise these
 
     def run(self, request: TaskRequest) -> str:
         if self.fail:
@@ -136,7 +136,7 @@ class FakeDns:
         self.records: dict[str, str] = {}
         self.changes = 0
         self.pending: set[str] = set()
-        self.slow = False  # whether changes take until `settle`
+        self.slow = False  # whether changes are in sync only after `settle`
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         for record in remove:
@@ -151,6 +151,7 @@ class FakeDns:
         return f"C{self.changes}"
 
     def settle(self) -> None:
+        """Let all changes be in sync."""
         self.pending.clear()
 
     def in_sync(self, change: str) -> bool:
@@ -192,7 +193,7 @@ class FakeBus:
 
 
 class FakePlatform:
-    """The five ports in memory. `clock` is moved by tests."""
+    """The five ports in memory. Tests set `clock`, or move it with `wait`."""
 
     def __init__(self) -> None:
         self.settings = Settings(
@@ -215,6 +216,6 @@ class FakePlatform:
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         return [act() for act in acts]
 
-    def wait(self, **kw: float) -> None:
-        """Let time pass."""
-        self.clock += timedelta(**kw)
+    def wait(self, **time: float) -> None:
+        """Move the clock by `timedelta(**time)`."""
+        self.clock += timedelta(**time)

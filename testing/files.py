@@ -1,4 +1,4 @@
-"""Folders of files for tests."""
+"""Writes folders of files for tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> Path:
-    """Write these texts by their paths within the folder, with the folders above them; the folder."""
+    """Write each text to its path within the folder, and make the folders for it. Return the folder."""
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)

@@ -1,4 +1,4 @@
-"""A real server of environments in a process of its own, and a client that knows the messages and nothing else."""
+"""A real server of environments in a process of its own, and a client that only sends messages and returns the answers."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from websockets.typing import Subprotocol
 from testing.preloaded import interruptible
 
 ROOT = Path(__file__).resolve().parent.parent
-SECONDS = 60.0  # that an answer may take: environments on a participant's server give way to all other processes
+SECONDS = 60.0  # an answer may take so long: on a participant's server, environments have the lowest priority
 
 
 @dataclass(frozen=True, slots=True)
 class GymServerProcess:
-    """A server that runs. `pid` is that of the process that listens."""
+    """A running server. `pid` is the id of the process that listens."""
 
     port: int
     pid: int
 
     @property
     def url(self) -> str:
-        """Where clients connect."""
+        """The address to which clients connect."""
         return f"ws://127.0.0.1:{self.port}/gym"
 
 
@@ -42,7 +42,11 @@ def gym_server(
     cwd: Path = ROOT,
     env: Mapping[str, str] | None = None,
 ) -> Iterator[GymServerProcess]:
-    """`python -m trial.gym` with these arguments, at a port of its own; it is interrupted at the end, as by Ctrl-C."""
+    """Run `python -m trial.gym` with these arguments at a free port for the block.
+
+    At the end it is interrupted, as by Ctrl-C. `program` is run instead, if it is given; `env` is added to the
+    environment. The program prints the server's address first.
+    """
     paths = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     process = subprocess.Popen(
         [sys.executable, *program, *(("--port", "0") if program[0] == "-m" else ()), *arguments],
@@ -68,7 +72,11 @@ def gym_server(
 
 
 class TextClient:
-    """Sends and receives text, as Gymie's client does: the next message is the answer."""
+    """A client that sends text and takes the next message for the answer, as Gymie's client does.
+
+    With `arrays`, it asks for the binary subprotocol. All methods raise ConnectionClosed if the server has closed the
+    connection.
+    """
 
     def __init__(self, url: str, *, arrays: bool = False) -> None:
         protocols = [Subprotocol("hippodrome.gym.1")] if arrays else None
@@ -79,18 +87,18 @@ class TextClient:
             self._stack = stack.pop_all()
 
     def say(self, text: str | bytes) -> Any:
-        """Send this message; the answer as it comes. Raises ConnectionClosed."""
+        """Send this message; return the answer as it comes."""
         self.websocket.send(text)
         return self.websocket.recv(SECONDS)
 
     def ask(self, method: str, **params: Any) -> Any:
-        """Send a request; what its answer says in JSON. Raises ConnectionClosed."""
+        """Send a request; return its answer, parsed."""
         return json.loads(self.say(json.dumps({"method": method, "params": params})))
 
     def make(self, env_id: str, **params: Any) -> Any:
-        """Make an environment; its id."""
-        said = self.say(json.dumps({"method": "make", "params": {"env_id": env_id, **params}}))
-        made = json.loads(said) if said.startswith("{") else said
+        """Make an environment; return its id. Raises AssertionError if the answer is an error."""
+        answer = self.say(json.dumps({"method": "make", "params": {"env_id": env_id, **params}}))
+        made = json.loads(answer) if answer.startswith("{") else answer
         assert "error" not in made, made
         return made["instance_id"] if isinstance(made, dict) else made
 

@@ -1,4 +1,4 @@
-"""`python -m local.rehearsal`, whose study is held by a process that begins with its imports done, too."""
+"""Runs `python -m local.rehearsal` so that the process of its study, too, starts with its imports already done."""
 
 from __future__ import annotations
 

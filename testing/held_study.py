@@ -1,4 +1,4 @@
-"""A study that a test holds in a process of its own."""
+"""A study that a test runs in a process of its own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trial.recordings.recording import read
 
 
 class HeldStudy(StudyProcess):
-    """`StudyProcess`, whose process begins with its imports done. At `port` it can be started again."""
+    """A `StudyProcess` whose imports are done when it starts. With `port`, it can be started again at the same port."""
 
     def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
         super().__init__(folder, data, log=log)
@@ -21,12 +21,12 @@ class HeldStudy(StudyProcess):
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         options["env"] = {**options["env"], "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT)}
-        return preloaded.start("local", [*arguments, "--port", str(self._port)], **options)  # the last one counts
+        return preloaded.start("local", [*arguments, "--port", str(self._port)], **options)  # the last --port counts
 
     def steps_written(self, owner: str = "*") -> int:
-        """The steps in the recordings that servers of this participant or session have not finished."""
+        """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""
         files, steps = (logs_of(self.data).parent / "spool").glob(f"*/*/{owner}/trials/*/*.part"), 0
         for file in files:
-            with contextlib.suppress(FileNotFoundError):  # it is finished meanwhile
+            with contextlib.suppress(FileNotFoundError):  # the recording was finished meanwhile
                 steps += sum(line["kind"] == "step" for line in read(file.read_bytes()))
         return steps

@@ -1,4 +1,4 @@
-"""What a Python file imports, for the tests that hold packages, rooms and modules apart."""
+"""Finds what a Python file imports, for the tests that say which packages and modules may import which."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @functools.cache
 def imported(path: Path) -> frozenset[str]:
-    """The names that the import statements of a file lead to, also inside functions: `from a import b` to `a` and `a.b`.
+    """Return the names that a file imports, also inside functions; `from a import b` gives `a` and `a.b`.
 
     Raises AssertionError for a relative import: this project has none.
     """

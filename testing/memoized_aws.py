@@ -1,7 +1,8 @@
-"""Compute once per process what botocore and moto compute again for every session, client and call.
+"""Lets botocore and moto compute once per process what they compute again for every session, client and call.
 
-Half of the CPU time of the tests goes into botocore and moto. What is kept here depends only on installed files and on the arguments,
-so a test can see no difference except in time. `testing/moto_world.py` has what moto lacks; this module changes no answer.
+Half of the CPU time of the tests goes into botocore and moto. The kept results depend only on installed files and on
+the arguments, so a test can see no difference except in time. `testing/moto_world.py` adds what moto lacks; this module
+changes no answer.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ from werkzeug.exceptions import HTTPException
 
 
 def keep() -> None:
-    """Start keeping results, in this process and in the processes that it starts."""
-    # moto makes thousands of machine images for every region that is asked anything of EC2; no test needs one.
+    """Keep results from now on, in this process and in the processes that are forked from it."""
+    # moto makes thousands of machine images for each region in which EC2 is called; no test needs one.
     os.environ["MOTO_EC2_LOAD_DEFAULT_AMIS"] = "false"
     # Nor does a test ask which types of instances there are: a million values in each process, 80 MB.
     load = moto.utilities.utils.load_resource
@@ -56,18 +57,18 @@ def keep() -> None:
 
 
 def _keep_clients() -> None:
-    """What every session and client loads or builds: models, endpoint rules, methods."""
+    """Keep what every session and client loads or builds: models, endpoint rules, methods."""
     # Every session parses the models of the services. A loader only reads files of the installed package.
     botocore.session.create_loader = functools.cache(botocore.session.create_loader)
     _keep(botocore.client.ClientCreator, "_load_service_model", lambda _, name, api_version=None: (name, api_version))
-    # The loader returns the same objects each time, so their ids name them.
+    # The loader returns the same objects each time, so their ids identify them.
     _keep(
         botocore.regions,
         "EndpointProvider",
         lambda ruleset_data, partition_data, excluded_params=None: (id(ruleset_data), id(partition_data)),
         hold=True,
     )
-    # What is registered for a new class adds methods to this dictionary, so that each class gets its own.
+    # Handlers of the event for a new class add methods to this dictionary, so each class gets a copy of its own.
     _keep(
         botocore.client.ClientCreator,
         "_create_methods",
@@ -82,34 +83,35 @@ def _keep_clients() -> None:
 
 
 def _keep_calls() -> None:
-    """What botocore computes for every call."""
+    """Keep what botocore computes for every call."""
     _keep(botocore.hooks.EventAliaser, "_alias_event_name", lambda _, name: name)
-    # The code of a function says whether it takes keywords; a bound method would keep its object alive.
+    # The code object decides whether a function takes keywords; a bound method as the key would keep its object alive.
     _keep(botocore.hooks, "accepts_kwargs", lambda called: getattr(called, "__code__", called))
-    _keep(
-        botocore.useragent.UserAgentString, "to_string", lambda agent: agent._client_config is None
-    )  # no test reads it
+    agent = botocore.useragent.UserAgentString
+    _keep(agent, "to_string", lambda agent: agent._client_config is None)  # no test reads it
     _keep(botocore.utils, "_parse_timestamp_with_tzinfo", lambda value, zone: (type(value), value, zone))
     setattr(botocore.auth.SigV4Auth, "add_auth", _sign(botocore.auth.SigV4Auth.add_auth))  # noqa: B010
 
 
 def _keep_moto() -> None:
-    """What moto computes for every call and every world."""
+    """Keep what moto computes for every call and every world."""
     _keep(moto.core.responses, "method_names_from_class", lambda kind: kind)
-    # S3 loads its module of addresses anew, twice per call, since a variable may change them; here nothing sets it.
+    # S3 loads its module of URLs anew twice per call, since an environment variable may change them; here none does.
     backend = moto.core.base_backend.BaseBackend
     setattr(moto.s3.models.S3Backend, "_url_module", vars(backend)["_url_module"])  # noqa: B010 - a property for mypy
     addresses = _Addresses(vars(backend)["urls"].fget)
     setattr(backend, "urls", property(addresses))  # noqa: B010
-    # A world that ends drops its backends right after their reset, which would fill them anew (EC2: with networks).
+    # A world that ends drops its backends right after it has reset them, and a reset fills them anew (EC2: with
+    # networks).
     setattr(backend, "reset", lambda backend: None)  # noqa: B010
-    # For programs that use `requests`; no test adds a callback of its own.
+    # The callbacks are for programs that use `requests`; no test adds one of its own.
     mock = moto.core.models.MockAWS
     setattr(mock, "_enable_patching", _intercept(mock._enable_patching))  # noqa: B010
     stubber = moto.core.botocore_stubber.BotocoreStubber
     setattr(stubber, "process_request", _route(stubber.process_request))  # noqa: B010
     setattr(MotoRandom, "get_random_string", _random_string)  # noqa: B010 - two for each call of AWS
-    # A listing of versions sets in its copies of the bucket's objects which is the latest, and copied their bodies, too.
+    # A listing of versions copies the objects of the bucket to mark the latest ones. A deep copy would copy their
+    # bodies, too.
     setattr(moto.s3.models, "copy", SimpleNamespace(copy=copy.copy, deepcopy=_copies))  # noqa: B010
     _keep(
         moto.core.base_backend.AccountSpecificBackend,
@@ -117,7 +119,7 @@ def _keep_moto() -> None:
         lambda _, service_name: service_name,
         given=list,
     )
-    # An RSA key for each certificate that is requested.
+    # moto makes an RSA key for each certificate that is requested.
     setattr(moto.acm.models.CertBundle, "generate_cert", classmethod(_requested_certificate))  # noqa: B010
     _keep(moto.acm.models.CertBundle, "validate_pk", lambda bundle: bundle.key)
     _keep(
@@ -126,7 +128,7 @@ def _keep_moto() -> None:
 
 
 def _context(make: Callable[..., Any]) -> Callable[..., Any]:
-    """`create_urllib3_context`, but the clients of moto's worlds, which connect to nothing, share what would be for TLS."""
+    """Return a `create_urllib3_context` that gives all clients of moto, which connect to nothing, the same TLS context."""
     shared = functools.cache(make)
 
     def made(*arguments: Any, **more: Any) -> Any:
@@ -136,12 +138,12 @@ def _context(make: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _proxies(find: Callable[[str], Any]) -> Callable[[str], Any]:
-    """`get_environ_proxies`, which reads the whole environment for each client; those of moto's worlds connect to nothing."""
+    """Return a `get_environ_proxies` that does not read the environment for clients of moto, which connect to nothing."""
     return lambda url: {} if moto.core.models.botocore_stubber.enabled else find(url)
 
 
 def _sign(sign: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
-    """`SigV4Auth.add_auth`, but a request that moto answers has a signature of zeros: moto reads all but that."""
+    """Return an `add_auth` that gives requests to moto a signature of zeros: moto reads everything but the signature."""
 
     def signed(auth: Any, request: Any) -> None:
         by_headers = type(auth) in (botocore.auth.SigV4Auth, botocore.auth.S3SigV4Auth)  # not in a presigned address
@@ -156,7 +158,7 @@ def _sign(sign: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
 
 
 def _intercept(enable: Callable[..., None]) -> Callable[..., None]:
-    """`MockAWS._enable_patching`, which registers a callback for every method and pattern with each world."""
+    """Return an `_enable_patching` that registers the callbacks once, and not again for each world."""
     registered: list[Any] = []
 
     def enabled(mock: Any, reset: bool = True) -> None:
@@ -174,11 +176,11 @@ def _intercept(enable: Callable[..., None]) -> Callable[..., None]:
 
 
 def _route(process: Callable[..., Any]) -> Callable[..., Any]:
-    """`BotocoreStubber.process_request`, which for every call tries 200 patterns to find who answers at its address."""
-    answering = functools.cache(_who_answers)
+    """Return a `process_request` that looks for the method of an address once. moto's tries 200 patterns for every call."""
+    method_of = functools.cache(_method_of)
 
     def processed(stubber: Any, request: Any) -> Any:
-        answer = answering(_address(request.url))
+        answer = method_of(_address(request.url))
         if answer is None:
             return process(stubber, request)
         normalized = normalize_request(request)
@@ -191,7 +193,8 @@ def _route(process: Callable[..., Any]) -> Callable[..., Any]:
     return processed
 
 
-def _who_answers(address: str) -> Callable[..., Any] | None:
+def _method_of(address: str) -> Callable[..., Any] | None:
+    """Return moto's method that answers requests to this address; None if there is none."""
     for service, pattern in backend_index.backend_url_patterns:
         if pattern.match(address):
             regions: Any = moto.backends.get_backend(service)[DEFAULT_ACCOUNT_ID]  # type: ignore[call-overload]
@@ -202,7 +205,7 @@ def _who_answers(address: str) -> Callable[..., Any] | None:
 
 
 def _address(url: str) -> str:
-    """What the patterns look at. Of a key or bucket in a path of S3 they only see whether something follows."""
+    """Return the part of a URL that decides which pattern matches; of an S3 path, whether it has bucket and key."""
     scheme, host, path, *_ = urlsplit(url)
     if host.startswith("s3.") or ".s3." in host:
         path = "/".join("x" if part else "" for part in path.split("/", 2))
@@ -210,7 +213,7 @@ def _address(url: str) -> str:
 
 
 def _requested_certificate(cls: Any, /, domain_name: str, **more: Any) -> Any:
-    """`CertBundle.generate_cert`, which makes an RSA key for each request; here for each name."""
+    """Do what `CertBundle.generate_cert` does, but with one RSA key for each name instead of each request."""
     made = _certificate(domain_name, tuple(more.get("sans") or ()), more.get("cert_authority_arn"))
     account = {name: more[name] for name in ("account_id", "region", "cert_authority_arn")}
     return cls(certificate=made.cert, private_key=made.key, cert_type=made.type, cert_status=made.status, **account)
@@ -234,20 +237,20 @@ def _copies(versions: list[Any]) -> list[Any]:
 
 
 class _Addresses(dict[type, Any]):
-    """The addresses of a backend's service, by its class."""
+    """The URLs of each service, by the class of its backend."""
 
-    def __init__(self, made: Callable[[Any], Any]) -> None:
+    def __init__(self, urls_of: Callable[[Any], Any]) -> None:
         super().__init__()
-        self._made = made
+        self._urls_of = urls_of
 
     def __call__(self, backend: Any) -> Any:
         if type(backend) not in self:
-            self[type(backend)] = self._made(backend)
+            self[type(backend)] = self._urls_of(backend)
         return self[type(backend)]
 
 
 def _looked_for(_: Any, context: Any) -> Hashable:
-    """What decides under which names moto looks for a value in an object (the alias providers in moto/core/serialize.py)."""
+    """Return the key of the names under which moto looks for a value (the alias providers in moto/core/serialize.py)."""
     shape = context.shape
     parent = getattr(shape, "parent", None)
     return (
@@ -260,7 +263,7 @@ def _looked_for(_: Any, context: Any) -> Hashable:
 
 
 def _copy_of_handlers(trie: Any) -> Any:
-    """A copy of all nodes and their lists of handlers, but not of the handlers: what botocore's own copy gives."""
+    """Copy all nodes and their lists of handlers, but not the handlers, as botocore's own copy does."""
     new = type(trie)()
     new.__dict__ = {name: _copy_of_node(node) if isinstance(node, dict) else node for name, node in vars(trie).items()}
     return new
@@ -283,19 +286,19 @@ def _keep(
     made: Callable[[Any], Any] = lambda found: found,
     hold: bool = False,
 ) -> None:
-    """Call `owner.name` once for each key of its arguments.
+    """Replace `owner.name` with a function that calls it once for each key of its arguments, and keeps the result.
 
-    `made` turns the result into what is kept, `given` turns that into what callers get. `hold` keeps the arguments alive, for
-    keys that are made of their ids.
+    `made` converts the result before it is kept, and `given` converts the kept result for each caller. `hold` keeps the
+    arguments alive, for keys that consist of their ids.
     """
     wrapped = getattr(owner, name)
     kept: dict[Hashable, tuple[Any, Any]] = {}
 
     @functools.wraps(wrapped)
     def known(*arguments: Any, **more: Any) -> Any:
-        which = key(*arguments, **more)
-        if which not in kept:
-            kept[which] = made(wrapped(*arguments, **more)), (arguments, more) if hold else None
-        return given(kept[which][0])
+        found = key(*arguments, **more)
+        if found not in kept:
+            kept[found] = made(wrapped(*arguments, **more)), (arguments, more) if hold else None
+        return given(kept[found][0])
 
     setattr(owner, name, known)

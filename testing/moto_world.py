@@ -1,4 +1,4 @@
-"""An AWS account on moto with everything that Hippodrome needs, and bridges over what moto does not do.
+"""An AWS account on moto with all resources that Hippodrome needs, and with bridges over the gaps of moto.
 
 `MotoWorld` is a context manager; the fixture `moto_world` enters one for a test::
 
@@ -8,12 +8,14 @@
         ...
         assert "ecs:RunTask" in moto_world.actions
 
-Each bridge says which gap of moto 5.2 it closes (search for "Gap:"). They work inside moto: they hold for every client.
+A comment at each bridge says which gap of moto 5.2 it closes (search for "Gap:"). Bridges change moto itself, so they
+hold for every client.
 
-Gap: moto's IAM proves nothing. Bridge: while a world is open, the handlers in `lambdas/` run with the roles and variables of
-`infra/template.yml`; see `testing/iam/enforcement.py`. A world whose handlers were refused something fails when it closes.
+Gap: moto's IAM does not judge calls by the roles of functions. Bridge: while a world is open, the handlers in
+`lambdas/` run with the roles and variables of `infra/template.yml`; see `testing/iam/enforcement.py`. If a handler was
+refused a call, the world fails when it closes.
 
-What is read of moto's own is copied first: handlers may run in other threads meanwhile.
+This module copies collections of moto before it reads them, since handlers may change them in other threads meanwhile.
 """
 
 from __future__ import annotations
@@ -60,18 +62,22 @@ from testing.iam.enforcement import ApiCall, IamEnforcement
 
 @dataclass
 class ScriptedAnswer:
-    """What the next calls of an operation get instead of moto's own answer."""
+    """The answer that the next `times` calls of an operation get instead of moto's."""
 
     service: str
     operation: str
     parsed: dict[str, Any]
     status: int
     times: int
-    when: Callable[[Mapping[str, Any]], bool] | None = None  # of those with such parameters only
+    when: Callable[[Mapping[str, Any]], bool] | None = None  # only calls whose parameters satisfy this
 
 
 class MotoWorld:
-    """One account. `env` is what the functions' environment holds; `platform` is an `AwsPlatform` made from it."""
+    """One account. `env` are the functions' environment variables; `platform` is an `AwsPlatform` made from them.
+
+    `raw_delivery`: whether the queues get messages without SNS's envelope. `enforce`: whether calls of handlers are
+    judged.
+    """
 
     def __init__(
         self,
@@ -85,16 +91,16 @@ class MotoWorld:
         self.calls: list[ApiCall] = []
         self.in_sync = True  # False: Route 53 answers PENDING to every GetChange
         self.env: dict[str, str] = {}
-        self.ids: dict[str, str] = {}  # made along the way: vpc, zone, queue URLs and ARNs
+        self.ids: dict[str, str] = {}  # of the account's resources: VPC, zone, queue URLs and ARNs, …
         self._lock = threading.RLock()
         self._answers: list[ScriptedAnswer] = []
         self._tokens: dict[tuple[str, str], tuple[str, list[Any]]] = {}
         self._versions: Counter[str] = Counter()
         self._stack = contextlib.ExitStack()
         self._enforce = enforce
-        self.iam: IamEnforcement | None = None  # who judges the handlers' calls
+        self.iam: IamEnforcement | None = None  # judges the handlers' calls
 
-    # -- coming and going -----------------------------------------------------------------------------------------
+    # -- opening and closing -----------------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
         self._stack.enter_context(mock.patch.dict(os.environ, MOTO_EC2_LOAD_DEFAULT_AMIS="false"))  # 0.1 s
@@ -113,44 +119,44 @@ class MotoWorld:
         assert error[0] or not findings, findings
 
     def enforce(self, iam: IamEnforcement | None) -> None:
-        """Judge the handlers' calls by these roles until the world closes."""
+        """Judge the handlers' calls by these roles until the world closes; None judges nothing."""
         self.iam = iam
         if iam:
             self._stack.enter_context(iam.enforced())
 
     def client(self, service: str) -> Any:
-        """A client of the world's own: its calls are not recorded, and `fail` and `answer` do not touch it."""
+        """Return a client of the world's own: its calls are not recorded, not judged, and never scripted."""
         with _making:
             return _own_client(service, self.region)
 
-    # -- watching and troubling the calls -------------------------------------------------------------------------
+    # -- recording and scripting the calls -------------------------------------------------------------------------
 
     @property
     def actions(self) -> list[str]:
-        """Every call so far, such as `ecs:RunTask`, in order."""
+        """The action of every call so far, such as `ecs:RunTask`, in order."""
         return [call.action for call in self.calls]
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[list[ApiCall]]:
-        """The calls made within the block."""
-        seen: list[ApiCall] = []
+        """Give a list that holds the calls of the block after its end."""
+        recorded: list[ApiCall] = []
         start = len(self.calls)
-        yield seen
-        seen.extend(self.calls[start:])
+        yield recorded
+        recorded.extend(self.calls[start:])
 
     def answer(self, action: str, parsed: dict[str, Any], status: int = 200, times: int = 1) -> None:
-        """Let the next `times` calls of `action` ("ecs:RunTask") be answered by `parsed` and never reach moto."""
+        """Answer the next `times` calls of `action` ("ecs:RunTask") with `parsed`; they do not reach moto."""
         service, operation = action.split(":")
         self._answers.append(ScriptedAnswer(service, operation, parsed, status, times))
 
     def fail(
         self, action: str, code: str, message: str = "made up", status: int = 400, times: int = 1, **more: Any
     ) -> None:
-        """Let the next `times` calls of `action` fail with this error. botocore does not retry it, whatever it is."""
+        """Let the next `times` calls of `action` fail with this error. botocore never retries such a call."""
         self.answer(action, {"Error": {"Code": code, "Message": message}, **more}, status, times)
 
     def refuse(self, action: str, when: Callable[[Mapping[str, Any]], bool], code: str, message: str) -> None:
-        """Let every call of `action` from now on fail whose parameters are such."""
+        """Let every later call of `action` fail whose parameters satisfy `when`."""
         service, operation = action.split(":")
         parsed = {"Error": {"Code": code, "Message": message}}
         self._answers.append(ScriptedAnswer(service, operation, parsed, 400, sys.maxsize, when))
@@ -180,7 +186,7 @@ class MotoWorld:
             return None
 
         ours: list[tuple[str, Any]] = [("before-parameter-build", before_build), ("before-call", before_call)]
-        botocore.handlers.BUILTIN_HANDLERS.extend(ours)  # every session made from now on, boto3's too
+        botocore.handlers.BUILTIN_HANDLERS.extend(ours)  # for every session made from now on, boto3's too
 
         def forget() -> None:
             for handler in ours:
@@ -191,7 +197,7 @@ class MotoWorld:
     # -- bridges --------------------------------------------------------------------------------------------------
 
     def one_at_a_time(self, app: Callable[..., Any]) -> Callable[..., Any]:
-        """A WSGI application before this account, such as moto's server: one request at a time, of whatever client."""
+        """Wrap a WSGI application for this account, such as moto's server, so that it serves one request at a time."""
 
         def serve(environ: dict[str, Any], start_response: Any) -> Any:
             with self._lock:
@@ -266,13 +272,13 @@ class MotoWorld:
 
         self._patch(EC2ContainerServiceBackend, "delete_cluster", delete_empty)
 
-        # Gap: list_clusters names deleted (INACTIVE) clusters too, and create_cluster throws away the tasks' cluster.
+        # Gap: list_clusters names deleted (INACTIVE) clusters, too, and create_cluster replaces an existing cluster.
         list_clusters = EC2ContainerServiceBackend.list_clusters
         create_cluster = EC2ContainerServiceBackend.create_cluster
 
         def list_active(backend: Any) -> list[str]:
-            gone = {cluster.arn for cluster in backend.clusters.values() if cluster.status == "INACTIVE"}
-            return [arn for arn in list_clusters(backend) if arn not in gone]
+            inactive = {cluster.arn for cluster in backend.clusters.values() if cluster.status == "INACTIVE"}
+            return [arn for arn in list_clusters(backend) if arn not in inactive]
 
         def create_once(backend: Any, cluster_name: str, *args: Any, **kwargs: Any) -> Any:
             present = backend.clusters.get(cluster_name)
@@ -283,8 +289,8 @@ class MotoWorld:
         self._patch(EC2ContainerServiceBackend, "list_clusters", list_active)
         self._patch(EC2ContainerServiceBackend, "create_cluster", create_once)
 
-        # Gap: Route 53 in moto deletes a record whatever values are given, and says InvalidInput for one it never saw.
-        # The real one refuses the whole batch (InvalidChangeBatch) unless every DELETE matches in name, TTL and values.
+        # Gap: moto's Route 53 deletes a record whatever values the change has, and answers InvalidInput for an unknown
+        # record. AWS refuses the whole batch (InvalidChangeBatch) unless every DELETE matches in name, TTL and values.
         change_sets = Route53Backend.change_resource_record_sets
 
         def change_strictly(backend: Any, zoneid: str, change_list: list[dict[str, Any]]) -> Any:
@@ -304,7 +310,7 @@ class MotoWorld:
 
         self._patch(Route53, "get_change", get_change_in_time)
 
-        # Gap: a task walks from RUNNING to STOPPED as it is described. Bridge: it stays as it is until told otherwise.
+        # Gap: each DescribeTasks moves a task on, from RUNNING to STOPPED. Bridge: only `task_event` changes its state.
         state_manager.set_transition("ecs::task", {"progression": "manual", "times": 10**9})
         self._stack.callback(state_manager.unset_transition, "ecs::task")
 
@@ -314,7 +320,7 @@ class MotoWorld:
     # -- the account ----------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        """Make the account's resources in moto's own objects: a world for each test, 46 ms faster than by API calls."""
+        """Make the account's resources as moto's own objects, which is 46 ms faster for each world than API calls."""
         ec2, ecs = ec2_backends[ACCOUNT][self.region], ecs_backends[ACCOUNT][self.region]
         vpc = ec2.create_vpc("10.0.0.0/16").id
         ec2.modify_vpc_attribute(vpc, "enable_dns_hostnames", "true")  # Gap: moto's RunTask fails without it
@@ -328,7 +334,7 @@ class MotoWorld:
             "name": "trial",
             "image": IMAGE,
             "essential": True,
-            "memory": 2048,  # Gap: moto wants it on the container even where the task has its own
+            "memory": 2048,  # Gap: moto requires it of the container, even if the task has its own
             "portMappings": [{"containerPort": 5000, "protocol": "tcp"}],
         }
         ecs.register_task_definition(
@@ -388,14 +394,15 @@ class MotoWorld:
     # -- queues ---------------------------------------------------------------------------------------------------
 
     def receive(self, queue: str, at_most: int = 10) -> dict[str, Any]:
-        """What Lambda would hand to the function behind `queue` ("start", "stop", "task"): an SQS event, maybe empty.
+        """Return the messages of `queue` ("start", "stop", "task") as the SQS event that its function would get.
 
-        The messages are taken off the queue, as after a success. Delayed ones come after their delay, or `skip_delays`.
+        The messages are deleted from the queue, as after a success. A delayed message comes after its delay, or after
+        `skip_delays`.
         """
         sqs, url = self.client("sqs"), self.ids[f"{queue}_queue"]
         held = sqs_backends[ACCOUNT][self.region].queues[aws_events.last(url)]
         bodies: list[str] = []
-        while len(bodies) < at_most and held.messages:  # most looks find an empty queue: no call for those
+        while len(bodies) < at_most and held.messages:  # no call for an empty queue, which is the usual case
             wanted = min(10, at_most - len(bodies))
             found = sqs.receive_message(QueueUrl=url, MaxNumberOfMessages=wanted, WaitTimeSeconds=0).get("Messages", [])
             if not found:
@@ -406,7 +413,7 @@ class MotoWorld:
         return self.sqs_event(queue, bodies)
 
     def sqs_event(self, queue: str, bodies: list[Any]) -> dict[str, Any]:
-        """An SQS event of these bodies, as if they came from `queue`; ECS events and other JSON may be given as they are."""
+        """Return an SQS event with these bodies, as if they came from `queue`. Bodies that are no texts become JSON."""
         return aws_events.sqs_event(bodies, self.ids[f"{queue}_queue_arn"], self.region)
 
     def skip_delays(self) -> None:
@@ -418,7 +425,7 @@ class MotoWorld:
     # -- tasks ----------------------------------------------------------------------------------------------------
 
     def task(self, task: str) -> Any:
-        """moto's own object behind a task's ARN or id."""
+        """Return moto's own object of the task with this ARN or id. Raises LookupError if there is none."""
         for tasks in list(ecs_backends[ACCOUNT][self.region].tasks.values()):
             for arn, found in list(tasks.items()):
                 if arn.endswith(aws_events.last(task)):
@@ -426,7 +433,7 @@ class MotoWorld:
         raise LookupError(task)
 
     def task_arns(self) -> list[str]:
-        """Every task that ever ran, oldest first."""
+        """Return the ARN of every task so far, in the order of RunTask within each cluster."""
         return [arn for tasks in list(ecs_backends[ACCOUNT][self.region].tasks.values()) for arn in list(tasks)]
 
     def task_event(
@@ -442,12 +449,15 @@ class MotoWorld:
         version: int | None = None,
         time: datetime | None = None,
     ) -> dict[str, Any]:
-        """The "ECS Task State Change" event that says `task` has reached `status`, in the shape of `tests/events`.
+        """Move `task` to `status`, and return the "ECS Task State Change" event of that, in the form of `tests/events`.
 
-        Gap: moto sends no events and gives no public address. RUNNING associates one with the task's network interface;
-        DEPROVISIONING ends the task's container; STOPPED removes the interface as well, as Fargate does. `stop_code` (SpotInterruption, …) is by
-        itself UserInitiated, with the reason given to StopTask, after that, else EssentialContainerExited; `version`
-        counts up. `desired="STOPPED"` with RUNNING is Spot's warning.
+        Gap: moto sends no events and gives no public address. Bridge: RUNNING associates an address with the task's
+        network interface; DEPROVISIONING ends the task's container; STOPPED removes the interface, too, as Fargate
+        does.
+
+        The default of `stop_code` is UserInitiated after StopTask, with the reason of that call, else
+        EssentialContainerExited; the default of `version` counts the events of the task. RUNNING with
+        `desired="STOPPED"` is Spot's warning.
         """
         found = self.task(task)
         arn = found.task_arn
@@ -483,9 +493,10 @@ class MotoWorld:
         )
 
     def public_ip(self, task: str) -> str:
-        """The public IPv4 address of a task; given to it now if it has none.
+        """Return the public IPv4 address of a task; associate one first if it has none.
 
-        Gap: `assignPublicIp` gives none in moto. Bridge: an elastic address is associated, which reads the same.
+        Gap: `assignPublicIp` has no effect in moto. Bridge: an elastic address, which DescribeNetworkInterfaces shows
+        in the same way.
         """
         ec2 = self.client("ec2")
         details = {item["name"]: item["value"] for item in self.task(task).attachments[0]["details"]}
@@ -508,14 +519,14 @@ class MotoWorld:
     # -- names ----------------------------------------------------------------------------------------------------
 
     def records(self) -> dict[str, str]:
-        """The A records of the zone: name without the final dot → address."""
+        """Return the A records of the zone: name without the final dot → address."""
         zone = route53_backends[ACCOUNT]["aws"].get_hosted_zone(self.ids["zone"])
         return {r.name.rstrip("."): r.records[0] for r in list(zone.rrsets) if r.type == "A"}
 
     # -- timers ---------------------------------------------------------------------------------------------------
 
     def timers(self) -> dict[str, tuple[datetime, dict[str, Any]]]:
-        """The one-time schedules: name → when (UTC) and the message."""
+        """Return the one-time schedules: name → time (UTC) and message."""
         schedules = scheduler_backends[ACCOUNT][self.region].schedule_groups["hippodrome"].schedules
         found = {}
         for name, schedule in list(schedules.items()):
@@ -524,9 +535,9 @@ class MotoWorld:
         return found
 
     def fire_timer(self, name: str) -> dict[str, Any]:
-        """Do what the schedule would: publish its input to its target's topic, then delete it. Returns the message.
+        """Publish the schedule's input to its target's topic, then delete it, as the Scheduler does. Return the message.
 
-        Gap: schedules never fire in moto. KeyError if there is no such schedule.
+        Gap: schedules never fire in moto. Raises KeyError if there is no such schedule.
         """
         schedules = scheduler_backends[ACCOUNT][self.region].schedule_groups["hippodrome"].schedules
         schedule = schedules[name]
@@ -537,7 +548,7 @@ class MotoWorld:
 
 
 _making = threading.Lock()  # making a client is not thread-safe, using one is
-_own_session = botocore.session.get_session()  # made before any world's recorder, which so does not see its calls
+_own_session = botocore.session.get_session()  # made before the handlers of any world: its calls are not recorded
 
 
 @functools.cache
@@ -554,7 +565,7 @@ def moto_world() -> Iterator[MotoWorld]:
 def _summary(value: Any) -> Any:
     if isinstance(value, bytes | bytearray):
         return f"<{len(value)} bytes>"
-    if isinstance(value, io.BytesIO):  # what botocore makes of an S3 body
+    if isinstance(value, io.BytesIO):  # botocore wraps the body of an S3 request
         return f"<{value.getbuffer().nbytes} bytes>"
     return value
 
@@ -576,6 +587,7 @@ class _TokenConflict(_EcsError):
 
 
 def _check_batch(zone: Any, change_list: list[dict[str, Any]]) -> None:
+    """Raise Route 53's InvalidChangeBatch if the zone would refuse one of these changes."""
     present = {
         (_fold(r.name), r.type): (int(r.ttl), sorted(r.records))
         for r in list(zone.rrsets)
@@ -586,19 +598,19 @@ def _check_batch(zone: Any, change_list: list[dict[str, Any]]) -> None:
         record = change["ResourceRecordSet"]
         key = (_fold(record["Name"]), record["Type"])
         values = (int(record.get("TTL") or 0), sorted(item["Value"] for item in record.get("ResourceRecords") or ()))
-        what = f"resource record set [name='{key[0]}', type='{key[1]}']"
+        record_set = f"resource record set [name='{key[0]}', type='{key[1]}']"
         if change["Action"] == "DELETE":
             if key not in present:
-                wrong.append(f"Tried to delete {what} but it was not found")
+                wrong.append(f"Tried to delete {record_set} but it was not found")
             elif present[key] != values:
-                wrong.append(f"Tried to delete {what} but the values provided do not match the current values")
+                wrong.append(f"Tried to delete {record_set} but the values provided do not match the current values")
             else:
                 del present[key]
         elif change["Action"] == "CREATE" and key in present:
-            wrong.append(f"Tried to create {what} but it already exists")
+            wrong.append(f"Tried to create {record_set} but it already exists")
         else:
             present[key] = values
-        # Gap: moto takes any name. Route 53 refuses the batch (external-dns, issues 2839 and 1517).
+        # Gap: moto accepts any name. Route 53 refuses the batch (external-dns, issues 2839 and 1517).
         for label in record["Name"].rstrip(".").split("."):
             if len(label) > 63:
                 wrong.append(f"FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '{label}'")

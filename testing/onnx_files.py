@@ -1,4 +1,4 @@
-"""ONNX files for tests: small policies, made by the package `onnx` in the forms that researchers export."""
+"""Writes ONNX files for tests: small policies in the forms that researchers export, made with the package `onnx`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 Shape = Sequence[int | str]
-_IR, _OPSET = 8, 17  # what onnxruntime has read since 2022
+_IR, _OPSET = 8, 17  # versions that onnxruntime has read since 2022
 
 
 def save(
@@ -23,7 +23,10 @@ def save(
     *,
     types: dict[str, int] | None = None,
 ) -> Path:
-    """Write a graph. `values` are its constants, `types` those of inputs and outputs that are no floats."""
+    """Write a graph to the file, and return the file.
+
+    `values` are its constants by name; `types` are the element types of the inputs and outputs that are not float32.
+    """
     kinds = types or {}
     graph = helper.make_graph(
         list(nodes),
@@ -40,7 +43,10 @@ def save(
 
 
 def linear(file: Path, weights: Any, *, shape: Shape | None = None) -> Path:
-    """`output = obs @ weights`: one column of weights for each action."""
+    """Write the policy `output = obs @ weights`, with a column of weights for each action; return the file.
+
+    `shape` is that of `obs`, if it is another one than (batch, rows of weights).
+    """
     matrix = np.asarray(weights, np.float32)
     sizes = shape or ("batch", matrix.shape[0])
     flat = helper.make_node("Reshape", ["obs", "rows"], ["flat"])
@@ -56,7 +62,7 @@ def linear(file: Path, weights: Any, *, shape: Shape | None = None) -> Path:
 
 
 def constant(file: Path, values: Any, *, size: int = 2, dtype: int = TensorProto.FLOAT) -> Path:
-    """Gives these values for every observation of `size` numbers."""
+    """Write a policy that gives these values for every observation of `size` numbers; return the file."""
     row = np.asarray(values)
     nodes = [
         helper.make_node("ReduceSum", ["obs"], ["sum"], keepdims=0),
@@ -77,7 +83,11 @@ def constant(file: Path, values: Any, *, size: int = 2, dtype: int = TensorProto
 def counter(
     file: Path, *, state: tuple[str, str] = ("state_in_0", "state_out_0"), seq_lens: Shape | None = (1,)
 ) -> Path:
-    """A recurrent policy of three actions: it takes action 0, 1, 2, 2, … and forgets at a reset."""
+    """Write a recurrent policy of three actions, which takes action 0, 1, 2, 2, … after each reset; return the file.
+
+    `state` are the names of its state's input and output; `seq_lens` is the shape of RLlib's input of that name, None
+    for none.
+    """
     nodes = [
         helper.make_node("Add", [state[0], "one"], [state[1]]),
         helper.make_node("Sub", ["centers", state[0]], ["distance"]),
@@ -99,7 +109,7 @@ def counter(
 
 
 def endless(file: Path) -> Path:
-    """A policy of three actions that works for hours on any observation but zeros."""
+    """Write a policy of three actions that computes for hours on any observation but zeros; return the file."""
     body = helper.make_graph(
         [helper.make_node("Identity", ["more"], ["goes_on"]), helper.make_node("Sin", ["before"], ["after"])],
         "body",

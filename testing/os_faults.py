@@ -1,12 +1,14 @@
-"""Faults of one machine, as the operating system reports them: at single calls for files, processes, threads, sockets.
+"""Faults of one machine at single system calls for files, processes, threads and sockets.
 
-Everything is injected *below* `local/`, in the functions of Python's library that make the system call. A call is known
-by its operation and by what kind of file it is about (`OsCall`), since threads make calls in an order that changes from
-run to run; the n-th call of one kind is nearly always the same.
+Faults are injected *below* `local/`, in the functions of Python's library that make the system call. A call is
+identified by its operation and its kind of file (`OsCall`) and by its number among those: threads make calls in an
+order that changes from run to run, but the n-th call of one kind is nearly always the same.
 
 * `OsReach.ONCE`: this call fails.
-* `OsReach.SPELL`: it fails, and so does for a moment every call that can fail for this reason, as on a full disk.
-* `OsReach.EVER`: the data folder is another file system than the state folder: no link leads from one to the other.
+* `OsReach.SPELL`: this call fails, and for `SPELL_SECONDS` each call that can fail with the same errno, as on a full
+  disk.
+* `OsReach.EVER`: the data folder and the state folder are on different file systems, so no hard link can be made
+  between them.
 * `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill -9`) just before the call, or just after it. None of its
   threads makes another call.
 """
@@ -36,7 +38,7 @@ SPELL_SECONDS = 0.4
 
 
 class OsReach(StrEnum):
-    """How far a fault reaches, see above."""
+    """What a fault does; the module's docstring says what each value means."""
 
     ONCE = "once"
     SPELL = "for a while"
@@ -49,14 +51,14 @@ KILLS = (OsReach.BEFORE, OsReach.AFTER)
 
 
 class OsCall(NamedTuple):
-    """A kind of call: what is done, and to which kind of file."""
+    """A kind of call: its operation, and the kind of file that it is made for (`OsFaultInjector.place`)."""
 
     operation: str
     place: str
 
 
 class OsFault(NamedTuple):
-    """The `number`-th call of this kind (from 1) goes wrong; `number` is an errno for all but kills."""
+    """A fault of the `number`-th call of this kind, counted from 1, with this `errno`; a kill has none."""
 
     call: OsCall
     number: int
@@ -69,10 +71,11 @@ class OsFault(NamedTuple):
 
 
 class Killed(BaseException):
-    """This thread's process has been killed."""
+    """Raised in each thread of a process that was killed, at its next call."""
 
 
-# What the system says (Linux man-pages 6, section 2: open, write, fsync, link, rename, unlink, mkdir, stat, flock, fork).
+# By operation, the errors that Linux may report (man-pages 6, section 2: open, write, fsync, link, rename, unlink,
+# mkdir, stat, flock, fork).
 ERRORS: dict[str, tuple[int, ...]] = {
     "create": (errno.ENOSPC, errno.EMFILE, errno.EACCES, errno.EROFS),
     "open": (errno.EMFILE, errno.EIO, errno.ENOMEM),
@@ -89,7 +92,7 @@ ERRORS: dict[str, tuple[int, ...]] = {
     "spawn": (errno.EAGAIN, errno.ENOMEM),
     "thread": (errno.EAGAIN,),
     "connect": (errno.EMFILE, errno.ENOMEM),
-    "process": (errno.EMFILE,),  # /proc, which psutil reads
+    "process": (errno.EMFILE,),  # of /proc, which psutil reads
 }
 _KINDS = (
     (re.compile(r"s[a-z0-9]{20}-\d+"), "SERVER"),
@@ -102,20 +105,23 @@ _KINDS = (
 
 
 class _Off(threading.local):
-    """How many blocks this thread is in where its calls are the test's own."""
+    """How many blocks of `unharmed` this thread is in."""
 
     deep = 0
 
 
 class OsFaultInjector:
-    """Stands between Python and the system for everything below `root`; spoils the call that `fault` says."""
+    """Counts the calls for files below `root` (and for /proc, processes, threads, connections), and injects `fault`.
+
+    Calls for which `only` returns False are neither counted nor changed.
+    """
 
     def __init__(self, root: Path, fault: OsFault | None = None, *, only: Callable[[], bool] = lambda: True) -> None:
         self.root = os.path.realpath(root)
         self.fault = fault
         self.calls: Counter[OsCall] = Counter()
-        self.struck = 0
-        self.dead = threading.Event()  # the process has been killed, and the next has not begun
+        self.struck = 0  # calls that the fault has changed
+        self.dead = threading.Event()  # set from a kill until the next process begins
         self.off = _Off()
         self._only = only
         self._generation = 0
@@ -123,7 +129,7 @@ class OsFaultInjector:
         self._lock = threading.Lock()
 
     def begin_process(self) -> None:
-        """What starts from now on is another process; every thread of the last one ends at its next call."""
+        """Begin another process: every thread of the last one gets `Killed` at its next call."""
         with self._lock:
             self._generation += 1
             self.dead.clear()
@@ -131,7 +137,7 @@ class OsFaultInjector:
 
     @contextlib.contextmanager
     def unharmed(self) -> Iterator[None]:
-        """What this thread does within the block is no call of local mode."""
+        """Leave this thread's calls within the block alone: they are the test's own."""
         self.off.deep += 1
         try:
             yield
@@ -139,13 +145,13 @@ class OsFaultInjector:
             self.off.deep -= 1
 
     def heal(self) -> None:
-        """Nothing goes wrong any more."""
+        """Inject nothing from now on."""
         self.fault, self._spell = None, 0.0
 
     # Calls
 
     def place(self, path: Any) -> str | None:
-        """The kind of file; None if it is none of the study."""
+        """Return the kind of file: its path below `root` with words in the place of ids; None for a file elsewhere."""
         try:
             text = os.path.abspath(os.fsdecode(path))
         except (TypeError, ValueError):
@@ -182,7 +188,7 @@ class OsFaultInjector:
         return result
 
     def _error(self, call: OsCall) -> int | OsReach | None:
-        """What goes wrong with the call that is made now."""
+        """Count this call. Return the errno with which it fails, or how it is killed; None if the call is to be made."""
         with self._lock:
             self.calls[call] += 1
             fault = self.fault
@@ -204,7 +210,7 @@ class OsFaultInjector:
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
-        """Stand in between within the block."""
+        """Replace the functions of Python's library within the block."""
         with contextlib.ExitStack() as stack:
 
             def put(owner: Any, name: str, made: Any) -> None:
@@ -241,8 +247,8 @@ class OsFaultInjector:
                     raise RuntimeError("can't start new thread") from error
 
             put(threading.Thread, "start", started)
-            told = threading.excepthook
-            put(threading, "excepthook", lambda of: None if of.exc_type is Killed else told(of))
+            report = threading.excepthook
+            put(threading, "excepthook", lambda args: None if args.exc_type is Killed else report(args))
             threading.current_thread().generation = self._generation  # type: ignore[attr-defined]
             yield
 
@@ -254,8 +260,8 @@ class OsFaultInjector:
 
     def _link(self, do: Any, source: Any, target: Any, **options: Any) -> Any:
         here, there = self.place(source), self.place(target)
-        two = bool(here and there and here.startswith("data/") != there.startswith("data/"))
-        if two and self.fault and self.fault.reach is OsReach.EVER and not self.off.deep:
+        between = bool(here and there and here.startswith("data/") != there.startswith("data/"))
+        if between and self.fault and self.fault.reach is OsReach.EVER and not self.off.deep:
             self.struck += 1
             raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
         return self._call("link", there, lambda: do(source, target, **options))
@@ -305,7 +311,7 @@ class _Writer(io.BufferedWriter):
         try:
             return int(self.call(all_of_it))
         except (OSError, Killed):
-            super().write(bytes(data)[: len(data) // 2])  # as much as there was room for
+            super().write(bytes(data)[: len(data) // 2])  # a part was written before the fault
             super().flush()
             raise
 

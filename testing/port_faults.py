@@ -1,6 +1,6 @@
-"""What can go wrong at one call of a port, on the simulated platforms: the call is refused, is the last, or loses its reply.
+"""Faults at one call of a port, on the simulated platforms: the call is refused, loses its reply, or is the last one.
 
-`testing/aws_faults.py` injects below botocore, in HTTP; `testing/os_faults.py` injects at the system's calls.
+`testing/aws_faults.py` injects faults below botocore, in HTTP; `testing/os_faults.py` injects them at system calls.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ T = TypeVar("T")
 
 
 class Crash(BaseException):
-    """The function is gone, between two of its lines. Nothing catches it."""
+    """The function has crashed between two of its lines. A BaseException, so that no handler catches it."""
 
 
 class Unreachable(ConnectionError):
-    """The call was not made, or the function cannot know whether it was."""
+    """The call was not made, or its reply was lost, so that the function cannot know whether it was made."""
 
 
 class PortFault(StrEnum):
-    """What happens at a call."""
+    """What happens at a call; read each value after "the call"."""
 
     ERROR = "is refused"
     REPLY = "is made and its reply lost"
@@ -31,7 +31,7 @@ class PortFault(StrEnum):
 
 
 class FaultAt(NamedTuple):
-    """What happens to a function at the n-th call that it makes, from 1."""
+    """A fault, and the number of the call at which it happens, counted from 1."""
 
     call: int
     fault: PortFault
@@ -41,7 +41,11 @@ class FaultAt(NamedTuple):
 
 
 def call_with_fault(action: str, effect: Callable[[], T], fault: PortFault | None) -> T:
-    """Make a call with this fault. Raises Crash or Unreachable as it says. A refusal is an answer too, and may be lost."""
+    """Make a call with this fault; return what `effect` returns.
+
+    Raises Crash or Unreachable, as the fault says. An exception of `effect` is a reply of the port, too, so it may be
+    lost.
+    """
     if fault is PortFault.CRASH_BEFORE:
         raise Crash(action)
     if fault is PortFault.ERROR:

@@ -1,4 +1,4 @@
-"""A port for a server that is started again where it was."""
+"""A free port for a server that a test starts again at the same port."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import random
 import socket
 from pathlib import Path
 
-_GIVEN = Path("/proc/sys/net/ipv4/ip_local_port_range")  # to whoever asks for any port, and to connections
+_EPHEMERAL = Path("/proc/sys/net/ipv4/ip_local_port_range")  # the system gives these to connections, and for port 0
 _LOWEST = 10_000
 
 
 def free() -> int:
-    """A port of 127.0.0.1 that nobody listens on.
+    """Return a port of 127.0.0.1 on which no process listens. Raises AssertionError if there is none.
 
-    If the system says which ports it gives to others by itself, it is none of these: between two starts of the server nobody gets it.
+    Where the system tells its range of ephemeral ports, the port lies below that range, so that the system gives it to no
+    other process between two starts of the server.
     """
-    given = int(_GIVEN.read_text().split()[0]) if _GIVEN.exists() else 0
-    for port in random.sample(range(_LOWEST, given), 100) if given > _LOWEST + 100 else [0] * 100:
+    below = int(_EPHEMERAL.read_text().split()[0]) if _EPHEMERAL.exists() else 0
+    for port in random.sample(range(_LOWEST, below), 100) if below > _LOWEST + 100 else [0] * 100:
         with contextlib.suppress(OSError), socket.socket() as probe:
             probe.bind(("127.0.0.1", port))
             return int(probe.getsockname()[1])

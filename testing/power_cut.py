@@ -1,9 +1,10 @@
-"""A disk that loses power: what was not synced may be there afterwards, or not, in any combination.
+"""Simulates a disk that loses power: each change that was not synced may be lost or not, in any combination.
 
-Calls are done on a real folder and written down. `Disk.after_cut` then makes the folder as it may be when power fails at
-a moment of that record. By POSIX (fsync(2)), only this is certain: a file has the bytes that it had when it was last
-synced, and a folder the names that it had when it was last synced. Of every other change of a name each may be lost for
-itself; a file may have the bytes of a sync, those that came later, or none of those.
+Calls are made on a real folder and recorded. `Disk.after_cut` then makes the folder as it may be after a power cut at
+one moment of that record. By POSIX (fsync(2)), only this is certain: a file has the bytes of its last sync, and a
+folder has the names of its last sync. Each other change of a name may be lost by itself. The record has the bytes of a
+file only at its syncs: so a file that was never synced is empty after the cut, and a sync that the cut interrupts may
+have written its bytes or not.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ Chance = Callable[[], bool]
 
 
 class DiskChange(NamedTuple):
-    """One line of the record."""
+    """One change in the record."""
 
     kind: str  # "name", "bytes", "sync"
-    thing: int  # the file or folder that it is about
+    thing: int  # the number of the file or folder that changes; of "name" the folder that holds the name
     name: str = ""
-    to: int | None = None  # of "name": which file or folder has that name from now on
+    to: int | None = None  # of "name": the file or folder that has the name from now on; None if none has
     body: bytes = b""
 
 
@@ -37,12 +38,12 @@ class Disk:
     def __init__(self, root: Path) -> None:
         self.root = Path(os.path.realpath(root))
         self.record: list[DiskChange] = []
-        self._things = {self.root: 0}  # what the paths of the moment mean
+        self._things = {self.root: 0}  # the file or folder that has each path now
         self._count = 0
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Write down what happens within the block."""
+        """Record the changes within the block."""
         opened = partial(self._open, io.open)
         with contextlib.ExitStack() as stack:
             for owner, name, made in (
@@ -60,7 +61,10 @@ class Disk:
             yield
 
     def after_cut(self, moment: int, chance: Chance, place: Path) -> None:
-        """Make in `place` what may be left if power fails after so many changes."""
+        """Make in `place` the folder as it may be if power fails after the first `moment` changes.
+
+        `chance` says of each uncertain change whether it reached the disk.
+        """
         record = self.record[:moment]
         synced = {change.thing: number for number, change in enumerate(record) if change.kind == "sync"}
         names: dict[int, dict[str, int]] = {}
@@ -91,10 +95,10 @@ class Disk:
     def _is_folder(self, thing: int) -> bool:
         return any(known == thing and path.is_dir() for path, known in self._things.items())
 
-    # What happens
+    # The functions of Python's library
 
     def _path(self, path: Any) -> Path | None:
-        """Below the root, or None."""
+        """Return the path if it is below the root, else None."""
         try:
             found = Path(os.path.abspath(os.fsdecode(path)))
         except TypeError:  # a handle
@@ -151,7 +155,7 @@ class Disk:
             self._name(found, None)
 
     def _fsync(self, do: Any, handle: int) -> None:
-        """Noted, and not done: what outlives a power cut is what was noted. Raises OSError if the file is not open."""
+        """Record the sync, but do not sync: `after_cut` needs only the record. Raises OSError if the file is not open."""
         os.fstat(handle)
         found = self._path(os.readlink(f"/proc/self/fd/{handle}"))
         if found is None:

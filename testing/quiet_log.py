@@ -1,4 +1,4 @@
-"""The log stands still while thousands of faults are tried."""
+"""Switches the log off while a test tries thousands of faults."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hippodrome.log import logger
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Log nothing below CRITICAL meanwhile."""
+    """Log nothing below CRITICAL within the block."""
     level = logger.log_level
     logger.setLevel(logging.CRITICAL)
     try:

@@ -1,4 +1,4 @@
-"""The functions that start, register and stop servers, as one object: for tests that call them without events."""
+"""The work of the functions that start, register and stop servers, as one object, for tests that need no events."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from hippodrome.storage.repository import Versioned
 
 
 class Servers:
-    """`start_server`, `task_changed` and `stop_server` in one process, with one project cache."""
+    """Does what `start_server`, `task_changed` and `stop_server` do, in one process with one project cache."""
 
     def __init__(self, platform: Platform) -> None:
         self._services = services = ServerServices(platform)
         self._start, self._dns, self._termination = Start(services), DnsRecords(services), Termination(services)
 
     def start(self, message: StartServer | KeepWarm) -> None:
-        """What `start_server` does for one message."""
+        """Do what `start_server` does for one message."""
         self._start.handle(message)
 
     def tasks_changed(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """What `task_changed` does for ECS events; return those that should be delivered again."""
+        """Do what `task_changed` does for ECS events; return those that should be delivered again."""
         again = self._dns.tasks_running([event for event in events if event.status == "RUNNING"])
         return again + self._termination.tasks_ended([event for event in events if event.status in ENDED])
 
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
-        """What `task_changed` does for its own messages; return those that should be delivered again."""
+        """Do what `task_changed` does for its own messages; return those that should be delivered again."""
         return self._dns.dns_changed(*messages)
 
     def stop(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
-        """What `stop_server` does; return the messages that should be delivered again."""
+        """Do what `stop_server` does for a batch; return the messages that should be delivered again."""
         return Stops(self._services).handle(batch)
 
     def clean_up_lost(self, stored: Versioned, reason: Reason) -> None:
-        """What the sweep does for a server whose task is gone."""
+        """Do what the sweep does for a server whose task is gone."""
         self._termination.clean_up_lost(stored, reason, Cause.VANISHED)
 
     def failures(self) -> list[Cause]:
-        """What the functions report as metrics."""
+        """Return the causes that the functions would report as metrics."""
         return self._services.failures()

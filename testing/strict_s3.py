@@ -1,7 +1,8 @@
-"""A bucket that takes presigned requests as S3 does, beside the function that signs them: both on a socket of this machine.
+"""An HTTP server on loopback that checks presigned requests as S3 does, and runs the function that signs them.
 
-moto and ministack take any signature. This one makes each signature anew from what arrives, refuses what differs or has
-expired, and lets the role of `sign_requests` in the template decide what a signed request may do.
+moto and ministack accept any signature. This server computes the signature of each request anew, refuses a request
+whose signature differs or has expired, and asks the role of `sign_requests` in the template whether a signed request is
+allowed.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ KEYS = ReadOnlyCredentials("ASIATESTING", "the role's secret", "the role's sessi
 
 
 class StrictS3(FakePlatform):
-    """A platform whose documents are also behind HTTP. `url` is what a trial is told to ask for requests."""
+    """A platform whose documents can be read and written over HTTP, too. Trials ask for presigned requests at `url`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.clock = datetime.now(UTC)
         self.lock = threading.RLock()
-        self.seen: list[tuple[str, str, int]] = []  # method, path and status of all that came
-        self.failing: list[int] = []  # what the next requests to the bucket get instead of an answer
+        self.requests: list[tuple[str, str, int]] = []  # method, path and status of all requests so far
+        self.failing: list[int] = []  # the statuses that the next requests to the bucket get
         domain = {"RootDomain": self.settings.root_domain, "ServersHost": self.settings.servers_host}
         values = cfn.ReferenceValues(parameters=domain, known={"Bucket": BUCKET})
         self.judge = Judge(values) if evaluator() else None
@@ -58,8 +59,8 @@ class StrictS3(FakePlatform):
 
     @contextmanager
     def serving(self) -> Iterator[StrictS3]:
-        """Requests are answered within the block."""
-        installed.use(self)  # it has what this function needs
+        """Answer requests within the block."""
+        installed.use(self)  # `sign_requests` needs nothing that this platform lacks
         thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         thread.start()
         try:
@@ -73,24 +74,25 @@ class StrictS3(FakePlatform):
         return datetime.now(UTC)
 
     def keep(self, record: Server) -> Server:
-        """Write a server's record; the record."""
+        """Write a server's record, and return it."""
         with self.lock:
             self.documents.put(server.key(record.label), to_json(record))
         return record
 
-    def told(self, record: Server) -> dict[str, str]:
-        """The variables with which the server of this record asks for requests."""
+    def variables(self, record: Server) -> dict[str, str]:
+        """Return the environment variables with which the server of this record asks for presigned requests."""
         with self.lock:
             credential = SecretCache(self.documents).get_or_create().credential(record.name, record.nonce)
         return {environment.STORE: self.url, environment.SERVER: record.name, environment.CREDENTIAL: credential}
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], body: bytes) -> tuple[int, bytes]:
+        """Answer one request to `target`, an address without scheme and host: its status and body."""
         path = urlsplit(target).path
         with self.lock:
             status, found = (
                 self._sign(method, headers, body) if path == "/sign" else self._s3(method, target, headers, body)
             )
-            self.seen.append((method, unquote(path), status))
+            self.requests.append((method, unquote(path), status))
         return status, found
 
     def _sign(self, method: str, headers: Mapping[str, str], body: bytes) -> tuple[int, bytes]:
@@ -117,7 +119,7 @@ class StrictS3(FakePlatform):
         return 200, b""
 
     def _refusal(self, method: str, target: str, headers: Mapping[str, str]) -> str:
-        """Why this is no presigned request that is good now; empty if it is."""
+        """Return why the signature of this request is not valid now; an empty string if it is."""
         parts = urlsplit(target)
         query = {name: values[0] for name, values in parse_qs(parts.query, keep_blank_values=True).items()}
         try:

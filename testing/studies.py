@@ -10,7 +10,10 @@ from testing.fake_platform import FakePlatform
 
 
 def study(**changes: object) -> Project:
-    """consent (2 groups) → questionnaire → game → survey → debrief; the server from step 2 up to step 4."""
+    """Return a project: consent (2 groups) → questionnaire → game → survey → debrief.
+
+    Its server starts at step 2 and stops at step 4. `changes` replaces fields.
+    """
     steps = [
         Step("1", "consent", 2),
         Step("2", "questionnaire"),
@@ -42,7 +45,7 @@ PAGES = {
 
 
 def installed(project: Project | None = None) -> FakePlatform:
-    """A platform in memory with the study registered and its pages uploaded."""
+    """Return a platform in memory that holds the project (`study()` unless given) and its pages."""
     platform = FakePlatform()
     project = project or study()
     platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))

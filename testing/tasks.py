@@ -1,4 +1,4 @@
-"""One Fargate task in memory, as ECS tells of it: for the platforms on which tasks start and end."""
+"""A Fargate task in memory, with its states and their ECS events, for the platforms on which tasks start and end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from testing import aws_events
 
 
 class Life(StrEnum):
-    """ECS's lastStatus of a task, as far as the functions can tell them apart."""
+    """The values of ECS's lastStatus that make a difference for the functions."""
 
     PROVISIONING = "PROVISIONING"
     RUNNING = "RUNNING"
@@ -21,7 +21,7 @@ class Life(StrEnum):
 
 @dataclass(repr=False)
 class Task:
-    """`last` and `desired` are ECS's lastStatus and desiredStatus; `version` is that of its latest event."""
+    """A task. `last` and `desired` are ECS's lastStatus and desiredStatus; `version` is that of its latest event."""
 
     number: int
     request: TaskRequest = field(repr=False)
@@ -40,39 +40,40 @@ class Task:
 
     @property
     def name(self) -> str:
+        """The name of the server that runs on it."""
         return self.request.name
 
     @property
     def user(self) -> str:
-        """Whose it was from the beginning; empty for a warm server."""
+        """The id of the participant for whom it was started; empty for a warm server and for a session's server."""
         return self.request.environment.get("USER_ID", "")
 
     @property
     def session(self) -> str:
-        """The id of the session whose it was from the beginning; empty for all others."""
+        """The id of the session for which it was started; empty for all other servers."""
         return self.request.environment.get("SESSION", "")
 
     @property
     def is_warm_server(self) -> bool:
-        """Whether it was started ahead, for no participant."""
+        """Whether it was started as a warm server, for no participant yet."""
         return self.request.environment.get("SPARE") == "on"
 
     @property
     def alive(self) -> bool:
-        """Whether nothing has told it to stop."""
+        """Whether it was not told to stop."""
         return self.desired is Life.RUNNING
 
     @property
     def ended(self) -> bool:
-        """Whether its container runs no more."""
+        """Whether its container has ended."""
         return self.last in (Life.DEPROVISIONING, Life.STOPPED)
 
     def stop(self, code: str | None, reason: str, exit_code: int | None = None) -> None:
-        """It is to stop from now on; its `last` follows later."""
+        """Tell the task to stop, for this reason. The caller changes `last` later."""
         self.desired, self.stop_code, self.reason, self.exit_code = Life.STOPPED, code, reason, exit_code
 
     def event(self) -> dict[str, Any]:
-        """The ECS Task State Change event of the state that it is in."""
+        """Return the "ECS Task State Change" event of its present state."""
         return aws_events.task_event(
             self.arn,
             self.name,

@@ -1,4 +1,4 @@
-"""`infra/template.yml` as data, and what its references become in an account."""
+"""Reads `infra/template.yml` as data, and resolves its references for an account."""
 
 from __future__ import annotations
 
@@ -39,25 +39,31 @@ _Loader.add_multi_constructor("!", _short_form)
 
 @cache
 def template() -> dict[str, Any]:
-    """The template. Not to be changed: copy it."""
+    """Return the template. All callers share the result, so copy it before you change it."""
     found: dict[str, Any] = yaml.load(PATH.read_text(encoding="utf-8"), _Loader)
     return found
 
 
 def resources(kind: str, of: Mapping[str, Any] | None = None) -> dict[str, dict[str, Any]]:
-    """Logical id → properties of the resources of a type, such as `AWS::Lambda::Function`."""
+    """Return logical id → properties of the resources of a type, such as `AWS::Lambda::Function`.
+
+    Here and below, `of` is the template, if it is another one than `infra/template.yml`.
+    """
     found = (of or template())["Resources"]
     return {name: one.get("Properties", {}) for name, one in found.items() if one["Type"] == kind}
 
 
 def functions(of: Mapping[str, Any] | None = None) -> dict[str, str]:
-    """Name of a function, as its file in `lambdas/`, → logical id."""
+    """Return the name of each function's file in `lambdas/` → logical id."""
     return {p["Handler"].split(".")[1]: name for name, p in resources("AWS::Lambda::Function", of).items()}
 
 
 @dataclass
 class ReferenceValues:
-    """What references become. `known` has what was made outside, by `Ref` ("Bucket") or attribute ("Bucket.Arn")."""
+    """The values of the template's references in one account (`id` is the account's).
+
+    `known` has the values of resources that exist already, by `Ref` ("Bucket") or attribute ("Bucket.Arn").
+    """
 
     stack: str = "hippodrome"
     id: str = "123456789012"
@@ -67,7 +73,10 @@ class ReferenceValues:
     of: Mapping[str, Any] = field(default_factory=template)
 
     def resolve(self, value: Any) -> Any:
-        """The value with its intrinsic functions done. KeyError for a reference to what does not exist."""
+        """Return the value with its intrinsic functions evaluated.
+
+        Raises KeyError for a reference to nothing, and for an intrinsic function that is not implemented here.
+        """
         if isinstance(value, list):
             return [self.resolve(item) for item in value]
         if not isinstance(value, dict):
@@ -91,6 +100,7 @@ class ReferenceValues:
         return {key: self.resolve(item) for key, item in value.items()}
 
     def holds(self, condition: str | dict[str, Any]) -> bool:
+        """Return whether a condition is true: its name, or an expression of Fn::Equals and Fn::Not."""
         expression = self.of["Conditions"][condition] if isinstance(condition, str) else condition
         ((name, argument),) = expression.items()
         if name == "Fn::Not":
@@ -99,6 +109,7 @@ class ReferenceValues:
         return str(left) == str(right)
 
     def ref(self, name: str) -> Any:
+        """Return the value of `Ref`; for a parameter without value and default `the-{name}`."""
         if name in self.known:
             return self.known[name]
         if name.startswith("AWS::"):
@@ -112,22 +123,21 @@ class ReferenceValues:
         return self._name(name)
 
     def attribute(self, name: str, attribute: str) -> str:
+        """Return the value of `Fn::GetAtt`."""
         if f"{name}.{attribute}" in self.known:
             return self.known[f"{name}.{attribute}"]
         kind = self.of["Resources"][name]["Type"]
         if attribute != "Arn" or kind not in _ARNS:
             return f"{self._name(name)}-{attribute}"
-        return _ARNS[kind].format(place=f"{self.region}:{self.id}", id=self.id, name=self.ref_name(name))
-
-    def ref_name(self, name: str) -> str:
-        return self.known.get(name) or self._name(name)
+        place = f"{self.region}:{self.id}"
+        return _ARNS[kind].format(place=place, id=self.id, name=self.known.get(name) or self._name(name))
 
     def _named(self, text: str) -> Any:
         name, _, attribute = text.partition(".")
         return self.attribute(name, attribute) if attribute else self.ref(name)
 
     def _name(self, name: str) -> str:
-        """The name it was given, or one like CloudFormation's."""
+        """Return the resource's name in the template, or else one like CloudFormation makes."""
         properties = self.of["Resources"][name].get("Properties", {})
         for key in ("FunctionName", "QueueName", "TopicName", "LogGroupName", "ClusterName", "DashboardName", "Name"):
             if key in properties and self.of["Resources"][name]["Type"] in _NAMED:
@@ -164,7 +174,7 @@ _NAMED = {*_ARNS, "AWS::CloudWatch::Dashboard"} - {"AWS::IAM::Role", "AWS::IAM::
 
 
 def statements(of: Mapping[str, Any] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every statement of every policy, unresolved, with the logical id of the resource it stands in."""
+    """Yield every statement of every policy, unresolved, with the logical id of its resource."""
     for name, one in (of or template())["Resources"].items():
         for document in _documents(one.get("Properties", {})):
             for statement in document["Statement"]:
@@ -172,9 +182,9 @@ def statements(of: Mapping[str, Any] | None = None) -> Iterator[tuple[str, dict[
 
 
 def role_documents(role: str, of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
-    """The documents of a role's policies, unresolved."""
+    """Return the documents of a role's inline policies, unresolved. Raises AssertionError if it has managed ones."""
     properties = (of or template())["Resources"][role]["Properties"]
-    assert not properties.get("ManagedPolicyArns"), f"{role} has a policy of AWS's, which the tests do not read"
+    assert not properties.get("ManagedPolicyArns"), f"{role} has managed policies, which the tests do not read"
     return [policy["PolicyDocument"] for policy in properties.get("Policies", [])]
 
 
@@ -191,5 +201,5 @@ def _documents(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def listed(value: Any) -> list[Any]:
-    """A policy element as a list, whether it was one or not."""
+    """Return an element of a policy as a list."""
     return value if isinstance(value, list) else [value]

@@ -1,7 +1,7 @@
-"""The browser and the program of a participant, without a screen: they send requests to `next_step` and read its pages.
+"""Clients of `next_step` for tests, in the same process: they send a participant's requests and read the answers.
 
-`Browser` reads HTML and sends the form of a page, as `web/` makes it. `Program` reads JSON and posts JSON, as a front end that a
-researcher has written. A real Chromium is in `testing/browser.py`.
+`Browser` reads HTML and sends the form of a page, as `web/` makes it. `Program` reads and posts JSON, as a front end
+does that a researcher has written. A real Chromium is in `testing/browser.py`.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from testing.fake_platform import FakePlatform
 
 
 def sent(answer: Mapping[str, Any]) -> bytes:
-    """The bytes that go over the line for a function's answer."""
+    """Return the bytes of a function's answer as they go over the network, compressed if the function compresses them."""
     body = str(answer["body"]).encode()
     return base64.b64decode(body) if answer["isBase64Encoded"] else body
 
 
 def body_of(answer: Mapping[str, Any]) -> bytes:
-    """An answer's body as the browser sees it."""
+    """Return the body of a function's answer, decompressed."""
     body = sent(answer)
     return gzip.decompress(body) if answer["headers"].get("Content-Encoding") == "gzip" else body
 
 
 def hidden(page: str) -> dict[str, str]:
-    """The hidden fields of a page's form."""
+    """Return the names and values of the hidden fields of a page's form."""
     return {
         name: html.unescape(value)
         for name, value in re.findall(r'<input type="hidden" name="([^"]+)" value="([^"]*)"', page)
@@ -41,7 +41,7 @@ def hidden(page: str) -> dict[str, str]:
 
 
 class Browser:
-    """Opens the link `query` on this platform and sends forms. Redirects are left to the test."""
+    """A browser that opens the link with this query on this platform, and sends forms. The test follows redirects."""
 
     def __init__(self, platform: FakePlatform, query: str = "projectId=maze&userId=alice") -> None:
         self.platform, self.query = platform, query
@@ -49,38 +49,40 @@ class Browser:
             installed.use(platform)
 
     def send(self, method: str = "GET", body: str | bytes | None = None, **headers: str) -> dict[str, Any]:
-        """What the function answers; names of headers are written with `_`."""
+        """Send a request and return the function's answer. Names of headers have `_` instead of `-`."""
         named = {"accept": "text/html", **{name.replace("_", "-"): value for name, value in headers.items()}}
         return next_step.handler(http_event(method, self.query, body, headers=named), None)
 
     def get(self, **headers: str) -> str:
-        """The page. AssertionError if there is none."""
+        """Open the link and return the page. Raises AssertionError unless the status is 200."""
         response = self.send(**headers)
         assert response["statusCode"] == 200, response
         return str(response["body"])
 
     def answer(self, page: str, **fields: object) -> dict[str, Any]:
-        """Submit the page's form with these fields."""
+        """Submit the page's form with its hidden fields and these fields; return the function's answer."""
         return self.post(**hidden(page), **fields)
 
     def post(self, **fields: object) -> dict[str, Any]:
+        """Submit a form with these fields alone; return the function's answer."""
         return self.send("POST", urlencode(fields, doseq=True), content_type=FORM)
 
 
 class Program:
-    """A front end of its own: it reads JSON, and posts a JSON object."""
+    """A front end that a researcher has written: it reads JSON, and posts a JSON object."""
 
     def __init__(self, platform: FakePlatform) -> None:
         self.platform = platform
         installed.use(platform)
 
-    def ask(self, method: str = "GET", body: str | None = None, kind: str = JSON) -> Any:
-        """What the JSON of the answer says. AssertionError unless it is 200."""
+    def ask(self, method: str = "GET", body: str | None = None, content_type: str = JSON) -> Any:
+        """Send a request and return its answer, parsed. Raises AssertionError unless the status is 200."""
         query = "projectId=maze&userId=alice"
-        headers = {"accept": JSON, "content-type": kind}
+        headers = {"accept": JSON, "content-type": content_type}
         response = next_step.handler(http_event(method, query, body, headers=headers), None)
         assert response["statusCode"] == 200, response
         return json.loads(response["body"])
 
     def post(self, answers: object) -> Any:
+        """Post these answers as JSON; return the function's answer, parsed."""
         return self.ask("POST", json.dumps(answers))

@@ -1,4 +1,4 @@
-"""Waiting for a condition, and never for a time."""
+"""Waits for a condition instead of a fixed time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def until(look: Callable[[], T], seconds: float = 20) -> T:
-    """What `look` returns once that is true. AssertionError with what it returned last, after so many seconds."""
+    """Return the first true result of `look`. Raises AssertionError with the last result after so many seconds."""
     end = time.monotonic() + seconds
     while not (found := look()):
         assert time.monotonic() < end, f"waited in vain; the last look: {found!r}"

@@ -1,1 +1,1 @@
-"""Every AWS call of every function, judged by its role in the template."""
+"""Judges every AWS call of every function by the function's role in the template."""

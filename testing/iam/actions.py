@@ -1,8 +1,9 @@
-"""What a call of an AWS API has to be allowed: actions on resources, with the condition keys that the call brings.
+"""The permissions that a call of an AWS API needs: actions on resources, with the values of the call's condition keys.
 
-Source: AWS's Service Authorization Reference (read November 2026), and where it is silent or wrong what AWS's own refusals
-name: ListTasks is judged on "*" (cdklabs/construct-hub pull request 1207) or on `container-instance/{cluster}/*`, so both
-must be allowed; ListSchedules on `schedule/*/*` whatever group is asked for; CreateCluster on the cluster to be.
+Source: AWS's Service Authorization Reference (read November 2026). Where it is silent or wrong, the messages count with
+which AWS refuses calls: they name "*" (cdklabs/construct-hub pull request 1207) or `container-instance/{cluster}/*` for
+ListTasks, so both must be allowed; `schedule/*/*` for ListSchedules, whatever its group; and the new cluster for
+CreateCluster.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from testing.aws_events import last
+
 
 @dataclass(frozen=True)
 class Ask:
-    """One thing that must be allowed. `kind` is what a table for people calls it."""
+    """An action on a resource that must be allowed, with the condition keys `context`. `about` is the kind of resource."""
 
     action: str
     resource: str
@@ -24,30 +27,31 @@ class Ask:
 
     @property
     def kind(self) -> str:
+        """The name of this permission in tables for people, such as `s3:GetObject answers`."""
         return f"{self.action} {self.about}".strip()
 
 
 class Facts(Protocol):
-    """What one has to know of the account to say what a call needs."""
+    """The facts of an account that decide which permissions a call needs."""
 
     region: str
     account: str
 
     def exists(self, bucket: str, key: str) -> bool:
-        """Whether the object is there."""
+        """Return whether the object exists."""
 
     def definition(self, name: str) -> tuple[str, list[str]]:
-        """The ARN with revision of a task definition, and its two roles."""
+        """Return the ARN with revision of a task definition, and the ARNs of its roles."""
 
-    def call_it(self, arn: str) -> str:
-        """What a person calls the topic, queue or role with this ARN: "start", "task"."""
+    def short_name(self, arn: str) -> str:
+        """Return the short name of a topic, queue or role, such as "start" or "tasks"; of others the ARN."""
 
 
 Params = Mapping[str, Any]
 
 
 def asks(service: str, operation: str, params: Params, facts: Facts) -> list[Ask]:
-    """What the call must be allowed. KeyError for an operation that stands not in the table below."""
+    """Return the permissions that the call needs. Raises KeyError for an operation that the table below does not have."""
     return _TABLE[f"{service}:{operation}"](params, facts)
 
 
@@ -55,7 +59,7 @@ def asks(service: str, operation: str, params: Params, facts: Facts) -> list[Ask
 
 
 def about_key(key: str) -> str:
-    """The kind of document: `answers` for all of `{projectId}/users/{userId}/answers/…`."""
+    """Return the kind of a document, such as `answers` for each `{projectId}/users/{userId}/answers/…`."""
     parts = key.split("/")
     if len(parts) > 3 and parts[1] == "users":
         return parts[3]
@@ -78,7 +82,7 @@ def _bucket(params: Params) -> str:
 
 
 def _get_object(params: Params, facts: Facts) -> list[Ask]:
-    """Without s3:ListBucket what is missing is 403, not 404; no prefix is part of that question."""
+    """Without s3:ListBucket (judged without s3:prefix), S3 answers 403 instead of 404 for a missing document."""
     found = [_object("s3:GetObject", params)]
     if not facts.exists(params["Bucket"], params["Key"]):
         found.append(Ask("s3:ListBucket", _bucket(params)))
@@ -86,9 +90,9 @@ def _get_object(params: Params, facts: Facts) -> list[Ask]:
 
 
 def _put_object(params: Params, facts: Facts) -> list[Ask]:
-    """A write with If-Match tells something of what is there, so it must be allowed to read it, too.
+    """A write with If-Match needs s3:GetObject, too, since its result says something about the stored document.
 
-    (S3 User Guide, "How to prevent object overwrites with conditional writes": s3:PutObject and s3:GetObject.)
+    (S3 User Guide, "How to prevent object overwrites with conditional writes".)
     """
     context = {}
     if "IfNoneMatch" in params:
@@ -111,12 +115,8 @@ def _ecs(facts: Facts, rest: str) -> str:
     return f"arn:aws:ecs:{facts.region}:{facts.account}:{rest}"
 
 
-def _last(text: str) -> str:
-    return text.rpartition("/")[2]
-
-
 def _in_cluster(params: Params, facts: Facts) -> dict[str, str]:
-    return {"ecs:cluster": _ecs(facts, f"cluster/{_last(params['cluster'])}")}
+    return {"ecs:cluster": _ecs(facts, f"cluster/{last(params['cluster'])}")}
 
 
 def _run_task(params: Params, facts: Facts) -> list[Ask]:
@@ -125,43 +125,43 @@ def _run_task(params: Params, facts: Facts) -> list[Ask]:
     assert not {"taskRoleArn", "executionRoleArn"} & set(overrides), "other roles would have to be passed"
     return [
         Ask("ecs:RunTask", definition, _in_cluster(params, facts)),
-        Ask("ecs:TagResource", _ecs(facts, f"task/{_last(params['cluster'])}/*"), {"ecs:CreateAction": "RunTask"}),
+        Ask("ecs:TagResource", _ecs(facts, f"task/{last(params['cluster'])}/*"), {"ecs:CreateAction": "RunTask"}),
         *(_pass(role, "ecs-tasks.amazonaws.com", facts) for role in roles),
     ]
 
 
-def _pass(role: str, to: str, facts: Facts) -> Ask:
-    return Ask("iam:PassRole", role, {"iam:PassedToService": to}, facts.call_it(role))
+def _pass(role: str, service: str, facts: Facts) -> Ask:
+    return Ask("iam:PassRole", role, {"iam:PassedToService": service}, facts.short_name(role))
 
 
 def _task(action: str, name: str) -> Callable[[Params, Facts], list[Ask]]:
     def needed(params: Params, facts: Facts) -> list[Ask]:
         tasks = params[name] if isinstance(params[name], list) else [params[name]]
         within = _in_cluster(params, facts)
-        return [Ask(action, _ecs(facts, f"task/{_last(params['cluster'])}/{_last(task)}"), within) for task in tasks]
+        return [Ask(action, _ecs(facts, f"task/{last(params['cluster'])}/{last(task)}"), within) for task in tasks]
 
     return needed
 
 
 def _list_tasks(params: Params, facts: Facts) -> list[Ask]:
     within = _in_cluster(params, facts)
-    instances = _ecs(facts, f"container-instance/{_last(params['cluster'])}/*")
+    instances = _ecs(facts, f"container-instance/{last(params['cluster'])}/*")
     return [Ask("ecs:ListTasks", resource, within) for resource in ("*", instances)]
 
 
 def _cluster(action: str, name: str) -> Callable[[Params, Facts], list[Ask]]:
-    return lambda params, facts: [Ask(action, _ecs(facts, f"cluster/{_last(params[name])}"))]
+    return lambda params, facts: [Ask(action, _ecs(facts, f"cluster/{last(params[name])}"))]
 
 
 # -- Route 53
 
 
 def _zone(params: Params) -> str:
-    return f"arn:aws:route53:::hostedzone/{_last(params['HostedZoneId'])}"
+    return f"arn:aws:route53:::hostedzone/{last(params['HostedZoneId'])}"
 
 
 def normalized(name: str) -> str:
-    """A name as the condition key has it: lower case, no final dot, odd characters as octal codes.
+    """Return a name in the form of the condition key: lower case, no final dot, special characters as octal codes.
 
     https://docs.aws.amazon.com/Route53/latest/DeveloperGuide/specifying-rrset-conditions.html
     """
@@ -200,12 +200,12 @@ def _list_schedules(params: Params, facts: Facts) -> list[Ask]:
 
 
 def _publish(params: Params, facts: Facts) -> list[Ask]:
-    return [Ask("sns:Publish", params["TopicArn"], {}, facts.call_it(params["TopicArn"]))]
+    return [Ask("sns:Publish", params["TopicArn"], {}, facts.short_name(params["TopicArn"]))]
 
 
 def _send_message(params: Params, facts: Facts) -> list[Ask]:
-    arn = f"arn:aws:sqs:{facts.region}:{facts.account}:{_last(params['QueueUrl'])}"
-    return [Ask("sqs:SendMessage", arn, {}, facts.call_it(arn))]
+    arn = f"arn:aws:sqs:{facts.region}:{facts.account}:{last(params['QueueUrl'])}"
+    return [Ask("sqs:SendMessage", arn, {}, facts.short_name(arn))]
 
 
 _TABLE: dict[str, Callable[[Params, Facts], list[Ask]]] = {
@@ -222,7 +222,7 @@ _TABLE: dict[str, Callable[[Params, Facts], list[Ask]]] = {
     "ecs:ListClusters": lambda params, facts: [Ask("ecs:ListClusters", "*")],
     "ec2:DescribeNetworkInterfaces": lambda params, facts: [Ask("ec2:DescribeNetworkInterfaces", "*")],
     "route53:ChangeResourceRecordSets": _change_records,
-    "route53:GetChange": lambda p, facts: [Ask("route53:GetChange", f"arn:aws:route53:::change/{_last(p['Id'])}")],
+    "route53:GetChange": lambda p, facts: [Ask("route53:GetChange", f"arn:aws:route53:::change/{last(p['Id'])}")],
     "route53:ListResourceRecordSets": lambda p, facts: [Ask("route53:ListResourceRecordSets", _zone(p))],
     "scheduler:CreateSchedule": _schedule("scheduler:CreateSchedule"),
     "scheduler:UpdateSchedule": _schedule("scheduler:UpdateSchedule"),

@@ -1,9 +1,9 @@
-"""Roles enforced on moto: each AWS call of a handler is judged by the role of its function in `infra/template.yml`.
+"""Enforces roles on moto: each AWS call of a handler is judged by the role of its function in `infra/template.yml`.
 
-While a `MotoWorld` is open, `lambdas.*.handler` run as their functions do: each with a platform of its own, which knows
-only the environment variables that the template gives it, and with its role. What the role does not allow is refused with
-AWS's error; and when the world closes, it fails if anything was refused, or if a function has a right that only others
-need (`WHO_MAY`).
+While a `MotoWorld` is open, each handler of `lambdas` runs with its function's role and with a platform of its own,
+which has only the environment variables that the template gives the function. A call that the role does not allow is
+refused with AWS's error. When the world closes, it fails if a call was refused, or if a function has a permission that
+only others need (`WHO_MAY`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from testing.iam.judge import Judge, evaluator
 
 
 class EnforcedWorld(Protocol):
-    """What the enforcement needs of a `MotoWorld`."""
+    """The part of a `MotoWorld` that the enforcement needs."""
 
     platform: AwsPlatform
     region: str
@@ -35,12 +35,12 @@ class EnforcedWorld(Protocol):
     ids: dict[str, str]
 
     def client(self, service: str) -> Any:
-        """A client of the world's own, whose calls are not judged."""
+        """Return a client of the world's own, whose calls are not judged."""
 
 
 @dataclass(frozen=True)
 class ApiCall:
-    """One call of an AWS API, made through any botocore client but the world's own."""
+    """One call of an AWS API through any botocore client but the world's own."""
 
     service: str  # as botocore names it: s3, ecs, ec2, route53, scheduler, sns, sqs
     operation: str  # PutObject
@@ -48,7 +48,7 @@ class ApiCall:
 
     @property
     def action(self) -> str:
-        """`ecs:RunTask`: nearly the name of the IAM action (ListObjectsV2 needs `s3:ListBucket`)."""
+        """Service and operation: `ecs:RunTask`. Most IAM actions have this name (ListObjectsV2 needs `s3:ListBucket`)."""
         return f"{self.service}:{self.operation}"
 
 
@@ -57,25 +57,26 @@ SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
 REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_certificate", "sign_requests"
 
 WHO_MAY: dict[str, set[str]] = {
-    # Without it, S3 does not tell a missing document from a forbidden one.
+    # Without s3:ListBucket, S3 gives the same answer for a missing document as for a forbidden one.
     "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
-    # Functions that need the list: to see whether a project is live, and its game steps. stop_server stops a
-    # participant's servers of all projects, if the message names none.
+    # Most functions look up whether a project is live, and its game steps. stop_server stops a participant's servers of
+    # all projects if the message names no project.
     "s3:GetObject project_master_list.json": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP},
     "s3:PutObject project_master_list.json": {REGISTER},
     "s3:GetObject steps": {NEXT},
     "s3:GetObject participant.json": {NEXT},
     "s3:PutObject participant.json": {NEXT},
-    # Servers have no rights: sign_requests presigns what they read and create, and may itself do no more than that.
+    # Servers have no role: sign_requests presigns the requests with which they read and create documents, and may do no
+    # more.
     "s3:GetObject answers": {NEXT, SIGN},
     "s3:PutObject answers": {NEXT, SIGN},
     "s3:GetObject trials": {SIGN},
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
     "s3:GetObject spares": {SIGN},
-    # Sessions: who waits in a lobby, what is decided there, and the documents of sessions and of their members, which are
-    # written once. start_server and stop_server note who is under way, and who is not; the sweep finishes what was
-    # interrupted. A lost server is replaced unless all members have played; the relays look whose session it is.
+    # Sessions: a lobby's entries and its decisions, and the documents of sessions and of their members, which are written
+    # once. start_server and stop_server note whether a participant is under way; the sweep finishes decisions that were
+    # interrupted. A lost server is replaced unless all members have played; the relays look up a participant's session.
     "s3:GetObject _lobby": {NEXT, SWEEP},
     "s3:PutObject _lobby": {NEXT, START},
     "s3:DeleteObject _lobby": {NEXT, START, STOP, SWEEP},
@@ -87,34 +88,37 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject a session's session.json": {NEXT, SWEEP},
     "s3:GetObject a session's trials": {SIGN},
     "s3:PutObject a session's trials": {SIGN},
-    # matching: match: next_step asks who plays with whom, and servers answer. The sweep deletes what is old.
+    # With `matching: match`, next_step asks who plays with whom, and servers answer. The sweep deletes old questions
+    # and answers.
     "s3:GetObject _match": {NEXT, SIGN},
     "s3:PutObject _match": {NEXT},
     "s3:GetObject lobby/groups": {NEXT},
     "s3:PutObject lobby/groups": {SIGN},
     "s3:DeleteObject _match": {SWEEP},
     "s3:DeleteObject lobby/groups": {SWEEP},
-    # What tickets, tokens and credentials are derived from; it is made with the first project, or the first server after
-    # an upgrade.
+    # Tickets, tokens and credentials are derived from the secret. It is made with the first project, or with the first
+    # server after an upgrade.
     "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
     "s3:PutObject _secret.json": {START, REGISTER},
     # Functions that show, name, stop or remove servers read the record first; the relays compare the server's token.
     "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
-    # Slots of projects with limits. next_step takes one for a newcomer, and registering counts the participants who came
-    # before the limit; a function that starts a server takes one, and one that ends a server releases it.
+    # Slots of projects with limits. next_step takes a slot for a new participant, and registering counts the
+    # participants who came before the limit; a function that starts a server takes a slot, and one that ends a server
+    # releases it.
     "s3:GetObject places": {NEXT, REGISTER},
     "s3:PutObject places": {NEXT, REGISTER},
     "s3:GetObject _places": {START, TASK, STOP, SWEEP},
     "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # Warm servers: the pools (_spares), and the handover of each assigned one, deleted by the function that ends it.
+    # Warm servers: the pools (_spares), and the handover of each assigned server, which the function deletes that ends
+    # it.
     "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject spares": {START},
     "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
-    # A step or a relay requests a server; a function that finds one lost requests the next attempt. Registering, and
+    # A step or a relay requests a server; a function that finds a lost server requests the next attempt. Registering, and
     # assigning or ending a warm server, request that the pool is adjusted, which may stop servers. The sweep stops
-    # servers by message, and sends the messages of servers that make no progress again.
+    # servers by messages, and sends the messages of servers that make no progress again.
     "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
     "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
     "sqs:SendMessage tasks": {TASK, SWEEP},
@@ -122,21 +126,21 @@ WHO_MAY: dict[str, set[str]] = {
     "scheduler:CreateSchedule": {START, SEND_STOP},
     "scheduler:UpdateSchedule": {START, SEND_STOP},
     "iam:PassRole ScheduleRole": {START, SEND_STOP},
-    # A function that ends a server deletes its timer; start_server ends one that AWS refused.
+    # A function that ends a server deletes its timer; start_server ends a server whose task AWS refused.
     "scheduler:DeleteSchedule": {START, TASK, STOP, SWEEP},
     "scheduler:ListSchedules": {SWEEP},
     "ecs:RunTask": {START},
     "ecs:TagResource": {START},
     "iam:PassRole TaskExecutionRole": {START},
     "ecs:CreateCluster": {START},
-    "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as timers
+    "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as with timers
     "ecs:StopTask": {TASK, STOP, SWEEP},  # task_changed: a task that runs too late
     "ecs:ListTasks": {STOP, SWEEP},  # stop_server: a task whose id is not known yet
     "ecs:DescribeTasks": {SWEEP},
     "ecs:ListClusters": {SWEEP},
     "ec2:DescribeNetworkInterfaces": {TASK},
     "route53:ChangeResourceRecordSets UPSERT A": {TASK},
-    "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # as timers
+    "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # as with timers
     "route53:GetChange": {TASK, RENEW},
     "route53:ListResourceRecordSets": {SWEEP},
 }
@@ -148,7 +152,10 @@ Handler = Callable[[dict[str, Any], object], Any]
 
 
 def account_of(world: EnforcedWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> cfn.ReferenceValues:
-    """The template's references in the world's account."""
+    """Return the values of the template's references in the world's account.
+
+    `of` is the template, if it is another one; `parameters` are added to those that the world's environment gives.
+    """
     env = world.env
     known = {
         "Bucket": env["BUCKET"],
@@ -174,7 +181,7 @@ def account_of(world: EnforcedWorld, of: Mapping[str, Any] | None = None, **para
 
 
 class IamEnforcement:
-    """The enforcement of one world."""
+    """Judges the calls of one world. `refused` and `too_much` are the findings, in sentences."""
 
     def __init__(self, world: EnforcedWorld, of: Mapping[str, Any] | None = None, **parameters: str) -> None:
         self._world = world
@@ -182,18 +189,18 @@ class IamEnforcement:
         self._account = account_of(world, of, **parameters)
         self._judge = Judge(self._account)
         self._rooms: dict[str, tuple[Any, dict[Any, Any]]] = {}
-        self.kinds: set[str] = set()  # of the rights that were needed
+        self.kinds: set[str] = set()  # the kinds of permissions that were needed
         self.refused: list[str] = []
         self.too_much: list[str] = []
 
     @classmethod
     def of(cls, world: EnforcedWorld) -> IamEnforcement | None:
-        """None if there is no evaluator: `test_enforcement.py` says so aloud."""
+        """Return the enforcement of a world; None without an evaluator, which `test_enforcement.py` reports."""
         return cls(world) if evaluator() else None
 
     @contextlib.contextmanager
     def enforced(self) -> Iterator[None]:
-        """Handlers run as their functions within the block."""
+        """Run handlers with the roles of their functions within the block."""
         with contextlib.ExitStack() as stack:
             for name in self._judge.functions:
                 if name != RENEW:  # needs a certificate authority; its calls are judged in test_enforcement.py
@@ -202,28 +209,28 @@ class IamEnforcement:
             yield
 
     def findings(self) -> list[str]:
-        """What was wrong, in sentences."""
+        """Return what was wrong, in sentences, each once."""
         return [*dict.fromkeys([*self.refused, *self.too_much])]
 
     def judge(self, call: ApiCall) -> dict[str, Any] | None:
-        """AWS's error if the calling function may not make this call; None if it may, or if no function calls."""
-        who = _running.get()
-        if who is None:
+        """Return AWS's error if the running function may not make this call; None if it may, or if no function runs."""
+        function = _running.get()
+        if function is None:
             return None
         try:
             wanted = asks(call.service, call.operation, call.params, self)
         except KeyError:
-            return self._refuse(call, f"{who} calls {call.action}, which actions.py does not describe")
+            return self._refuse(call, f"{function} calls {call.action}, which actions.py does not describe")
         for ask in wanted:
             self.kinds.add(ask.kind)
-            if not self._judge.may(who, ask):
-                return self._refuse(call, f"{who} may not {ask.kind} on {ask.resource}")
+            if not self._judge.may(function, ask):
+                return self._refuse(call, f"{function} may not {ask.kind} on {ask.resource}")
             others = self._judge.who_may(ask) - WHO_MAY.get(ask.kind, set())
             self.too_much += [f"{other} may {ask.kind} as well, which is not needed" for other in sorted(others)]
         return None
 
     def signed(self, call: ApiCall) -> None:
-        """Judge a presigned request: it has the rights of the role that signed it."""
+        """Judge a presigned request by the role of `sign_requests`, which has signed it."""
         token = _running.set(SIGN)
         try:
             self.judge(call)
@@ -251,13 +258,13 @@ class IamEnforcement:
         return run
 
     def _room(self, name: str) -> tuple[Any, dict[Any, Any]]:
-        """The function's own platform, and what it keeps between invocations."""
+        """Return the function's own platform, and the cache that it keeps between invocations."""
         if name not in self._rooms:
             self._rooms[name] = (AwsPlatform.from_env(self.environment(name)), {})
         return self._rooms[name]
 
     def environment(self, name: str) -> dict[str, str]:
-        """The variables that the template gives the function."""
+        """Return the environment variables that the template gives the function."""
         properties = self._account.of["Resources"][self._judge.functions[name]]["Properties"]
         return {
             "AWS_REGION": self.region,
@@ -277,7 +284,7 @@ class IamEnforcement:
         found = self._world.client("ecs").describe_task_definition(taskDefinition=name)["taskDefinition"]
         return found["taskDefinitionArn"], [found[key] for key in ("taskRoleArn", "executionRoleArn") if key in found]
 
-    def call_it(self, arn: str) -> str:
+    def short_name(self, arn: str) -> str:
         names = {
             self._account.ref("StartServerTopic"): "start",
             self._account.ref("StopServerTopic"): "stop",

@@ -1,7 +1,8 @@
-"""Whether a role may do a thing, as ministack's evaluator of IAM policies sees it.
+"""Judges with ministack's evaluator of IAM policies whether a role allows an action.
 
-The evaluator (`ministack/core/iam_evaluator.py`, 1.5.33) implements AWS's logic: explicit deny, allow, else no. It imports
-only the standard library, so it is loaded from ministack's own environment into this process without the rest.
+The evaluator (`ministack/core/iam_evaluator.py`, 1.5.33) implements AWS's logic: an explicit deny refuses, else an
+allow allows, else the action is refused. It imports only the standard library, so this process can load its file alone
+from ministack's own virtual environment.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ MISSING = (
 
 
 def evaluator_path() -> Path | None:
-    """Where the evaluator lies; None if ministack is not there."""
+    """Return the path of the evaluator; None if ministack is not installed."""
     sites = [Path(os.environ["MINISTACK_SITE"])] if os.environ.get("MINISTACK_SITE") else []
     for venv in (os.environ.get("MINISTACK_VENV"), ROOT / ".venv-ministack"):
         sites += sorted(Path(venv).glob("lib/python3*/site-packages")) if venv else []
@@ -36,7 +37,7 @@ def evaluator_path() -> Path | None:
 
 @cache
 def evaluator() -> ModuleType | None:
-    """ministack's evaluator; None if ministack is not there."""
+    """Return the evaluator's module; None if ministack is not installed."""
     path = evaluator_path()
     if path is None:
         return None
@@ -51,7 +52,10 @@ def evaluator() -> ModuleType | None:
 
 
 class Judge:
-    """Judges by the policies of the template's roles, resolved for one account."""
+    """Judges by the policies of the template's roles, with the references of one account.
+
+    `principal` is always a function's name, or the logical id of a role or managed policy of the template.
+    """
 
     def __init__(self, account: cfn.ReferenceValues) -> None:
         found = evaluator()
@@ -62,16 +66,16 @@ class Judge:
         self._policies: dict[str, list[Any]] = {}
         self._decided: dict[tuple[Any, ...], bool] = {}
 
-    def may(self, who: str, ask: Ask) -> bool:
-        """Whether the function, or else the role or managed policy of this logical id, allows it."""
-        question = (who, ask.action, ask.resource, *sorted((key, str(value)) for key, value in ask.context.items()))
+    def may(self, principal: str, ask: Ask) -> bool:
+        """Return whether the policies of the principal allow it."""
+        question = (principal, ask.action, ask.resource, *sorted(map(str, ask.context.items())))
         if question not in self._decided:  # the same questions come thousands of times in a run
-            self._decided[question] = self._decide(who, ask)
+            self._decided[question] = self._decide(principal, ask)
         return self._decided[question]
 
-    def _decide(self, who: str, ask: Ask) -> bool:
+    def _decide(self, principal: str, ask: Ask) -> bool:
         context = self._iam.EvalContext(
-            principal_arn=f"arn:aws:sts::{self._account.id}:assumed-role/{who}/session",
+            principal_arn=f"arn:aws:sts::{self._account.id}:assumed-role/{principal}/session",
             principal_type="AssumedRole",
             principal_account=self._account.id,
             action=ask.action,
@@ -80,25 +84,26 @@ class Judge:
             secure_transport=True,
             service_context={key.lower(): value for key, value in ask.context.items()},
         )
-        return bool(self._iam.evaluate(context, self.policies(who)).decision == "Allow")
+        return bool(self._iam.evaluate(context, self.policies(principal)).decision == "Allow")
 
     def who_may(self, ask: Ask) -> frozenset[str]:
-        """The functions that are allowed to do it."""
+        """Return the functions that are allowed to do it."""
         return frozenset(name for name in self.functions if self.may(name, ask))
 
-    def policies(self, who: str) -> list[Any]:
-        if who not in self._policies:
-            documents = [self._account.resolve(document) for document in self._documents(who)]
+    def policies(self, principal: str) -> list[Any]:
+        """Return the parsed policies of the principal. Raises AssertionError if one is not valid."""
+        if principal not in self._policies:
+            documents = [self._account.resolve(document) for document in self._documents(principal)]
             problems = [self._iam.validate_policy_document(document) for document in documents]
-            assert not any(problems), (who, problems)
-            self._policies[who] = [self._iam.parse_policy_document(document) for document in documents]
-        return self._policies[who]
+            assert not any(problems), (principal, problems)
+            self._policies[principal] = [self._iam.parse_policy_document(document) for document in documents]
+        return self._policies[principal]
 
-    def _documents(self, who: str) -> Iterable[Mapping[str, Any]]:
-        found = self._account.of["Resources"]
-        if who in self.functions:
-            role = found[self.functions[who]]["Properties"]["Role"]["Fn::GetAtt"][0]
+    def _documents(self, principal: str) -> Iterable[Mapping[str, Any]]:
+        resources = self._account.of["Resources"]
+        if principal in self.functions:
+            role = resources[self.functions[principal]]["Properties"]["Role"]["Fn::GetAtt"][0]
             return cfn.role_documents(role, self._account.of)
-        if found[who]["Type"] == "AWS::IAM::ManagedPolicy":
-            return [found[who]["Properties"]["PolicyDocument"]]
-        return cfn.role_documents(who, self._account.of)
+        if resources[principal]["Type"] == "AWS::IAM::ManagedPolicy":
+            return [resources[principal]["Properties"]["PolicyDocument"]]
+        return cfn.role_documents(principal, self._account.of)

@@ -1,1 +1,1 @@
-"""An installation on ministack: the real template with the real functions and their roles."""
+"""An installation on the emulator ministack: the real template with the real functions and their roles."""

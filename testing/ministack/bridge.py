@@ -1,14 +1,17 @@
-"""Python as a newcomer's commands run it on the emulator: `python bridge.py -m deploy …`, with BRIDGE naming a JSON file.
+"""Runs a command of a new user's first hour on the emulator: `python bridge.py -m deploy …`.
 
-What stands between the commands and the Internet, and is not there:
+The environment variable BRIDGE names a JSON file with the addresses of the tests' name server and certificate
+authorities. These bridges take the place of the Internet and of parts of AWS that the emulator lacks:
 
-- Gap: the emulator has no name servers. A name server of the tests says what the Internet's would.
-- Gap: Let's Encrypt is two Pebbles, one for its staging authority and one for the real one, and its challenges are told
-  to Pebble's own DNS as well.
-- Gap: the site's address leads to the emulator's gateway by its Host header alone.
-- Gap: the emulator has no quotas. A new account's are answered: 6 vCPUs of Fargate, 10 executions of Lambda, one build.
-- Gap: ECR's findings about an image are unknown to the emulator. There are none.
-- No Docker: the image is built "at AWS", whatever runs on the machine of the tests.
+- Gap: the emulator has no name servers. Bridge: a name server of the tests answers.
+- Gap: Let's Encrypt is not reachable. Bridge: one Pebble for its staging authority and another for the real one; the DNS
+  challenges are also given to Pebble's own DNS servers.
+- Gap: the site's domain name leads nowhere. Bridge: requests go to the emulator's gateway, with the domain name as Host
+  header.
+- Gap: the emulator has no quotas. Bridge: those of a new account: 6 vCPUs of Fargate, 10 executions of Lambda, one
+  build, 5 VPCs.
+- Gap: the emulator has no scan findings of ECR images. Bridge: a complete scan without findings.
+- Docker counts as missing, so the image is always built by CodeBuild, whatever the tests' machine has.
 """
 
 from __future__ import annotations
@@ -23,28 +26,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-TOLD = json.loads(Path(os.environ["BRIDGE"]).read_text())
+SETTINGS = json.loads(Path(os.environ["BRIDGE"]).read_text())
 EXECUTIONS = 10
 
 
 def certificates() -> None:
     from hippodrome.certificates import rules as certificate
 
-    certificate.STAGING, certificate.PRODUCTION = TOLD["staging"], TOLD["production"]  # before anybody imports them
+    # Before any module imports them.
+    certificate.STAGING, certificate.PRODUCTION = SETTINGS["staging"], SETTINGS["production"]
     from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.certificates import renewal
 
     order, put = renewal.Renewal.obtain, Route53Challenges.put
 
     def obtain(self: Any, wish: Any) -> Any:
-        return order(self, renewal.RenewalRequest(**{**vars(wish), "trusted": TOLD["trusted"][wish.directory]}))
+        return order(self, renewal.RenewalRequest(**{**vars(wish), "trusted": SETTINGS["trusted"][wish.directory]}))
 
     def published(self: Any, name: str, values: Sequence[str], seconds: float) -> None:
         put(self, name, values, seconds)
-        for management in TOLD["dns"]:
+        for management in SETTINGS["dns"]:
             for value in values:
-                said = json.dumps({"host": f"{name}.", "value": value}).encode()
-                urllib.request.urlopen(urllib.request.Request(f"{management}/set-txt", said), timeout=10).read()
+                record = json.dumps({"host": f"{name}.", "value": value}).encode()
+                urllib.request.urlopen(urllib.request.Request(f"{management}/set-txt", record), timeout=10).read()
 
     renewal.Renewal.obtain = obtain  # type: ignore[method-assign]
     Route53Challenges.put = published  # type: ignore[method-assign]
@@ -58,7 +62,7 @@ def internet() -> None:
     class Resolver(dns.resolver.Resolver):
         def __init__(self, *_: object, **__: object) -> None:
             super().__init__(configure=False)
-            self.nameservers, self.port = ["127.0.0.1"], TOLD["nameserver"]
+            self.nameservers, self.port = ["127.0.0.1"], SETTINGS["nameserver"]
 
     dns.resolver.Resolver = Resolver  # type: ignore[misc]
 
@@ -100,7 +104,7 @@ def account() -> None:
 
 
 if __name__ == "__main__":
-    sys.path[0] = os.getcwd()  # as `python -m` has it
+    sys.path[0] = os.getcwd()  # as with `python -m`
     if sys.argv[1:3] == ["-m", "deploy"]:
         certificates()
         internet()

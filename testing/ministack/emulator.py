@@ -1,38 +1,38 @@
-"""Runs ministack 1.5.33, with the bridges over what it lacks. Its own Python runs this file; tests do not import it.
+"""Runs ministack 1.5.33 with bridges over its gaps. ministack's own Python runs this file; tests do not import it.
 
     VENV/bin/python testing/ministack/emulator.py   # with ministack's environment variables, and DECISIONS=FILE
 
-It ends when its standard input ends, so that it does not outlive the tests. Every decision about a caller who is not root is written
-to DECISIONS, a JSON object a line: `who`, `action`, `resource`, `allowed`.
+It ends when its standard input ends, so that it does not outlive the tests. It writes every decision about a caller
+other than root to DECISIONS, one JSON object per line: `who`, `action`, `resource`, `allowed`.
 
-With AUTH=true ministack judges each call by the caller's policies, but for some actions it judges another resource than
-AWS does, or leaves condition keys out, so that a policy that fits AWS exactly is refused. Gaps that are bridged here,
-each after the Service Authorization Reference (read November 2026):
+With AUTH=true ministack judges each call by the caller's policies. But for some actions it judges another resource than
+AWS does, or lacks condition keys, so that it refuses callers whom AWS allows the call. These gaps are bridged here, by
+the Service Authorization Reference (read November 2026):
 
 - ECS: every call that names a cluster is judged on the cluster. AWS: RunTask on the task definition with its revision,
-  StopTask and DescribeTasks on each task, ListTasks on container instances, CreateCluster on the cluster to be; and all
+  StopTask and DescribeTasks on each task, ListTasks on container instances, CreateCluster on the new cluster; and all
   of them with the key ecs:cluster.
 - ECS RegisterTaskDefinition is judged on "*". AWS: on the task definition, with PassRole for its roles.
 - CodeBuild BatchGetBuilds is judged on "*". AWS: on the builds' projects.
-- CloudWatch DescribeAlarms is judged on "*". AWS: on alarms, of which a list names none.
-- Scheduler: every schedule is taken for one of the group `default`.
-- Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets knows none of its three keys.
+- CloudWatch DescribeAlarms is judged on "*". AWS: on `alarm:*` where the call lists alarms.
+- Scheduler: every schedule is judged as one of the group `default`.
+- Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets lacks its three condition keys.
 - S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
-- PassRole: never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
+- PassRole is never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
   schedules, with iam:PassedToService; and for CloudFormation, Lambda and others that no function of ours calls.
-- Roles that trust a service on conditions (aws:SourceAccount, aws:SourceArn) cannot be assumed. Here root may, in
-  the service's place.
+- Roles that trust a service under conditions (aws:SourceAccount, aws:SourceArn) cannot be assumed. Here root may assume
+  them, in the place of the service.
 
 Gaps elsewhere:
 
-- ECS emits no events, and PutEvents refuses `aws.ecs` to everybody, as AWS does. Here root may.
+- ECS emits no events, and PutEvents refuses the source `aws.ecs` to all callers, as on AWS. Here root may use it.
 - RunTask ignores clientToken. AWS: the same token and parameters in a cluster give the same task again, and other
   parameters a ConflictException that names it.
-- CodeBuild's builds succeed at once, make nothing and log nothing, but name a log group. Here the image that a build is
-  told to push is in the repository, and no log is named.
-- CloudFormation leaves a number that a parameter gave a text, and Lambda's pollers cannot count with it.
-- EC2 forgets which interface an address was associated with, and DescribeNetworkInterfaces leaves out ids it does not
-  know, where EC2 fails.
+- CodeBuild's builds succeed at once, make nothing and log nothing, but name a log group. Here a build puts the image
+  that it is to push into the repository, and names no log.
+- CloudFormation passes a number that comes from a parameter on as text, with which Lambda's pollers cannot compute.
+- EC2 does not remember to which interface an address was associated; and DescribeNetworkInterfaces leaves out unknown
+  ids, while on AWS the call fails.
 """
 
 from __future__ import annotations
@@ -59,17 +59,17 @@ _decisions = open(os.environ["DECISIONS"], "a", buffering=1)  # noqa: SIM115 - a
 
 @dataclass
 class Asked:
-    """What a request has to be allowed, as AWS sees it."""
+    """The permissions that a request needs on AWS: its action on these resources, with these condition keys; and PassRole."""
 
     resources: list[str]
     context: dict[str, Any] = field(default_factory=dict)
-    passed: list[tuple[str, str]] = field(default_factory=list)  # roles, and to which service
+    passed: list[tuple[str, str]] = field(default_factory=list)  # roles, each with the service to which it is passed
 
 
 _asked: contextvars.ContextVar[tuple[str, Asked] | None] = contextvars.ContextVar("asked", default=None)
 
 
-def of_ecs(operation: str, data: dict[str, Any], place: str) -> Asked | None:
+def asked_of_ecs(operation: str, data: dict[str, Any], place: str) -> Asked | None:
     named = str(data.get("cluster") or data.get("clusterName") or "default").rpartition("/")[2]
     arn = f"arn:aws:ecs:{place}"
     inside = {"ecs:cluster": f"{arn}:cluster/{named}"}
@@ -93,7 +93,7 @@ def of_ecs(operation: str, data: dict[str, Any], place: str) -> Asked | None:
     return None
 
 
-def of_scheduler(method: str, path: str, data: dict[str, Any], query: dict[str, Any], place: str) -> Asked | None:
+def asked_of_scheduler(path: str, data: dict[str, Any], query: dict[str, Any], place: str) -> Asked | None:
     parts = [urllib.parse.unquote(part) for part in path.split("/") if part]
     if "schedules" not in parts or parts[-1] == "schedules":
         return None
@@ -104,7 +104,7 @@ def of_scheduler(method: str, path: str, data: dict[str, Any], query: dict[str, 
     return Asked([f"arn:aws:scheduler:{place}:schedule/{group}/{parts[-1]}"], passed=passed)
 
 
-def of_route53(method: str, path: str, body: bytes) -> Asked | None:
+def asked_of_route53(method: str, path: str, body: bytes) -> Asked | None:
     parts = [part for part in path.split("/") if part]
     if "change" in parts:
         return Asked([f"arn:aws:route53:::change/{parts[-1]}"])
@@ -125,14 +125,14 @@ def of_route53(method: str, path: str, body: bytes) -> Asked | None:
     return None
 
 
-def of_codebuild(operation: str, data: dict[str, Any], place: str) -> Asked | None:
+def asked_of_codebuild(operation: str, data: dict[str, Any], place: str) -> Asked | None:
     if operation != "BatchGetBuilds":
         return None
     projects = sorted({build.rpartition("/")[2].partition(":")[0] for build in data.get("ids", [])})
     return Asked([f"arn:aws:codebuild:{place}:project/{project}" for project in projects])
 
 
-def of_s3(method: str, headers: dict[str, str], theirs: str) -> Asked | None:
+def asked_of_s3(method: str, headers: dict[str, str], theirs: str) -> Asked | None:
     conditions = {f"s3:{name}": headers[name] for name in ("if-match", "if-none-match") if headers.get(name)}
     return Asked([theirs], conditions) if method == "PUT" and conditions else None
 
@@ -155,15 +155,15 @@ def bridge_authorization() -> None:
         data = json.loads(body) if service in {"codebuild", "ecs", "scheduler"} and body[:1] == b"{" else {}
         operation = headers.get("x-amz-target", "").rpartition(".")[2]
         if service == "ecs":
-            found = of_ecs(operation, data, place)
+            found = asked_of_ecs(operation, data, place)
         elif service == "codebuild":
-            found = of_codebuild(operation, data, place)
+            found = asked_of_codebuild(operation, data, place)
         elif service == "scheduler":
-            found = of_scheduler(method, path, data, query, place)
+            found = asked_of_scheduler(path, data, query, place)
         elif service == "s3":
-            found = of_s3(method, headers, theirs)
+            found = asked_of_s3(method, headers, theirs)
         elif service == "route53":
-            found = of_route53(method, path, body)
+            found = asked_of_route53(method, path, body)
         elif service == "monitoring" and b"DescribeAlarms" in body + operation.encode():
             found = Asked([f"arn:aws:cloudwatch:{place}:alarm:*"])
         else:
@@ -258,8 +258,8 @@ def bridge_builds() -> None:
 
     def start(data: dict[str, Any]) -> Any:
         answer = start_build(data)
-        told = {one["name"]: one["value"] for one in data.get("environmentVariablesOverride", [])}
-        repository, _, tag = told.get("IMAGE", "").partition("/")[2].rpartition(":")
+        variables = {one["name"]: one["value"] for one in data.get("environmentVariablesOverride", [])}
+        repository, _, tag = variables.get("IMAGE", "").partition("/")[2].rpartition(":")
         if answer[0] == 200 and repository:
             codebuild._builds[json.loads(answer[2])["build"]["id"]].pop("logs", None)
             manifest = json.dumps({"schemaVersion": 2, "config": {}, "layers": [], "annotations": {"tag": tag}})
@@ -308,7 +308,7 @@ def bridge_pollers() -> None:
 
 
 def end_with_parent() -> None:
-    """Nothing of ours is left when the tests are killed: functions are processes in our group."""
+    """Kill this process group, to which the functions belong, when standard input ends, so that it does not outlive tests."""
 
     def wait() -> None:
         sys.stdin.buffer.read()

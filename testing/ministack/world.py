@@ -1,6 +1,6 @@
 """An AWS account on ministack, with the installation that `python -m deploy apply` makes in it.
 
-What ministack does not do as AWS does stands here and in `emulator.py`, beside what bridges it (search for "Gap:").
+The gaps between ministack and AWS are named here and in `emulator.py`, each beside its bridge (search for "Gap:").
 """
 
 from __future__ import annotations
@@ -34,40 +34,43 @@ ROOT = Path(__file__).resolve().parents[2]
 ACCOUNT = "123456789012"
 REGION = "ca-central-1"
 ROOT_KEYS = ("AKIAROOTROOTROOTROOT", "the root user's secret")
-DOMAIN = "hippodrome.test"  # a name that no name server knows, wherever the tests run (RFC 6761)
+DOMAIN = "hippodrome.test"  # no name server knows a name in .test (RFC 6761)
 T = TypeVar("T")
 
 FUNCTIONS = tuple(sorted(template.functions()))
 
 
 DATA = {"infra", "requirements", "steps", "web"}
-"""Folders without code that the commands need."""
+"""Folders that the commands need, and that are no packages."""
 
 
 def find_venv() -> Path | None:
-    """ministack's own virtual environment: MINISTACK_VENV, or `.venv-ministack` beside the project; None if missing."""
+    """Return ministack's own virtual environment, MINISTACK_VENV or `.venv-ministack`; None if there is none."""
     venv = Path(os.environ.get("MINISTACK_VENV") or ROOT / ".venv-ministack")
     return venv if (venv / "bin" / "ministack").exists() else None
 
 
 def fits(venv: Path) -> bool:
-    """Whether its Python is of our version: the zips are made for ours, and functions run with its."""
+    """Return whether the environment has our version of Python, for which the zips are made."""
     ours = f"{sys.version_info.major}.{sys.version_info.minor}."
     return f"version = {ours}" in (venv / "pyvenv.cfg").read_text()
 
 
-def until(look: Callable[[], T], what: str, seconds: float = 60) -> T:
-    """What `look` gives, once it gives something true. AssertionError if that does not happen in time."""
+def until(look: Callable[[], T], condition: str, seconds: float = 60) -> T:
+    """Call `look` until what it returns is true, and return that.
+
+    Raises AssertionError, with the condition in words and what `look` returned last, after so many seconds.
+    """
     deadline = time.monotonic() + seconds
     while not (found := look()):
         if time.monotonic() > deadline:
-            raise AssertionError(f"not within {seconds} s: {what}; the last thing seen: {found!r}")
+            raise AssertionError(f"not within {seconds} s: {condition}; the last look: {found!r}")
         time.sleep(0.25)
     return found
 
 
 def _certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """The files of an authority's certificate, of a certificate of its for loopback, and of its key."""
+    """Make an authority and a certificate for loopback. Return the files of the authority, the certificate and its key."""
     made = authority("ministack", days=1)
     files = folder / "ca.pem", folder / "tls.pem", folder / "tls.key"
     for file, content in zip(files, (made.certificate, *made.issue("localhost", "127.0.0.1")), strict=True):
@@ -77,7 +80,7 @@ def _certificates(folder: Path) -> tuple[Path, Path, Path]:
 
 @dataclass(frozen=True)
 class CommandRun:
-    """A command that has ended."""
+    """A command that has ended: its exit status, what it printed, and its duration."""
 
     code: int
     out: str
@@ -86,7 +89,7 @@ class CommandRun:
 
 
 class MinistackWorld:
-    """One account. `client` gives root's clients; `decisions` what ministack's evaluator has said about all others."""
+    """One account. `client` gives clients of root; `decisions` are ministack's about all other callers."""
 
     def __init__(self, venv: Path, home: Path) -> None:
         self.venv, self.home = venv, home
@@ -96,7 +99,7 @@ class MinistackWorld:
         self.source = home / "source"
         self.timings: dict[str, float] = {}
 
-    # -- coming and going
+    # -- opening and closing
 
     def __enter__(self) -> MinistackWorld:
         with socket.socket() as free:
@@ -107,7 +110,7 @@ class MinistackWorld:
         self.tls = ssl.create_default_context(cafile=str(self.ca))
         scratch = self.home / "tmp"
         scratch.mkdir()
-        # Functions inherit this environment, so it holds nothing else. Nothing is kept on disk but in TMPDIR.
+        # Functions inherit this environment, so it holds nothing else. Only TMPDIR is used on disk.
         env = {
             "PATH": os.environ.get("PATH", ""),
             "HOME": str(self.home),
@@ -121,7 +124,7 @@ class MinistackWorld:
             "MINISTACK_REGION": REGION,
             "AWS_ACCESS_KEY_ID": ROOT_KEYS[0],
             "AWS_SECRET_ACCESS_KEY": ROOT_KEYS[1],
-            "USE_SSL": "1",  # buckets refuse what is not TLS
+            "USE_SSL": "1",  # buckets refuse requests without TLS
             "MINISTACK_SSL_CERT": str(certificate),
             "MINISTACK_SSL_KEY": str(key),
             "AWS_CA_BUNDLE": str(self.ca),
@@ -132,7 +135,7 @@ class MinistackWorld:
             self._process = subprocess.Popen(
                 [str(self.venv / "bin" / "python"), str(Path(__file__).with_name("emulator.py"))],
                 env=env,
-                stdin=subprocess.PIPE,  # its end is the emulator's end
+                stdin=subprocess.PIPE,  # the emulator ends when this does
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
@@ -148,7 +151,7 @@ class MinistackWorld:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)  # the functions' processes too: the group is ours alone
+            os.killpg(self._process.pid, signal.SIGKILL)  # the group holds the emulator and its functions alone
         self._process.wait()
         if self._process.stdin:
             self._process.stdin.close()
@@ -166,7 +169,7 @@ class MinistackWorld:
         return str(made["HostedZone"]["Id"]).rpartition("/")[2]
 
     def _copy_source(self) -> None:
-        """The commands run in a copy of the project, so that a test may change a function's code."""
+        """Copy the project, so that a test may change a function's code. The commands run in the copy."""
         skip = shutil.ignore_patterns("__pycache__", "*.pyc")
         for folder in ROOT.iterdir():
             package = (folder / "__init__.py").exists() and folder.name not in ("bench", "testing", "tests")
@@ -178,7 +181,7 @@ class MinistackWorld:
     # -- callers
 
     def client(self, service: str, keys: Mapping[str, str] | None = None) -> Any:
-        """root's client of a service, or that of the credentials in `keys` (as STS and IAM name them)."""
+        """Return a client of a service with the credentials in `keys` (named as STS and IAM name them), or with root's."""
         who = json.dumps(dict(keys), sort_keys=True, default=str) if keys else ""
         if (service, who) not in self._clients:
             self._clients[service, who] = boto3.client(
@@ -194,27 +197,27 @@ class MinistackWorld:
         return self._clients[service, who]
 
     def assume(self, role: str, session: str) -> dict[str, str]:
-        """Credentials of a role, by its ARN or name.
+        """Return credentials of a role, by its ARN or name.
 
-        Gap: on AWS only the service that a role trusts may assume it; ministack lets root stand in for services.
+        Gap: on AWS only the service that a role trusts may assume it; here root may, too (`emulator.py`).
         """
         arn = role if role.startswith("arn:") else f"arn:aws:iam::{ACCOUNT}:role/{role}"
         return dict(self.client("sts").assume_role(RoleArn=arn, RoleSessionName=session)["Credentials"])
 
     def user(self, name: str, policy: str) -> dict[str, str]:
-        """The access key of a new IAM user with this managed policy."""
+        """Create an IAM user with this managed policy, and return its access key."""
         iam = self.client("iam")
         iam.create_user(UserName=name)
         iam.attach_user_policy(UserName=name, PolicyArn=policy)
         return dict(iam.create_access_key(UserName=name)["AccessKey"])
 
     def decisions(self, who: str = "", allowed: bool | None = None) -> list[dict[str, Any]]:
-        """What the evaluator decided so far about callers whose ARN contains `who`."""
+        """Return the evaluator's decisions so far about callers whose ARN contains `who`, and with this result if given."""
         found = [json.loads(line) for line in self._decisions.read_text().splitlines()]
         return [one for one in found if who in one["who"] and allowed in (None, one["allowed"])]
 
     def complaints(self) -> str:
-        """For a failed test: the calls that were refused, and the last errors and warnings of the functions and of ministack."""
+        """Return the last refused calls and the last errors and warnings of functions and ministack, for a failed test."""
         lines = [f"refused: {one}" for one in self.decisions(allowed=False)[-20:]]
         logs = self.client("logs")
         for group in logs.describe_log_groups()["logGroups"]:
@@ -230,9 +233,9 @@ class MinistackWorld:
     def deploy(
         self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "", anew: bool = False
     ) -> CommandRun:
-        """`python -m deploy …` in the copy of the project, as the caller with these keys (root without).
+        """Run `python -m deploy …` in the copy of the project, with these credentials or with root's.
 
-        Its process begins with its imports done, unless it is to be started `anew`, as users start it.
+        The process starts with its imports already done; with `anew`, it starts as users start it.
         """
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
         env |= {
@@ -246,7 +249,7 @@ class MinistackWorld:
             "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
             # Gap: functions run as processes of this machine, whatever architecture and Python they ask for.
             "HIPPODROME_TARGET": "here",
-            "PYTHONDONTWRITEBYTECODE": "",  # the next command finds its modules compiled
+            "PYTHONDONTWRITEBYTECODE": "",  # write bytecode, for the next command
         }
         if stack:
             env["HIPPODROME_STACK"] = stack
@@ -268,10 +271,10 @@ class MinistackWorld:
         self.timings[" ".join(arguments[:1])] = seconds
         return ran
 
-    # -- what stands
+    # -- resources
 
     def inventory(self) -> dict[str, list[str]]:
-        """Everything in the account that a stack, a command or a function of ours could have left, by kind."""
+        """Return, by kind, all resources in the account that a stack, a command or a function of ours could have left."""
         found: dict[str, list[str]] = {}
         for kind, (service, operation, path, arguments) in LISTS.items():
             client = self.client(service)
@@ -285,12 +288,12 @@ class MinistackWorld:
             found[kind] = sorted(str(item[inner] if inner else item) for page in pages for item in page.get(outer, []))
         records = self.client("route53").list_resource_record_sets(HostedZoneId=self.zone)["ResourceRecordSets"]
         found["names"] = sorted(f"{record['Name']} {record['Type']}" for record in records)
-        # ECS's service-linked role is the account's, not the stack's: every other user of ECS in the account needs it, too.
+        # ECS's service-linked role belongs to the account, not to the stack: all users of ECS in the account need it.
         found["roles"] = [role for role in found["roles"] if not role.startswith("AWSServiceRoleFor")]
         return found
 
 
-LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
+LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {  # service, operation, path of the names, parameters
     "alarms": ("cloudwatch", "describe_alarms", "MetricAlarms.AlarmName", {}),
     "APIs": ("apigatewayv2", "get_apis", "Items.Name", {}),
     "buckets": ("s3", "list_buckets", "Buckets.Name", {}),
@@ -327,7 +330,7 @@ LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
 
 
 class MinistackInstallation:
-    """A stack of ours in a world."""
+    """A stack of Hippodrome in a world."""
 
     def __init__(self, world: MinistackWorld, stack: str = "hippodrome") -> None:
         self.world, self.stack = world, stack
@@ -338,17 +341,18 @@ class MinistackInstallation:
         self.cluster = self.outputs.get("Cluster", "")
 
     def function(self, name: str) -> str:
+        """Return the full name of a function."""
         return f"{self.stack}-{name}"
 
     def invoke(self, name: str, event: Any) -> Any:
-        """What a function answers when root calls it. AssertionError if it fails."""
+        """Invoke a function as root, and return its answer. Raises AssertionError if the function fails."""
         answer = self.world.client("lambda").invoke(FunctionName=self.function(name), Payload=json.dumps(event))
         body = json.loads(answer["Payload"].read())
         assert "FunctionError" not in answer, body
         return body
 
     def role(self, name: str) -> str:
-        """The ARN of a function's role."""
+        """Return the ARN of a function's role."""
         found = self.world.client("lambda").get_function_configuration(FunctionName=self.function(name))
         return str(found["Role"])
 
@@ -358,6 +362,7 @@ class MinistackInstallation:
         self.world.client("s3").put_object(Bucket=self.bucket, Key=key, Body=body)
 
     def stored(self, key: str) -> Any:
+        """Return the JSON of a document; None if there is none."""
         s3 = self.world.client("s3")
         try:
             return json.loads(s3.get_object(Bucket=self.bucket, Key=key)["Body"].read())
@@ -366,9 +371,9 @@ class MinistackInstallation:
 
     # -- queues
 
-    def queue(self, part: str, dead: bool = False) -> str:
-        """The URL of the queue whose name contains `part`."""
-        event_sources = self.world.client("lambda").list_event_source_mappings(FunctionName=self.function(part))
+    def queue(self, function: str, dead: bool = False) -> str:
+        """Return the URL of the queue that feeds this function; with `dead`, that of its dead-letter queue."""
+        event_sources = self.world.client("lambda").list_event_source_mappings(FunctionName=self.function(function))
         name = event_sources["EventSourceMappings"][0]["EventSourceArn"].rpartition(":")[2]
         sqs = self.world.client("sqs")
         url = str(sqs.get_queue_url(QueueName=name)["QueueUrl"])
@@ -379,15 +384,15 @@ class MinistackInstallation:
         return str(sqs.get_queue_url(QueueName=target)["QueueUrl"])
 
     def waiting(self, url: str) -> int:
-        """How many messages lie in a queue, seen or unseen."""
+        """Return how many messages a queue holds, visible or not."""
         names = ["ApproximateNumberOfMessages", "ApproximateNumberOfMessagesNotVisible"]
         found = self.world.client("sqs").get_queue_attributes(QueueUrl=url, AttributeNames=names)["Attributes"]
         return sum(int(found[name]) for name in names)
 
-    # -- servers, as ECS knows them
+    # -- servers
 
     def tasks(self, status: str = "RUNNING") -> dict[str, dict[str, Any]]:
-        """The tasks of the cluster by their `startedBy`. AssertionError if two of them share one."""
+        """Return the cluster's tasks with this desired status, by `startedBy`. Raises AssertionError if two share one."""
         ecs = self.world.client("ecs")
         arns = ecs.list_tasks(cluster=self.cluster, desiredStatus=status)["taskArns"]
         found = ecs.describe_tasks(cluster=self.cluster, tasks=arns)["tasks"] if arns else []
@@ -396,12 +401,13 @@ class MinistackInstallation:
         return by_name
 
     def timers(self) -> list[str]:
+        """Return the names of the servers' schedules."""
         group = self.outputs["ScheduleGroup"]
         found = self.world.client("scheduler").list_schedules(GroupName=group)["Schedules"]
         return [schedule["Name"] for schedule in found]
 
     def names(self) -> dict[str, str]:
-        """The A records of servers: name → address."""
+        """Return the A records of servers: name → address."""
         zone = self.world.zone
         found = self.world.client("route53").list_resource_record_sets(HostedZoneId=zone)["ResourceRecordSets"]
         return {
@@ -411,11 +417,11 @@ class MinistackInstallation:
         }
 
     def runs(self, task: Mapping[str, Any]) -> str:
-        """ECS says that the task runs; its public address.
+        """Send the event that the task runs, and return its public address.
 
         Gap: ministack emits no ECS events and gives tasks no network interface. Bridge: an interface with an elastic
-        address, and the event as ECS sends it, put on the bus by root (`emulator.py` lets root use `aws.ecs`), so that
-        rule and queue, with their policies, are the template's own.
+        address; and root puts the event on the bus in the form of ECS (`emulator.py` lets root use the source
+        `aws.ecs`), so that it takes its way through the template's own rule and queue, with their policies.
         """
         ec2 = self.world.client("ec2")
         subnet = self.outputs["Subnets"].split(",")[0]
@@ -427,7 +433,7 @@ class MinistackInstallation:
         return str(address["PublicIp"])
 
     def ended(self, task: Mapping[str, Any], stop_code: str = "UserInitiated", exit_code: int | None = 0) -> None:
-        """ECS says that the task is gone; so is its interface."""
+        """Send the event that the task has stopped. The event names an interface that does not exist any more."""
         self._tell(task, "STOPPED", "eni-gone", stop_code=stop_code, exit_code=exit_code)
 
     def _tell(self, task: Mapping[str, Any], status: str, interface: str, **more: Any) -> None:
@@ -457,7 +463,7 @@ class MinistackInstallation:
         assert answer["FailedEntryCount"] == 0, answer
 
     def remove_interfaces(self) -> None:
-        """What `runs` made: on AWS an interface and its address go with the task."""
+        """Remove the interfaces and addresses that `runs` has made. On AWS they go with the task."""
         ec2 = self.world.client("ec2")
         for address in ec2.describe_addresses()["Addresses"]:
             ec2.disassociate_address(AssociationId=address["AssociationId"])
@@ -465,11 +471,11 @@ class MinistackInstallation:
         for interface in ec2.describe_network_interfaces()["NetworkInterfaces"]:
             ec2.delete_network_interface(NetworkInterfaceId=interface["NetworkInterfaceId"])
 
-    # -- the participants' address
+    # -- the site
 
     @contextlib.contextmanager
     def browser(self) -> Iterator[httpx.Client]:
-        """A browser that is at the participants' address: the custom domain of the HTTP API."""
+        """Give an HTTP client for the participants' site, the custom domain of the HTTP API, within the block."""
         site = httpx.URL(self.outputs["Site"])
         headers = {"Host": site.host, "Accept": "text/html"}
         with httpx.Client(base_url=self.world.endpoint, headers=headers, verify=self.world.tls, timeout=60) as client:

@@ -1,4 +1,4 @@
-"""What the simulation assumes, in words, from the very constants that it uses; with the source where there is one."""
+"""Writes the simulation's assumptions in words, from the constants that it uses, each with its source if there is one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OURS = "our assumption"
 
 
 def assumptions(conditions: Conditions) -> Mapping[str, str]:
-    """One line for each thing that decides the figures."""
+    """Return the assumptions that decide the figures: name → text."""
     median, sigma, longest = conditions.starts
     rate = ", ".join(f"{name} {quota[0]:g}/s (burst {quota[1]:g})" for name, quota in QUOTAS.items())
     delays = ", ".join(f"{name} {_span(span)}" for name, span in {**LATENCY, "s3": conditions.s3}.items())
@@ -45,7 +45,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "queue to function": f"{_span(functions.POLL)} ({OURS}); {queues} (infra/template.yml)",
         "pollers of a queue": f"{functions.BATCHES} batches at once, {functions.MORE_BATCHES:g} more for each "
         "second of backlog (AWS Compute Blog, November 2023)",
-        "batches that are throttled": "come again after the visibility timeout, a receive of each message is gone "
+        "batches that are throttled": "come again after the visibility timeout, which costs each message a receive "
         "(Lambda Developer Guide, SQS backoff strategy: Lambda tries again within it, which is left out)",
         "loops": f"the invocation after {functions.HOPS} of a function in one chain is dropped; a batch inherits the "
         f"highest count of its messages; allowed to {' and '.join(sorted(LOOPS)) or 'none'} (Lambda Developer Guide, "
@@ -62,9 +62,9 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
 
 
 def changed(conditions: Conditions) -> Mapping[str, str]:
-    """The lines that differ from those of the usual conditions."""
+    """Return the assumptions that differ from those of the usual conditions."""
     usual = assumptions(Conditions())
-    return {what: text for what, text in assumptions(conditions).items() if usual[what] != text}
+    return {name: text for name, text in assumptions(conditions).items() if usual[name] != text}
 
 
 def _spot(conditions: Conditions) -> str:

@@ -1,10 +1,9 @@
-"""How long AWS alone would take: the bound for every way to serve a crowd, with none of our code in it.
+"""Computes how long AWS alone would take to serve a crowd, without our code: a lower bound for every control plane.
 
-An ideal control plane asks at the moment at which the participant asks, has no latency, and looks at nothing: it calls
-RunTask as early as the account's token buckets admit, changes the zone at the moment at which EC2 shows the address of
-a task that runs (or, while another change keeps the zone busy, with everything that has come to run since), and shows
-`ready` at the moment at which the change is INSYNC. Only AWS's quotas, start times, late addresses, DNS times with
-their slow spans, and the busy zone remain.
+An ideal control plane has no latency. It calls RunTask as early as the account's token buckets admit after the
+participant's request. It changes the zone as soon as EC2 shows the address of the running task; while another change
+keeps the zone busy, it collects the tasks of the next change. It shows `ready` as soon as the change is INSYNC. Only
+AWS's quotas, start times, late addresses, DNS times with their slow spans, and the busy zone remain.
 """
 
 from __future__ import annotations
@@ -18,12 +17,11 @@ from testing.simulation.ports import MAX_CHANGES
 
 
 def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:
-    """Seconds that each participant waits who asks at these seconds. The same arguments give the same result.
+    """Return the seconds that each participant waits; `asked` are the seconds at which they request a server.
 
-    The seed is that of the simulated run, whose start times and DNS times are drawn in the same order.
-
-    Interruptions are left out: they only add to what participants wait. Where Spot is sold out, on demand has the same
-    quotas and start times.
+    The seed is that of the simulated run, whose start times and DNS times are drawn in the same order. The same
+    arguments give the same result. Interruptions are left out, since they only make waits longer. Spot that is sold out
+    changes nothing, since Fargate on demand has the same quotas and start times.
     """
     return [ready - came for came, ready in _served(asked, seed, conditions)]
 
@@ -31,11 +29,12 @@ def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None =
 def aws_alone_together(
     under_way: Sequence[float], lobby: Sequence[float], players: int, seed: int, conditions: Conditions | None = None
 ) -> list[float]:
-    """Seconds from the lobby until the server is ready, of those who come there at these seconds to play together.
+    """Return the seconds that participants of sessions wait, from the lobby until their server is ready.
 
-    One server is asked for as soon as the first of each `players` is under way. The first `players` who come to the
-    lobby are a session at the moment at which the last of them comes, and get the server that is ready first. Those who
-    are left over are left out.
+    `under_way` and `lobby` are the seconds at which participants get under way, and at which they come to the lobby. A
+    server is requested when the first of each `players` participants gets under way. Participants form sessions in the
+    order in which they come to the lobby, each when its last member comes; the first session gets the server that is
+    ready first. Participants of an incomplete session are left out.
     """
     asked = sorted(under_way)[::players]
     ready = sorted(ready for _, ready in _served(asked, seed, conditions))
@@ -46,7 +45,7 @@ def aws_alone_together(
 
 
 def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> Iterator[tuple[float, float]]:
-    """For each server that is asked for at these seconds: this second, and that at which it is ready."""
+    """Yield, for each server that is requested at these seconds, this second and the second at which it is ready."""
     conditions, starts, spreads = conditions or Conditions(), draws(seed, "starts"), draws(seed, "propagation")
     chance, lags = random.Random(seed), draws(seed, "addresses")
     arrivals = sorted(asked)
@@ -66,7 +65,7 @@ def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = N
 
 
 def _admitted(arrivals: Sequence[float]) -> list[float]:
-    """When RunTask is called for each arrival: as early as its own bucket and the bucket of launches have a token."""
+    """Return the second of RunTask for each arrival: as early as its own bucket and the bucket of launches have a token."""
     found = list(arrivals)
     for quota in ("ecs:RunTask", "launch:spot"):
         rate, burst = QUOTAS[quota]

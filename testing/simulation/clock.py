@@ -1,4 +1,4 @@
-"""The clock on which functions may wait: plain synchronous code runs in greenlets, and a greenlet that waits lets others run."""
+"""A clock on which synchronous code may wait: it runs in greenlets, and while one greenlet waits, others run."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ T = TypeVar("T")
 
 
 class GreenletClock(Clock):
-    """A clock on which code may wait. `random` is the only source of chance."""
+    """A clock on which code may wait. `random` is the source of random numbers, from the seed."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
         self.seed = seed
         self.random = random.Random(seed)
-        self.resumed: Callable[[object], None] | None = None  # called with the owner of what runs next
-        self.ends: Callable[[object], float] | None = None  # until which second an owner may run: its timeout
+        self.resumed: Callable[[object], None] | None = None  # called with the owner of the greenlet that runs next
+        self.ends: Callable[[object], float] | None = None  # gives the second at which an owner times out
         self._hub: greenlet.greenlet | None = None
 
     def spawn(self, act: Callable[[], object], delay: float = 0.0, owner: object = None) -> None:
-        """Run `act` in a greenlet of its own, which may `sleep`."""
+        """Run `act` in a greenlet of its own after `delay` seconds. In it, `act` may `sleep`."""
 
         def begin() -> None:
             made = greenlet.greenlet(act)
@@ -37,10 +37,10 @@ class GreenletClock(Clock):
         self.after(delay, begin)
 
     def sleep(self, seconds: float) -> None:
-        """Let that much time pass. Only within `spawn`. Raises `Crash` at the second at which the caller times out."""
+        """Let so many seconds pass, only in spawned code. Raises Crash at the second at which the owner times out."""
         me: Any = greenlet.getcurrent()
         assert self._hub is not None
-        assert me is not self._hub, "only what was spawned can wait"
+        assert me is not self._hub, "only spawned code can wait"
         end = self.ends(getattr(me, "owner", None)) if self.ends else math.inf
         late = self.seconds + seconds > end
         self.after(min(seconds, end - self.seconds), lambda: self._resume(me))
@@ -49,7 +49,7 @@ class GreenletClock(Clock):
             raise Crash("timed out")
 
     def together(self, acts: Sequence[Callable[[], T]], at_once: int = 16) -> list[T]:
-        """The results of all acts, of which that many run at the same time. What ends one of them ends all."""
+        """Run all acts, so many at the same time; return their results in order. Raises the first exception of an act."""
         if len(acts) < 2:
             return [act() for act in acts]
         me: Any = greenlet.getcurrent()
@@ -78,13 +78,13 @@ class GreenletClock(Clock):
         return [results[number] for number in range(len(acts))]
 
     def run(self, until: float) -> None:
-        """Let things happen until then, or until nothing is due any more."""
+        """Make all calls that are due until this second, and then go to it."""
         self._hub = greenlet.getcurrent()
         while self.next() <= until:
             self.step()
         self.seconds = max(self.seconds, until)
 
-    def _resume(self, what: greenlet.greenlet) -> None:
+    def _resume(self, waiting: greenlet.greenlet) -> None:
         if self.resumed:
-            self.resumed(getattr(what, "owner", None))
-        what.switch()
+            self.resumed(getattr(waiting, "owner", None))
+        waiting.switch()

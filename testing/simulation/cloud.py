@@ -1,4 +1,4 @@
-"""What every call of AWS has in common: a latency, a quota, and a number that a fault can be tied to."""
+"""The simulated APIs of AWS: every call has a latency, a quota, and a number at which a fault can be injected."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from testing.simulation.clock import GreenletClock
 
 T = TypeVar("T")
 ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
-BACKOFF = 1.0  # seconds, doubled at each attempt; a random share of it is waited
+BACKOFF = 1.0  # seconds, doubled at each attempt; a call waits a random share of it
 
 
 class Throttled(Exception):
-    """Rate exceeded. An effect may raise it too: the call is tried again as botocore does."""
+    """Rate exceeded. The effect of a call may raise it, too. The call is tried again, as botocore does."""
 
     expected = True
 
 
 class NoRoom(Throttled):
-    """A function is not invoked: the account has no concurrency left."""
+    """A function was not invoked, since the account has no concurrency left."""
 
 
 @dataclass
 class TokenBucket:
-    """A token bucket: `burst` calls at once, then `rate` a second."""
+    """A token bucket: it admits `burst` calls at once, then `rate` calls per second."""
 
     rate: float
     burst: float
@@ -41,7 +41,7 @@ class TokenBucket:
         self.tokens = self.burst
 
     def take(self, now: float, number: int = 1) -> bool:
-        """Whether there are so many tokens; they are gone then."""
+        """Take so many tokens, and return True; return False and take none if there are fewer."""
         self.tokens = min(self.burst, self.tokens + (now - self.since) * self.rate)
         self.since = now
         if self.tokens < number:
@@ -52,13 +52,13 @@ class TokenBucket:
 
 _REQUESTS = float(template.template()["Parameters"]["RequestsPerSecond"]["Default"])
 QUOTAS: dict[str, tuple[float, float]] = {  # (sustained per second, burst)
-    "http": (_REQUESTS, _REQUESTS),  # of the site: infra/template.yml
+    "http": (_REQUESTS, _REQUESTS),  # requests of the site: infra/template.yml
     "ecs:RunTask": (20, 20),  # ECS Developer Guide, "AWS Fargate throttling quotas"
     "ecs:StopTask": (40, 100),  # cluster resource modify actions, ECS "Request throttling"
     "ecs:DescribeTasks": (20, 100),
     "ecs:ListTasks": (20, 100),
     "route53": (10, 50),  # all actions of the account together: Route 53 Developer Guide, "Throttling for API requests"
-    "route53:changes": (100, 1500),  # of names, an UPSERT counting twice: the same, "Change throughput limiting"
+    "route53:changes": (100, 1500),  # names, an UPSERT counts twice: the same guide, "Change throughput limiting"
     "ec2:DescribeNetworkInterfaces": (20, 100),
     "scheduler:CreateSchedule": (1000, 1000),
     "scheduler:DeleteSchedule": (1000, 1000),
@@ -80,7 +80,7 @@ LATENCY: dict[str, tuple[float, float]] = {  # seconds, uniform: our assumption
 
 
 class Cloud:
-    """The account's APIs. Functions' calls are numbered; those of participants and trials are not, and cost nothing."""
+    """The account's APIs. Calls of functions are numbered; those of participants and trials are not, and take no time."""
 
     def __init__(
         self,
@@ -88,28 +88,31 @@ class Cloud:
         concurrency: int = CONCURRENCY,
         latency: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> None:
-        """`latency`: what differs from `LATENCY`."""
+        """`latency`: the entries that differ from `LATENCY`."""
         self.clock = clock
         self._latency = {**LATENCY, **latency}
         self.concurrency = concurrency
         self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
         self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
-        self.lobby_calls: Counter[str] = Counter()  # of S3 alone: about the lobby, sessions and memberships
+        self.lobby_calls: Counter[str] = Counter()  # those of S3 for lobbies, sessions and memberships
         self.throttled: Counter[str] = Counter()
-        self.conflicts: Counter[str] = Counter()  # conditional writes that met another version, by key
-        self.number = 0  # of the functions' calls so far
+        self.conflicts: Counter[str] = Counter()  # conditional writes that were refused, by key
+        self.number = 0  # the functions' calls so far
         self.fault: FaultAt | None = None
         self.timeline: list[tuple[float, str]] = []
-        self.invocations = 0  # that run now, of all functions
-        self.most_invocations = 0  # that ran at once
+        self.invocations = 0  # invocations of all functions that run now
+        self.most_invocations = 0  # the most that ran at once
         self._buckets = {name: TokenBucket(*quota) for name, quota in QUOTAS.items()}
 
     def log(self, text: str) -> None:
-        """One line of the timeline."""
+        """Add a line to the timeline."""
         self.timeline.append((self.clock.seconds, text))
 
     def call(self, action: str, effect: Callable[[], T], attempts: int = ATTEMPTS) -> T:
-        """One call by a function: it waits, may be throttled (and tries again as botocore does), may go wrong."""
+        """Make a call of a function, with its latency, its quota and its fault, and return what `effect` returns.
+
+        Raises Throttled after so many attempts, and what `effect` and the fault raise.
+        """
         self.number += 1
         fault = self.fault.fault if self.fault and self.fault.call == self.number else None
         if fault:
@@ -118,7 +121,7 @@ class Cloud:
 
     @contextlib.contextmanager
     def invocation(self) -> Iterator[None]:
-        """While a function runs. Raises `NoRoom` if the account has no more concurrency."""
+        """Count an invocation as running within the block. Raises NoRoom if the account has no concurrency left."""
         if self.invocations >= self.concurrency:
             self.throttled["lambda:Invoke"] += 1
             raise NoRoom("lambda:Invoke")
@@ -130,11 +133,11 @@ class Cloud:
             self.invocations -= 1
 
     def take(self, bucket: str, number: int = 1) -> bool:
-        """Whether the account's quota of that name has room for so much."""
+        """Take so much of the account's quota of this name, and return True; return False if less is left."""
         return self._buckets[bucket].take(self.clock.seconds, number)
 
     def _patiently(self, action: str, effect: Callable[[], T], attempts: int) -> T:
-        """Make the call, again after a throttling, as botocore's standard mode does."""
+        """Make the call, and try again when it is throttled, as botocore's standard mode does."""
         for attempt in range(attempts):
             self.calls[action] += 1
             try:

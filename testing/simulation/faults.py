@@ -1,8 +1,8 @@
-"""A crash before, after, and with the lost reply of every call that the functions make in a journey.
+"""Runs simulated journeys with a fault at each call: a crash before the call, a crash after it, or the loss of its reply.
 
-Each journey is run once to count the calls, then once for each call and each kind of fault, with the same seed.
-Retries, timers and the sweep do what they do; afterwards the participant must have been served or told so, what they
-answered must be there, and nothing may be left running.
+Each journey is run once to count the functions' calls, then once for each call and each kind of fault, with the same
+seed. Retries, timers and the sweep take their course. Afterwards each participant must have finished or been told why
+not, each answer that they were told is stored must be there, and no resource may be left.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from testing.simulation.people import SimulatedParticipant, SimulatedVisit
 from testing.simulation.world import PROJECT, SimulatedWorld
 
 FAULTS = (PortFault.CRASH_BEFORE, PortFault.CRASH_AFTER, PortFault.REPLY)
-HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: three times the deadline, and the sweeps after it
+HORIZON = 3.0 * 3600  # virtual seconds until everything must be over: six times the longest maxRuntime of a journey
 
 
 @dataclass(frozen=True)
 class SimulatedJourney:
-    """One way through the study."""
+    """One way through the study, and the conditions under which it is taken."""
 
     name: str
     conditions: Callable[[], Conditions] = Conditions
     person: Callable[[SimulatedWorld], SimulatedParticipant] = lambda world: SimulatedParticipant(world, 0)
-    finishes: bool = True  # whether the participant comes to the last page where nothing goes wrong
+    finishes: bool = True  # whether the participant comes to the last page if no fault is injected
     minutes: int = 30  # maxRuntime
     limits: Mapping[str, int] = field(default_factory=dict)
     others: int = 0  # participants who come at the same time
     comes: float = 0.0  # seconds until they come
-    closes: float | None = None  # when the study is closed; else it stays open
+    closes: float | None = None  # the second at which the study is closed; None: it stays open
     group: Sequence[Habits] = ()  # instead of `person` and `others`: participants who play together
-    to_the_end: int = 0  # how many of them come to the last page where nothing goes wrong
-    play: float = 60.0  # seconds that a session plays
+    to_the_end: int = 0  # how many of the group come to the last page if no fault is injected
+    play: float = 60.0  # seconds for which the group plays
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
 
     def people(self, world: SimulatedWorld) -> list[SimulatedParticipant]:
-        """All who take part. Those of a session come at the same time, but for their reading."""
+        """Make all participants of the journey. They come at the same time, but read for different times."""
         if self.group:
             return [
                 SimulatedMember(world, number, habits=habits, play=self.play)
@@ -170,7 +170,7 @@ JOURNEYS_OF_GROUPS = (
 
 @dataclass
 class FaultOutcome:
-    """What came of one run with one fault."""
+    """The outcome of one run with one fault (None: without)."""
 
     journey: str
     fault: FaultAt | None
@@ -184,24 +184,24 @@ class FaultOutcome:
 
     @property
     def well(self) -> bool:
-        """Nothing left, nothing lost, no participant stranded, and no session split or merged."""
-        everybody = all(served_or_told(visit) for visit in (self.visit, *self.others))
-        return not any(self.left.values()) and not self.lost and everybody and not self.wrong
+        """Whether nothing is left, no answer is lost, no participant is stranded, and no session is split or merged."""
+        everyone = all(served_or_told(visit) for visit in (self.visit, *self.others))
+        return not any(self.left.values()) and not self.lost and everyone and not self.wrong
 
     def __str__(self) -> str:
-        what = f"{self.fault.fault} at call {self.fault.call}" if self.fault else "no fault"
+        fault = f"{self.fault.fault} at call {self.fault.call}" if self.fault else "no fault"
         ended = [how_it_ended(visit) for visit in (self.visit, *self.others)]
-        about = f"{self.journey}, seed {self.seed}, {what}: {ended}; left {self.left}; lost {self.lost}; {self.wrong}"
+        about = f"{self.journey}, seed {self.seed}, {fault}: {ended}; left {self.left}; lost {self.lost}; {self.wrong}"
         return f"{about}\n{self.story}"
 
 
 def how_it_ended(visit: SimulatedVisit) -> str:
-    """How it ended for one participant."""
+    """Return `finished`, `stranded`, or why the study was over for the participant."""
     return "finished" if visit.finished is not None else visit.told or "stranded"
 
 
 def served_or_told(visit: SimulatedVisit) -> bool:
-    """Whether the participant finished, left by themselves, or ended with a page that says how things are."""
+    """Return whether the participant has finished, has left by themselves, or was told why the study is over for them."""
     told = bool(visit.told) and not visit.told.startswith(("waited too long", "no answer"))
     return visit.finished is not None or told
 
@@ -209,7 +209,7 @@ def served_or_told(visit: SimulatedVisit) -> bool:
 def run(
     journey: SimulatedJourney, seed: int, fault: FaultAt | None = None, *, watched: bool = False
 ) -> tuple[SimulatedWorld, FaultOutcome]:
-    """One run of a journey. With `watched` (`SimulatedWorld.watch`) it takes four times as long; nothing else changes."""
+    """Run a journey once; return its world and outcome. `watched` (`SimulatedWorld.watch`) takes four times as long."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits, **journey.project)
     world = SimulatedWorld(seed, journey.conditions(), project)
     world.cloud.fault = fault
@@ -234,17 +234,17 @@ def run(
 
 
 def calls(journey: SimulatedJourney, seed: int) -> int:
-    """How many calls the functions make in a journey until its server is gone; later sweeps are left out."""
+    """Return how many calls the functions make in a journey until nothing is left; later sweeps are not counted."""
     world, _ = run(journey, seed, watched=True)
     return world.calls_until_quiet
 
 
 def points(journey: SimulatedJourney, seed: int) -> list[FaultAt]:
-    """Every fault of a journey: each kind at each call."""
+    """Return every fault of a journey: each kind at each call."""
     return [FaultAt(call, fault) for call in range(1, calls(journey, seed) + 1) for fault in FAULTS]
 
 
 def explore(journey: SimulatedJourney, seed: int) -> Iterator[FaultOutcome]:
-    """Every fault of a journey, one run each."""
+    """Run a journey once with each of its faults; yield the outcomes."""
     for fault in points(journey, seed):
         yield run(journey, seed, fault)[1]

@@ -1,20 +1,22 @@
-"""Lambda and SQS: containers that serve one event at a time, queues that deliver at least once, dead letters.
+"""Simulated Lambda functions and SQS queues: one event at a time in each container, and delivery at least once.
 
-**Loops** (Lambda Developer Guide, "Use Lambda recursive loop detection to prevent infinite loops"). What a function
-sends to SQS or SNS carries how often each function has been invoked in its chain of requests. When a function has been
-invoked about 16 times in one chain, its next invocation is refused with RecursiveInvocationException, unless the
-function has `RecursiveLoop: Allow`; the metric RecursiveInvocationsDropped counts that. The poller of a queue takes the
-refusal for a failure: a receive is gone, the message comes again after its visibility timeout, is refused again, and
-ends as a dead letter when its receives are used up. A batch inherits the highest count of its messages, and so does
-everything that is sent while it is served. (The guide does not say what a batch inherits: this is the worst that it may
-mean.) ECS's events and the Scheduler begin a new chain: the guide names neither.
+**Loops** (Lambda Developer Guide, "Use Lambda recursive loop detection to prevent infinite loops"). Each message that a
+function sends to SQS or SNS carries how often each function has been invoked in its chain of requests. When a function
+has been invoked about 16 times in one chain, Lambda refuses its next invocation with RecursiveInvocationException,
+unless the function has `RecursiveLoop: Allow`; the metric RecursiveInvocationsDropped counts the refusals. For the
+poller of a queue, a refusal is a failure: it costs a receive, and the message comes again after its visibility timeout.
+It is refused again, and becomes a dead letter when its receives are used up. A batch inherits the highest count of its
+messages, and each message that is sent while the batch is served inherits it, too. (The guide does not say what a batch
+inherits; this is the worst possible case.) Events of ECS and the Scheduler begin a new chain here, since the guide
+names neither.
 
-**Throttling** (the same, "Backoff strategy for failed invocations"). A mapping with MaximumConcurrency fetches no more
-than it may hand on, but the account may have no room for that. Then Lambda tries the batch again until its visibility
-timeout is over, and drops it; people see its messages come back with one receive less (Z. Charles, "Lambda Concurrency
-Limits and SQS Triggers Don't Mix Well", 2019, and "Does Maximum Concurrency Solve the Lambda+SQS Issue?", 2023). Here
-it is not tried again before: the worst that it may mean. What EventBridge invokes waits in Lambda's own queue instead,
-and is tried again after 1 s, 2 s, 4 s … (the same, "How Lambda handles errors and retries with asynchronous
+**Throttling** (the same guide, "Backoff strategy for failed invocations"). A mapping with MaximumConcurrency fetches no
+more messages than it may pass on, but the account may have no concurrency left for them. Then Lambda tries the batch
+again until its visibility timeout is over, and drops it. Users report that its messages then come back with one receive
+less (Z. Charles, "Lambda Concurrency Limits and SQS Triggers Don't Mix Well", 2019, and "Does Maximum Concurrency Solve
+the Lambda+SQS Issue?", 2023). The simulation does not try the batch again within the visibility timeout, which is the
+worst possible case. An asynchronous invocation, such as EventBridge's, waits in Lambda's own queue instead; Lambda
+tries it again after 1 s, 2 s, 4 s … (the same guide, "How Lambda handles errors and retries with asynchronous
 invocation").
 """
 
@@ -40,25 +42,23 @@ from testing.simulation.clock import GreenletClock
 from testing.simulation.cloud import Cloud, NoRoom
 
 COLD = (0.5, 1.0)  # seconds of a cold start; billed
-POLL = (0.02, 0.2)  # seconds until a message that lies there is fetched
-BATCHES, MORE_BATCHES = (
-    5,
-    5.0,
-)  # that Lambda fetches at once from a standard queue at first; more each second of backlog
-HOPS = 16  # invocations of one function in a chain of requests
-ASYNC = (1.0, 300.0)  # seconds until Lambda tries an asynchronous invocation again: at first, and at most
+POLL = (0.02, 0.2)  # seconds until a visible message is fetched
+BATCHES = 5  # invocations at once that Lambda begins with for a standard queue
+MORE_BATCHES = 5.0  # further ones, for each second of backlog
+HOPS = 16  # allowed invocations of one function in a chain of requests
+ASYNC = (1.0, 300.0)  # seconds until Lambda tries an asynchronous invocation again: the first time, and at most
 Handler = Callable[[dict[str, Any], object], Any]
 Lineage = Mapping[str, int]  # how often each function has been invoked in a chain of requests
 NO_LINEAGE: Lineage = MappingProxyType({})
 
 
 class Recursive(Exception):
-    """RecursiveInvocationException: invoked too often in one chain of requests."""
+    """RecursiveInvocationException: a function was invoked too often in one chain of requests."""
 
 
 @dataclass
 class Container:
-    """What a function keeps between its invocations: `lambdas.installed`'s objects."""
+    """An execution environment: the objects of `lambdas.installed` that a function keeps between its invocations."""
 
     platform: Platform
     made: dict[Any, Any] = field(default_factory=dict)
@@ -67,27 +67,27 @@ class Container:
 
 
 class SimulatedFunction:
-    """One Lambda function. `billed` is seconds of all its invocations."""
+    """One Lambda function. `billed` are the seconds of all its invocations."""
 
     def __init__(
         self, name: str, handler: Handler, cloud: Cloud, platform: Platform, timeout: float, *, loops: bool = False
     ) -> None:
-        """`loops`: whether it has `RecursiveLoop: Allow`."""
+        """`timeout` is in seconds. `loops`: whether it has `RecursiveLoop: Allow`."""
         self.name, self._handler, self._cloud, self._platform = name, handler, cloud, platform
         self._loops = loops
         self._clock, self._timeout = cloud.clock, timeout
         self._free: list[Container] = []
         self.containers = 0
         self.invocations = 0
-        self.crashed = 0
+        self.crashed = 0  # invocations that ended by a crash or a timeout
         self.billed = 0.0
-        self.longest = 0.0  # seconds of one invocation
+        self.longest = 0.0  # seconds of the longest invocation
 
     def invoke(self, event: dict[str, Any], lineage: Lineage = NO_LINEAGE) -> Any:
-        """Run the handler, in the greenlet of the caller. Raises what it raises; a crash loses the container.
+        """Run the handler in the greenlet of the caller, and return its answer. A crash loses the container.
 
-        Raises `NoRoom` if the account has no concurrency left, `Crash` when the function's timeout is over, and
-        `Recursive` if the event's chain has invoked it too often.
+        Raises what the handler raises; NoRoom if the account has no concurrency left; Crash when the function times
+        out; and Recursive if the event's chain of requests has invoked it too often.
         """
         times = lineage.get(self.name, 0) + 1
         if times > HOPS and not self._loops:
@@ -97,7 +97,7 @@ class SimulatedFunction:
             return self._invoke(event, {**lineage, self.name: times})
 
     def later(self, event: dict[str, Any]) -> None:
-        """An asynchronous invocation, which waits while the account has no concurrency. To be spawned."""
+        """Invoke asynchronously: wait while there is no concurrency left. To be spawned. Raises what `invoke` raises."""
         wait, longest = ASYNC
         while True:
             try:
@@ -142,7 +142,7 @@ class SimulatedFunction:
 
 
 def enter(owner: object) -> None:
-    """What runs next runs in this container: its objects are those that `lambdas.installed` hands out."""
+    """Give `lambdas.installed` the objects of this container; none if the owner is no container."""
     if isinstance(owner, Container):
         installed._platform, installed._made = owner.platform, owner.made
     else:
@@ -150,13 +150,13 @@ def enter(owner: object) -> None:
 
 
 def lineage() -> Lineage:
-    """What a message inherits that is sent now: the lineage of the invocation that sends it, if one does."""
+    """Return the lineage for a message that is sent now: that of the present invocation, if there is one."""
     owner = getattr(greenlet.getcurrent(), "owner", None)
     return owner.lineage if isinstance(owner, Container) else NO_LINEAGE
 
 
 def together(lineages: Iterable[Lineage]) -> Lineage:
-    """The lineage of a batch: of each function the highest count."""
+    """Return the lineage of a batch: the highest count of each function."""
     found: dict[str, int] = {}
     for one in lineages:
         for name, times in one.items():
@@ -165,13 +165,13 @@ def together(lineages: Iterable[Lineage]) -> Lineage:
 
 
 def ends(owner: object) -> float:
-    """The second until which an invocation may run."""
+    """Return the second at which the owner's invocation times out; infinity if the owner is no container."""
     return owner.ends if isinstance(owner, Container) else math.inf
 
 
 @dataclass
 class HeldMessage:
-    """A message in a queue."""
+    """A message in a queue. `receipt` is the number of its latest receive; `gone` says whether it was deleted."""
 
     number: int
     body: str
@@ -182,8 +182,7 @@ class HeldMessage:
 
 
 class Wire(NamedTuple):
-    """Between a queue and its function: messages in a batch, seconds to gather them, invocations at once, and seconds
-    until a message that failed comes again."""
+    """An event source mapping: messages in a batch, seconds to gather them, invocations at once, visibility timeout (s)."""
 
     batch: int
     window: float
@@ -192,7 +191,10 @@ class Wire(NamedTuple):
 
 
 class SimulatedQueue:
-    """An SQS standard queue with the event source mapping that empties it into a function."""
+    """An SQS standard queue with the event source mapping that passes its messages to a function.
+
+    `receives` is how often a message is received before it becomes a dead letter.
+    """
 
     def __init__(
         self, function: SimulatedFunction, clock: GreenletClock, cloud: Cloud, wire: Wire, receives: int
@@ -202,15 +204,15 @@ class SimulatedQueue:
         self._visible: deque[HeldMessage] = deque()
         self._running = 0
         self._gathering = False
-        self._backlog_since = 0.0  # since when the queue has not been empty
+        self._backlog_since = 0.0  # the second since which there has been a backlog
         self._numbers = itertools.count(1)
         self._receipts = itertools.count(1)
         self.sent = 0
-        self.waiting = 0  # messages not yet gone
+        self.waiting = 0  # messages that are neither deleted nor dead letters
         self.dead: list[HeldMessage] = []
 
     def send(self, message: Mapping[str, Any], delay: float = 0.0, lineage: Lineage = NO_LINEAGE) -> None:
-        """A message, visible after `delay` seconds."""
+        """Send a message that is visible after `delay` seconds."""
         self.sent += 1
         self.waiting += 1
         held = HeldMessage(next(self._numbers), json.dumps(message), lineage)
@@ -228,7 +230,7 @@ class SimulatedQueue:
         self._gather()
 
     def _gather(self) -> None:
-        """Fetch a batch as soon as there is one, or the window is over."""
+        """Arrange the next fetch: soon if a batch is full, else after the window."""
         if self._gathering or not self._visible or self._running >= self._wire.concurrency:
             return
         self._gathering = True
@@ -237,10 +239,10 @@ class SimulatedQueue:
         self._clock.after(wait, self._fetch)
 
     def _fetch(self) -> None:
-        """Many pollers at work: each takes a batch, as long as the mapping's concurrency has room.
+        """Start an invocation for each batch, as long as the mapping's concurrency allows more.
 
-        The pollers grow with the backlog (AWS Compute Blog, "Introducing faster polling scale-up for AWS Lambda
-        functions configured with Amazon SQS", November 2023: 300 more invocations at once a minute, from 5).
+        The number of pollers grows with the backlog (AWS Compute Blog, "Introducing faster polling scale-up for AWS
+        Lambda functions configured with Amazon SQS", November 2023: 300 more invocations at once a minute, from 5).
         """
         self._gathering = False
         backlog = self._clock.seconds - self._backlog_since
@@ -256,7 +258,7 @@ class SimulatedQueue:
         self._gather()
 
     def _back(self, held: HeldMessage, receipt: int) -> None:
-        """The visibility timeout is over and the message is not deleted."""
+        """Show the message again after its visibility timeout, unless it was deleted or received again."""
         if not held.gone and held.receipt == receipt:
             self._show(held)
 
@@ -266,7 +268,7 @@ class SimulatedQueue:
             answer = self._function.invoke(event, together(held.lineage for held in batch)) or {}
         except Crash:
             failed = {str(held.number) for held in batch}
-        except Exception as error:  # noqa: BLE001 - as Lambda does: the whole batch comes again
+        except Exception as error:  # noqa: BLE001 - as with Lambda, the whole batch comes again
             self._cloud.log(f"{self._function.name} failed: {type(error).__name__}")
             failed = {str(held.number) for held in batch}
         else:

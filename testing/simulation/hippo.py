@@ -1,15 +1,16 @@
-"""HIPPO Gym's AWS functions as their source has them, for comparison on the same simulated account.
+"""The calls of HIPPO Gym's AWS functions on the same simulated account, for comparison.
 
-Read in the repository IRLL/HIPPO_Gym_AWS (`start_server.py`, `stop_server.py`, `next_step.py`, August 2021), and
-modelled call by call. `start_server` sets an EventBridge rule with a target as shutdown timer, makes a cluster of the
-participant's own, and tries RunTask three times, 20 s apart. Then it looks three times for the task's address, 20 s
-before each look, and gives up after the third. It makes one DNS change, and what that raises is swallowed. boto3's own
-retries are those of its default, "legacy" mode: five attempts. SNS invokes the function asynchronously; a function that
-raises is invoked again after one minute and after two more (Lambda Developer Guide, "Asynchronous invocation").
+The model follows the source, call by call: the repository IRLL/HIPPO_Gym_AWS (`start_server.py`, `stop_server.py`,
+`next_step.py`, August 2021). `start_server` sets an EventBridge rule with a target as shutdown timer, creates a cluster
+for the participant, and tries RunTask three times, 20 s apart. Then it looks for the task's address up to three times,
+with a pause of 20 s before each look. It makes one DNS change, and ignores the exceptions of that call. boto3 makes
+five attempts of each call, by its default mode, "legacy". SNS invokes the function asynchronously; Lambda invokes a
+function that raises again after one minute and after two more (Lambda Developer Guide, "Asynchronous invocation").
 
-In HIPPO's favour: it gets functions without end, CreateCluster and PutRule have no rate quota here, and each name in
-the zone counts as a server. When a task's address can be found decides much, since DNS changes that meet fail: soon,
-with the network interface (`early`), or when the task runs. Both are modelled, and the better one is compared with.
+The model favours HIPPO: its functions have no timeout and no limit of concurrency, CreateCluster and PutRule have no
+rate quota, and each name in the zone counts as a server. The moment at which a task's address can be found matters,
+since two DNS changes at the same time fail. It is either soon, with the network interface (`early`), or when the task
+runs. Both are modelled, and the better one is the yardstick.
 """
 
 from __future__ import annotations
@@ -26,31 +27,31 @@ from testing.simulation.tasks import TimedTask
 from testing.simulation.world import SimulatedWorld
 from testing.tasks import Life
 
-TRIES, PAUSE = 3, 20.0  # of RunTask and of the look for an address; seconds
-ATTEMPTS = 5  # of botocore's legacy mode
-AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function again that has raised
+TRIES, PAUSE = 3, 20.0  # tries of RunTask, and looks for the address; seconds between them
+ATTEMPTS = 5  # attempts of botocore's legacy mode
+AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function again that has raised an exception
 ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
-RULES = 300  # of an event bus: EventBridge quotas
+RULES = 300  # rules of an event bus: EventBridge quotas
 ASSUMED = (
     f"the interface has its address {ATTACHED[0]:g} to {ATTACHED[1]:g} s after RunTask (our assumption); functions have "
-    "no timeout, CreateCluster and PutRule no quota of rate, and who has a name has a server; the rest is its source "
+    "no timeout, CreateCluster and PutRule have no rate quota, and a name counts as a server; the rest follows its source "
     "(IRLL/HIPPO_Gym_AWS, August 2021)"
 )
 
 
 @dataclass
 class HippoStart:
-    """How one start went. Times are virtual seconds."""
+    """The outcome of one start. Times are virtual seconds."""
 
     asked: float
     named: float | None = None
-    ready: float | None = None  # when the DNS change is everywhere and the task runs
+    ready: float | None = None  # when the DNS change is in sync and the task runs
     billed: float = 0.0
     failed: str = ""
 
 
 class Hippo:
-    """The starts of one world."""
+    """Starts servers in one world in HIPPO's way. `early`: a task's address can be found before the task runs."""
 
     def __init__(self, world: SimulatedWorld, *, early: bool) -> None:
         self._early = early
@@ -59,7 +60,7 @@ class Hippo:
         self._rules: set[int] = set()
 
     def start(self, number: int) -> None:
-        """One participant's `start_server`, with Lambda's further invocations of it. To be spawned."""
+        """Do what one participant's `start_server` does, with Lambda's further invocations of it. To be spawned."""
         made = HippoStart(self.clock.seconds)
         self.starts.append(made)
         for pause in (*AGAIN, None):
@@ -71,7 +72,7 @@ class Hippo:
                 made.failed = f"{type(error).__name__}: {error}"
             made.billed += self.clock.seconds - begun
             if not made.failed.startswith(("Throttled", "TooMany")) or pause is None:
-                return  # it returned: Lambda does not invoke it again
+                return  # the function has returned, or this was its last invocation
             self.clock.sleep(pause)
 
     def _start(self, number: int, made: HippoStart) -> None:
@@ -118,42 +119,41 @@ class Hippo:
         return None
 
     def _address(self, task: TimedTask) -> bool:
-        """Whether the address is found; each look is two calls."""
+        """Look for the task's address, and return whether it was found. A look is two calls if it finds the task."""
         there = task.born + self.clock.random.uniform(*ATTACHED) if self._early else task.runs
         for _ in range(TRIES):
             self.clock.sleep(PAUSE)
             self._call("ecs:DescribeTasks")
             if task.last in (Life.PROVISIONING, Life.RUNNING) and self.clock.seconds >= there:
-                with contextlib.suppress(Throttled):  # what this look raises is swallowed, and the next look comes
+                with contextlib.suppress(Throttled):  # the function ignores the exceptions of a look, and looks again
                     self._call("ec2:DescribeNetworkInterfaces")
                     return True
         return False
 
 
 class TooMany(Exception):
-    """A quota that is no rate."""
+    """A quota of a number was exceeded, not one of a rate."""
 
 
-# What a participant costs
+# The calls of one participant
 
 
 def calls(steps: Mapping[str, str], *, start: str, stop: str, waits: int = 1) -> Iterator[tuple[str, str]]:
-    """Every AWS call of one participant of HIPPO from the link to the clean-up: the function and the call.
+    """Yield every AWS call of one participant of HIPPO, from the link to the clean-up, as function and action.
 
-    `steps` are the pages by step, `start` and `stop` the steps that publish. Each step is asked for once, and the game
-    step `waits` more times while the server starts. The address is found at the first look.
+    `steps` are the pages by step; the steps `start` and `stop` publish messages. Each step is requested once, and the
+    game step `waits` more times while the server starts. The address is found at the first look.
     """
     for step, page in steps.items():
         for waiting in (*[True] * (waits if page == "game" else 0), False):
-            yield from (
-                ("next_step", call) for call in page_calls(page, publishes=step in (start, stop), waiting=waiting)
-            )
-    yield from (("start_server", call) for call in START_CALLS)
-    yield from (("stop_server", call) for call in STOP_CALLS)
+            actions = page_calls(page, publishes=step in (start, stop), waiting=waiting)
+            yield from (("next_step", action) for action in actions)
+    yield from (("start_server", action) for action in START_CALLS)
+    yield from (("stop_server", action) for action in STOP_CALLS)
 
 
 def page_calls(page: str, *, publishes: bool = False, waiting: bool = False) -> Iterator[str]:
-    """One request of a step: the project list, the participant's record, the events, the page."""
+    """Yield the AWS calls of one request of a step: project list, participant's record, messages, page."""
     yield from ("s3:GetObject", "s3:GetObject", "s3:PutObject")
     if publishes:
         yield "sns:Publish"
@@ -161,7 +161,7 @@ def page_calls(page: str, *, publishes: bool = False, waiting: bool = False) -> 
         yield from ("s3:ListObjects", "s3:GetObject")
         return
     yield "route53:ListResourceRecordSets"
-    if waiting:  # the step is counted back
+    if waiting:  # the participant's record is set back by a step
         yield from ("s3:GetObject", "s3:PutObject")
 
 
@@ -176,12 +176,12 @@ STOP_CALLS = (
 
 
 class HippoRecord:
-    """A participant's record as HIPPO keeps it: the event of every request is appended, and the whole is written."""
+    """A participant's record as HIPPO stores it: each request appends its event, and writes the whole record."""
 
     def __init__(self) -> None:
         self.record: dict[str, Any] = {"created": "2026-11-21 14:46:40.123456+00:00", "nextStep": 1, "requests": []}
 
     def request(self, event: Mapping[str, Any]) -> int:
-        """Take a request; the bytes written for it."""
+        """Append a request; return the bytes that are written for it."""
         self.record["requests"].append(event)
         return len(json.dumps(self.record).encode())

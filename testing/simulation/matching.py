@@ -1,8 +1,8 @@
-"""The servers without members of a study with `matching: match`: they look at the question, and one answers.
+"""The simulated servers of a study with `matching: match` that have no members yet: they answer who plays with whom.
 
-As `trial/server/matching.py` does: each looks every two seconds, calls `match`, and creates the answer's document; the
-first one's counts. Here `match` takes up to five seconds (`trial/agent/match.py`), and puts those together whose ids
-stand next to each other.
+They do what `trial/server/matching.py` does: each server reads the question every two seconds, calls `match`, and
+creates the document of its answer; the first answer counts. Here a call of `match` takes up to a second (`TAKES`),
+while the trial allows it five (`trial/agent/match.py`); it groups the participants in the order of their ids.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from testing.simulation.ports import SimPlatform
 from testing.tasks import Life
 from trial.server.matching import LOOK_SECONDS
 
-TAKES = (0.05, 1.0)  # seconds of one call of `match`, and of its answer's way
+TAKES = (0.05, 1.0)  # seconds from the call of `match` until its answer is stored
 
 
 class SimMatching:
-    """All servers that wait without members. One look stands for theirs: only the first answer counts."""
+    """All servers that have no members yet. They look once for all of them, since only the first answer counts."""
 
     def __init__(self, platform: SimPlatform, project_id: str) -> None:
         self._platform, self._project_id = platform, project_id
-        self.answered = 0  # questions
-        self.most_waiting = 0  # in one question
-        self.largest = 0  # bytes of the document
+        self.answered = 0  # answers that were stored
+        self.most_waiting = 0  # the most participants in one question
+        self.largest = 0  # bytes of the largest question
         self._look()
 
     def _look(self) -> None:

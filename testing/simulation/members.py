@@ -1,4 +1,4 @@
-"""Participants who play together: they wait in the lobby, close tabs, load the page again, come back, lose the network."""
+"""Simulated participants who play together: they wait in the lobby, close tabs, reload, come back, lose the network."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from testing.simulation.people import SimulatedParticipant
 from testing.simulation.trials import SimTrial, is_lost
 from testing.simulation.world import SECRET, SimulatedWorld
 
-POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two questions of the lobby's page: web/game/
+POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two polls of the lobby's page, as in web/game/
 GIVES_UP = 3900.0  # seconds in the lobby: `patience` is an hour at most
 
 
 @dataclass(frozen=True)
 class Habits:
-    """What one of them does in the lobby and in the game. Times are seconds from when they came there."""
+    """The behaviour of one member in the lobby and in the game. Times are seconds since they came there."""
 
     leaves: float | None = None  # closes the page of the lobby
-    beacon: float | None = 0.1  # until the beacon arrives that says so; None: it never does
+    beacon: float | None = 0.1  # from then until the beacon of the closed page is sent; None: it never is
     back: float | None = None  # from then until they open the link again; None: never. 0 is a reload
-    offline: tuple[float, float] | None = None  # when their network is gone in the lobby, and for how long
+    offline: tuple[float, float] | None = None  # when they lose the network in the lobby, and for how long
     tabs: int = 1
-    drops: tuple[float, float] | None = None  # when their connection to the game is gone, and for how long
+    drops: tuple[float, float] | None = None  # when they lose the connection to the game, and for how long
     quits: float | None = None  # closes the page of the game for good
 
 
 class Quit(Exception):
-    """They have closed the page of the game."""
+    """The member has closed the page of the game for good."""
 
 
 class SimulatedMember(SimulatedParticipant):
@@ -40,11 +40,11 @@ class SimulatedMember(SimulatedParticipant):
     def __init__(self, world: SimulatedWorld, number: int, *, habits: Habits | None = None, **person: Any) -> None:
         super().__init__(world, number, **person)
         self.habits = habits or Habits()
-        self.asked_at: list[datetime] = []  # when their requests arrived at the game step
+        self.asked_at: list[datetime] = []  # when they sent each request, but for beacons
         self.lobby: float | None = None  # the second at which they came to the lobby
-        self.matched: float | None = None  # at which their page first said something else
-        self.first_picture: float | None = None
-        self.polls = 0  # of the lobby's page
+        self.matched: float | None = None  # the second at which their page first left the state `lobby`
+        self.first_picture: float | None = None  # the second at which they saw it
+        self.polls = 0  # polls of the lobby's page
         self._left = False
         self._dropped = False
 
@@ -69,7 +69,7 @@ class SimulatedMember(SimulatedParticipant):
         return super()._game(page) if "state" in page else True
 
     def _wait_in_lobby(self, page: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The page that they get when the lobby is over; None if they have left for good, or none comes."""
+        """Wait in the lobby, and return the page that follows it; None if they have left for good, or if no page comes."""
         step, since, habits = str(page["step"]), self.clock.seconds, self.habits
         if self.lobby is None:
             self.lobby = since
@@ -91,7 +91,7 @@ class SimulatedMember(SimulatedParticipant):
         return None
 
     def _loaded(self) -> dict[str, Any] | None:
-        """The page, loaded again; None if it does not come."""
+        """Load the page again and return it; None if it does not come."""
         found = self._ask("GET")
         if found is None:
             self.visit.told = "no answer from the site"
@@ -102,15 +102,15 @@ class SimulatedMember(SimulatedParticipant):
         return self._request("GET", self._poll_query(step), "")
 
     def _poll_query(self, step: str) -> str:
-        """The poll address of a page in a study of sessions has the step's ticket, also when the lobby is over."""
+        """Return the query of the page's polls. With sessions it has the step's ticket, even after the lobby."""
         return f"{self._query}&{urlencode({'poll': step, 'ticket': self._ticket(step)})}"
 
     def _ticket(self, step: str) -> str:
-        """The proof that they were shown this step, as it stands in the page."""
+        """Return the ticket of this step, as the page has it."""
         return ids.ticket(SECRET.project_secret(self.world.project), self.visit.user, step)
 
     def _leave(self, step: str) -> dict[str, Any] | None:
-        """They close the page; what they find if they come back, else None."""
+        """Close the page; return the page that they load if they come back, else None."""
         self._left = True
         if self.habits.beacon is not None:
             self.clock.spawn(lambda: self._beacon(step), delay=self.habits.beacon)
@@ -121,18 +121,18 @@ class SimulatedMember(SimulatedParticipant):
         return self._loaded()
 
     def _beacon(self, step: str) -> None:
-        """What the page sends when it is closed. It is no question: who has sent it is not there."""
+        """Send what a page sends when it is closed. It is not in `asked_at`, since the member is no longer present."""
         form = {"hippodrome-step": step, "hippodrome-ticket": self._ticket(step), "hippodrome-action": "leave"}
         super()._request("POST", self._query, urlencode(form))
 
     def _second_tab(self, step: str) -> None:
-        """Another tab at the lobby: it asks as the first one does, until one of them is through."""
+        """Poll from another tab in the lobby, until they are matched or gone."""
         while self.matched is None and not self.visit.told and self.visit.finished is None:
             self._poll_lobby(step)
             self.clock.sleep(POLL)
 
     def _play_on(self, state: dict[str, Any]) -> str:
-        """Connect and play with the others; `done`, or `lost`, or `unreachable`."""
+        """Connect and play with the others. Return `done`, `lost` or `unreachable`."""
         tasks, names = self.world.platform.tasks, self.world.platform.dns
         host = names.records.get(state["url"].split("/")[2].split(":")[0])
         task = tasks.at(host) if host else None
@@ -152,7 +152,10 @@ class SimulatedMember(SimulatedParticipant):
         return outcome
 
     def _stay(self, trial: SimTrial, step: str) -> str:
-        """Until the trial is over, the server is lost, or their network is gone for a while. Raises Quit."""
+        """Stay until the trial is over (`done`), the server is lost (`lost`), or they lose the connection (`dropped`).
+
+        Raises Quit when they close the page for good.
+        """
         since, drops = self.clock.seconds, self.habits.drops
         while True:
             self.clock.sleep(1.0)
@@ -168,6 +171,6 @@ class SimulatedMember(SimulatedParticipant):
                 return "dropped"
 
     def _is_over(self) -> bool:
-        """The page that is loaded when the server is gone: whether the game is over for this participant."""
+        """Load the page, and return whether the game is over for this member."""
         page = self._ask("GET")
         return page is not None and "state" not in page

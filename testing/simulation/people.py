@@ -1,4 +1,4 @@
-"""Participants: they read, answer, wait, play, come back after trouble, and sooner or later give up."""
+"""Simulated participants: they read, answer, wait, play, come back after a fault, and give up in the end."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import SimulatedWorld
 
-READ, PLAY = 20.0, 60.0  # seconds: for a page, half as long to half as long again; in the game
-MAX_TRIES = 4  # of a page that does not come
+READ, PLAY = 20.0, 60.0  # seconds: for a page, on average (half of it to one and a half times); in the game
+MAX_TRIES = 4  # requests of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
 RELOADS = 75.0  # seconds at the waiting page after which people load it again
-
-
-POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # of web/game/, in seconds; a test compares
+POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # seconds, as in web/game/; a test compares them
 
 
 def poll_delay(state: Mapping[str, Any], polls: int) -> float:
-    """Seconds until the waiting page asks once more, after so many questions: what `pollDelay` of web/game/ does."""
+    """Return the seconds until the waiting page's next poll, after so many polls, as `pollDelay` of web/game/ does."""
     if state.get("state") in ("failed", "ended"):
         return POLLS["longest"]
     if state.get("state") == "naming":
@@ -34,42 +32,42 @@ def poll_delay(state: Mapping[str, Any], polls: int) -> float:
 
 
 def retry_delay(tries: int) -> float:
-    """Seconds until the waiting page asks again that got no answer: what `pollUntilAnswered` of web/game/ does."""
+    """Return the seconds until the waiting page repeats a poll without answer, as `pollUntilAnswered` of web/game/ does."""
     return float(min(POLLS["longest"], POLLS["first"] * 2**tries))
 
 
 @dataclass
 class SimulatedVisit:
-    """How it went for one participant. Times are virtual seconds since the world's beginning."""
+    """What happened to one participant. Times are virtual seconds since the world's beginning."""
 
     user: str
     arrived: float
-    asked: float | None = None  # when they sent the request that calls for their server
+    asked: float | None = None  # when they sent the request for which their server is started
     waiting: float | None = None  # when they came to the game
-    ready: float | None = None  # when their page first showed an address
-    interruptions: int = 0
-    pages: int = 0  # that they asked for, polls left out
-    unanswered: int = 0  # of those, that did not come at the first try
+    ready: float | None = None  # when their page first got a server's address
+    interruptions: int = 0  # servers that were lost while they played
+    pages: int = 0  # pages that they requested, without polls
+    unanswered: int = 0  # of these, the pages that did not come at the first try
     finished: float | None = None
-    told: str = ""  # the honest page they ended with instead
+    told: str = ""  # why the study was over for them, if they have not finished
 
 
 class SimulatedParticipant:
-    """One participant's way through the study, as a browser walks it."""
+    """One participant with a browser, who goes through the study. `walk` is to be spawned."""
 
     def __init__(
         self, world: SimulatedWorld, number: int, *, read: float = READ, play: float = PLAY, leaves_at: str = ""
     ) -> None:
         self.world, self.clock = world, world.clock
         self.visit = SimulatedVisit(f"p{number:05d}", world.clock.seconds)
-        self.answered: list[str] = []  # the steps whose answer we were told is kept
+        self.answered: list[str] = []  # the steps whose answers they were told are stored
         self._read, self._play, self._leaves_at = read, play, leaves_at
         self._first_ask = self._step_before_server()
         world.people += 1
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
     def walk(self) -> None:
-        """From the link to the last page. To be spawned, once."""
+        """Go from the link to the last page, or give up. To be spawned, once."""
         try:
             self._walk()
         finally:
@@ -107,13 +105,13 @@ class SimulatedParticipant:
         self.visit.told = self.visit.told or "no answer from the site"
 
     def _step_before_server(self) -> str | None:
-        """The step whose answer calls for the server; None if the link itself does."""
+        """Return the step whose answer starts the server; None if the first request of the link does."""
         keys = [step.key for step in self.world.project.steps]
         at = keys.index(self.world.project.events.start_server_step or keys[0])
         return keys[at - 1] if at else None
 
     def _ask(self, method: str, body: str = "") -> dict[str, Any] | None:
-        """A page; a browser's person reloads when it does not come."""
+        """Request a page, and again after `RETRY` seconds if it does not come; None after `MAX_TRIES`."""
         self.visit.pages += 1
         for tries in range(MAX_TRIES):
             if (answer := self._request(method, self._query, body)) is not None:
@@ -123,7 +121,7 @@ class SimulatedParticipant:
         return None
 
     def _poll(self, step: str) -> dict[str, Any] | None:
-        """What the waiting page is told; None if nothing comes for a while."""
+        """Return the state that a poll of the waiting page gets; None if no answer comes after `MAX_TRIES`."""
         for tries in range(MAX_TRIES):
             if (answer := self._request("GET", self._poll_query(step), "")) is not None:
                 return answer
@@ -131,20 +129,20 @@ class SimulatedParticipant:
         return None
 
     def _poll_query(self, step: str) -> str:
-        """What follows the question mark in the page's poll address."""
+        """Return the query of the page's poll address."""
         return f"{self._query}&poll={step}"
 
     def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
         self.clock.sleep(self.clock.random.uniform(0.02, 0.2))
         try:
             status, answer = self.world.ask(method, query, body)
-        except (Crash, Exception) as error:  # noqa: BLE001 - whatever it was, no page came
+        except (Crash, Exception) as error:  # noqa: BLE001 - whatever the error, no page came
             self.world.cloud.log(f"a page failed: {type(error).__name__}")
             return None
         return answer if status < 500 and isinstance(answer, dict) else None
 
     def _game(self, page: dict[str, Any]) -> bool:
-        """Wait, play, and come back to wait after an interruption; False if it ends here."""
+        """Wait and play, and wait again after an interruption. Return False if the study is over for them here."""
         if self.visit.waiting is None:
             self.visit.waiting = self.clock.seconds
         state, since, polls = page, self.clock.seconds, 0
@@ -182,11 +180,11 @@ class SimulatedParticipant:
                 state = fresh or state
 
     def _is_over(self) -> bool:
-        """Whether the server has ended because the game is over. Alone, a participant hears that from the server."""
+        """Return whether the game is over, if the server has ended. Who plays alone learns it from the server."""
         return False
 
     def _play_on(self, state: dict[str, Any]) -> str:
-        """Connect and play; `done`, or `lost` when the connection ended before the game did, or `unreachable`."""
+        """Connect and play. Return `done`, `lost` if the server was lost before the game was over, or `unreachable`."""
         tasks, names = self.world.platform.tasks, self.world.platform.dns
         host = names.records.get(state["url"].split("/")[2].split(":")[0])
         task = tasks.at(host) if host else None

@@ -1,4 +1,4 @@
-"""The five ports on the simulated account, with what AWS does to those who use them."""
+"""The five ports on the simulated account, with AWS's delays, conflicts and limits."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from testing.simulation.conditions import Conditions, draws, propagation
 from testing.simulation.functions import Lineage, lineage
 from testing.simulation.tasks import SimTasks
 
-PAGE = 1000  # keys of one page of a listing: S3 API Reference, ListObjectsV2
-MAX_CHANGES = 1000  # of a zone in one call, an UPSERT counting twice: Route 53 Developer Guide, "Quotas"
-LOBBY = (entries.FOLDER, decisions.LOBBIES)  # where who waits, and what is decided, lies
+PAGE = 1000  # keys in one page of a listing: S3 API Reference, ListObjectsV2
+MAX_CHANGES = 1000  # changes of a zone in one call, an UPSERT counts twice: Route 53 Developer Guide, "Quotas"
+LOBBY = (entries.FOLDER, decisions.LOBBIES)  # the folders of the lobbies' entries and decisions
 T = TypeVar("T")
 
 
 class SimDocuments:
-    """S3: conditional writes, strongly consistent. `kept` and `keep` are for people and trials, who pay elsewhere.
+    """S3: strongly consistent, with conditional writes. Participants and trials use `kept` and `keep`, which are no calls.
 
-    A read, and a listing, show every write that was answered before they began (S3 User Guide, "What is Amazon S3?",
-    data consistency model); a write without a condition takes the place of what there is, and the last one stays.
-    `LastModified` has whole seconds, cut (minio/minio-go issue 1632 and pull request 1638, tried on AWS). A listing is a
-    call for every 1,000 keys (S3 API Reference, ListObjectsV2), and no snapshot: what is written between its pages
-    may be seen in the later ones. Removing what is not there succeeds (the same, DeleteObject).
+    Reads and listings show every write that was answered before they began (S3 User Guide, "What is Amazon S3?", data
+    consistency model). A write without a condition replaces the document. `LastModified` is cut to whole seconds
+    (minio/minio-go issue 1632 and pull request 1638, tried on AWS). A listing is a call for every 1,000 keys (S3 API
+    Reference, ListObjectsV2). It is no snapshot: later pages may show documents that were written after the first page.
+    Deleting a missing document succeeds (the same reference, DeleteObject).
     """
 
     def __init__(self, cloud: Cloud) -> None:
@@ -85,13 +85,13 @@ class SimDocuments:
         self._call("s3:DeleteObject", key, effect)
 
     def _call(self, action: str, key: str, effect: Callable[[], T]) -> T:
-        """One call, which is counted by what it is about, too."""
+        """Make a call, and count it in `lobby_calls` if it is about a lobby, a session or a membership."""
         if key.startswith(LOBBY) or key.endswith("/session.json"):
             self._cloud.lobby_calls[action] += 1
         return self._cloud.call(action, effect)
 
     def keep(self, key: str, body: bytes, etag: str | None = None) -> str:
-        """A conditional write, made at once: `etag` None means that there must be nothing yet. Raises `Conflict`."""
+        """Write at once if the document has this ETag (None: does not exist); return the new one. Raises Conflict."""
         found = self.kept.get(key)
         if (found[1] if found else None) != etag:
             self._cloud.conflicts[key] += 1
@@ -103,7 +103,7 @@ class SimDocuments:
         return made
 
     def _page(self, prefix: str, after: str) -> Sequence[Entry]:
-        """The keys with this prefix that come after that one, up to one more than a page holds."""
+        """Return the entries with this prefix after the key `after`, up to one more than a page holds."""
         start = max(bisect.bisect_left(self._keys, prefix), bisect.bisect_right(self._keys, after))
         found = itertools.takewhile(lambda key: key.startswith(prefix), itertools.islice(self._keys, start, None))
         return [Entry(key, self.kept[key][2], len(self.kept[key][0])) for key in itertools.islice(found, PAGE + 1)]
@@ -116,7 +116,7 @@ class SimDocuments:
 
 
 class SimDns:
-    """A Route 53 zone: one change at a time, in sync after a while, deletions only with the present values."""
+    """A Route 53 zone: one change at a time, in sync after some seconds. A removal needs the record's present value."""
 
     def __init__(self, cloud: Cloud, conditions: Conditions) -> None:
         self._cloud, self._conditions = cloud, conditions
@@ -124,9 +124,9 @@ class SimDns:
         self.records: dict[str, str] = {}
         self._in_sync: dict[str, float] = {}
         self._busy_until = 0.0
-        self.strangers: dict[str, str] = {}
-        self.most_records = 0
-        self.spreads: dict[str, float] = {}  # seconds that the change of a name took to be everywhere
+        self.strangers: dict[str, str] = {}  # records that belong to no server of ours
+        self.most_records = 0  # the most records at once
+        self.spreads: dict[str, float] = {}  # by name: seconds that its change took to be in sync
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         changes = [(record, False) for record in remove] + [(record, True) for record in add]
@@ -152,11 +152,11 @@ class SimDns:
         return record.name
 
     def in_sync_at(self, change: str) -> float:
-        """When a change is everywhere."""
+        """Return the second at which a change is in sync."""
         return self._in_sync[change]
 
     def _change(self, changes: Sequence[tuple[DnsRecord, bool]]) -> str:
-        """One batch, as `hippodrome.aws.dns` makes it: with its patience where the zone is busy."""
+        """Make one batch of changes, and try again while the zone is busy, as `hippodrome.aws.dns` does."""
         clock = self._cloud.clock
         add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
         return retry_while_busy(
@@ -168,9 +168,10 @@ class SimDns:
         )
 
     def changed(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
-        """What Route 53 does with a change; its id.
+        """Carry out a change as Route 53 does, at once; return its id.
 
-        Raises `Throttled` while another one is on its way, and where the account has made too many changes lately.
+        Raises Throttled while the zone is busy with another change, or if the account has made too many changes;
+        Refused if the batch is too large.
         """
         clock, number = self._cloud.clock, 2 * len(add) + len(remove)
         if number > MAX_CHANGES:
@@ -194,7 +195,7 @@ class SimDns:
 
 
 class SimTimers:
-    """EventBridge Scheduler: fires within a minute after its time, and forgets the timer."""
+    """EventBridge Scheduler: it fires a timer within a minute after its time, and deletes it."""
 
     def __init__(self, cloud: Cloud, fire: Callable[[Message], None]) -> None:
         self._cloud, self._fire = cloud, fire

@@ -1,4 +1,4 @@
-"""Whether the sessions of a simulated installation are in order, by its documents and by what its participants did."""
+"""Checks the sessions of a simulated installation by its documents and by the requests of its participants."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from protocol.keys import answer_key, membership_key
 from testing.simulation.lobby import Kept, formed
 from testing.simulation.members import SimulatedMember
 
-PRESENT = timedelta(seconds=10)  # after which who has not asked is no longer there
-ANSWERS = timedelta(seconds=30)  # that a page may take: what it decides, it decides for who was there when it began
+PRESENT = timedelta(seconds=10)  # a participant counts as present for so long after a request
+ANSWERS = timedelta(seconds=30)  # a request may take so long; those present at its beginning count
 
 
 def wrong(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
-    """Sessions whose members are split, or that are merged, participants who were matched as ghosts, and answers of another session."""
+    """Return each fault as a sentence; "split", "merged" or "ghost" stands before the colon."""
     return [
         *_split(kept, project, people),
         *_merged(kept, project),
@@ -28,20 +28,22 @@ def wrong(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> li
 
 
 def _split(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
-    """Where a session and its members do not say the same."""
+    """Compare the members in the sessions' documents with the membership that each participant has."""
     members = {(member.user_id, one.id) for one in formed(kept, project) for member in one.members}
-    told = set()
+    memberships_found = set()
     for user in {person.visit.user for person in people}:
         if stored := kept.get(membership_key(project.id, user)):
             membership = memberships.read(stored[0])
             if membership.session is not None:
-                told.add((user, membership.session))
-    yield from (f"split: {user} is a member of {session} and was not told" for user, session in sorted(members - told))
-    yield from (f"split: {user} was told of {session} and is no member" for user, session in sorted(told - members))
+                memberships_found.add((user, membership.session))
+    for user, session in sorted(members - memberships_found):
+        yield f"split: {user} is a member of {session} and has no membership of it"
+    for user, session in sorted(memberships_found - members):
+        yield f"split: {user} has a membership of {session} and is no member"
 
 
 def _merged(kept: Kept, project: Project) -> Iterator[str]:
-    """Participants in two sessions, and sessions of too many."""
+    """Find participants in two sessions, and sessions with too many or too few members."""
     count: Counter[str] = Counter()
     for one in formed(kept, project):
         count.update(member.user_id for member in one.members)
@@ -53,7 +55,7 @@ def _merged(kept: Kept, project: Project) -> Iterator[str]:
 
 
 def _ghosts(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
-    """Members who had closed the page long before their session was formed."""
+    """Find members who had sent no request for long when their session was formed."""
     asked: dict[str, list[datetime]] = defaultdict(list)
     for person in people:
         asked[person.visit.user] += person.asked_at
@@ -61,11 +63,11 @@ def _ghosts(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> 
         when = datetime.fromisoformat(one.formed.replace("Z", "+00:00"))
         for member in one.members:
             if not any(when - PRESENT - ANSWERS <= at <= when for at in asked[member.user_id]):
-                yield f"ghost: {member.user_id} had not asked for long when {one.id} was formed"
+                yield f"ghost: {member.user_id} had sent no request for long when {one.id} was formed"
 
 
 def _answers(kept: Kept, project: Project) -> Iterator[str]:
-    """Game steps that members of a session have answered in another."""
+    """Find game steps that members of a session have answered in another session."""
     for one in formed(kept, project):
         for member in one.members:
             for step in project.game_steps:

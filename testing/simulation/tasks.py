@@ -1,4 +1,4 @@
-"""ECS on Fargate on the simulated account: when tasks run and end, and what events tell of it."""
+"""ECS on Fargate on the simulated account: the start and the end of tasks, and their events."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from testing.simulation.cloud import ATTEMPTS, Cloud, Throttled
 from testing.simulation.conditions import Conditions, address_lag, draws, start_time
 from testing.tasks import Life, Task
 
-DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED: its network interface goes
+DEPROVISIONED = (10.0, 35.0)  # seconds from the end of a task's container to STOPPED, without its network interface
 ADDRESSES = sum(
     ipaddress.ip_network(subnet["CidrBlock"]).num_addresses
-    - 5  # of which AWS keeps five: VPC User Guide, "Subnet CIDR blocks"
+    - 5  # AWS reserves five in each subnet: VPC User Guide, "Subnet CIDR blocks"
     for subnet in template.resources("AWS::EC2::Subnet").values()
 )
-LOOKS = 20.0  # seconds between a warm server's looks for whose it has become
+LOOKS = 20.0  # seconds until a server looks again whether it has a participant or a formed session
 
 
 @dataclass(repr=False)
 class TimedTask(Task):
-    """A task and when AWS does what with it, in seconds of the clock."""
+    """A task with the times of its states, in seconds of the clock."""
 
-    born: float = 0.0
-    runs: float = 0.0  # when it is to run
-    lag: float = 0.0  # seconds from then on until EC2 shows its address
-    began: float | None = None
+    born: float = 0.0  # when RunTask was called
+    runs: float = 0.0  # when it is to be RUNNING
+    lag: float = 0.0  # seconds from then until EC2 shows its address
+    began: float | None = None  # when it was RUNNING
     closed: float | None = None  # when its container ended
     guests: int = 0  # connections so far
-    interrupted: bool = False  # by Spot
+    interrupted: bool = False  # whether Spot has taken it back
 
 
 class SimTasks:
-    """ECS on Fargate, with EC2's addresses. `changed` gets every event; `trial` is told of tasks that run."""
+    """ECS on Fargate, with EC2's addresses. `changed` is called with every event and its delay in seconds."""
 
     def __init__(self, cloud: Cloud, conditions: Conditions) -> None:
         self._cloud, self._conditions = cloud, conditions
@@ -57,9 +57,9 @@ class SimTasks:
         self._by_interface: dict[str, TimedTask] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
-        self.interfaces = 0  # network interfaces that there are now, each with an address of a subnet
+        self.interfaces = 0  # network interfaces that exist now, each with an address of a subnet
         self.most_interfaces = 0
-        # Whose a warm server has become, or one of a session that is formed; empty until it can be told.
+        # Returns the id of the participant or formed session to whom a server belongs; empty until there is one.
         self.owner: Callable[[TimedTask], str] = lambda task: ""
 
     def run(self, request: TaskRequest, attempts: int = ATTEMPTS) -> str:
@@ -109,19 +109,19 @@ class SimTasks:
     def clusters(self) -> Iterator[str]:
         yield from self._cloud.call("ecs:ListClusters", lambda: sorted(self._own_clusters))
 
-    # What AWS and trials do
+    # Events of AWS and of trials
 
     def living(self) -> Iterator[TimedTask]:
-        """Tasks that are not stopped and were not told to."""
+        """Yield the tasks that were not told to stop."""
         return (task for task in self.tasks.values() if task.desired is not Life.STOPPED)
 
     def at(self, host: str) -> TimedTask | None:
-        """The task that answers at that address."""
+        """Return the running task with this address; None if there is none."""
         task = self._by_host.get(host)
         return task if task and task.last is Life.RUNNING else None
 
     def end(self, arn: str, code: str | None, reason: str, exit_code: int | None = None) -> None:
-        """Let a task go: told to stop, its container ended a little later, and the task stopped some time after."""
+        """Stop a task: its desired status changes now, its container ends some seconds later, and then it is STOPPED."""
         task = self.tasks.get(arn)
         if task is None or task.desired is Life.STOPPED:
             return
@@ -174,7 +174,10 @@ class SimTasks:
         self._cloud.clock.after(wait, lambda: self.end(task.arn, "EssentialContainerExited", "deadline", 0))
 
     def _wait_for_guests(self, task: TimedTask) -> None:
-        """A warm server, or one of a session, is not idle until it knows who plays: it looks from time to time."""
+        """End the task if no participant connects within `idle` seconds.
+
+        A warm server or a session's server begins to count when it has a participant or a formed session.
+        """
         if (task.is_warm_server or task.session) and not self.owner(task):
             if task.last is Life.RUNNING:
                 self._cloud.clock.after(LOOKS, lambda: self._wait_for_guests(task))
@@ -186,7 +189,7 @@ class SimTasks:
             self.end(task.arn, "EssentialContainerExited", "idle", 0)
 
     def _take_back(self, task: TimedTask) -> None:
-        """Spot's warning is an event and SIGTERM, two minutes ahead; the trial stores what it has and ends well."""
+        """Interrupt a Spot task: AWS sends an event and SIGTERM two minutes ahead, and the trial ends with status 0."""
         if task.desired is Life.STOPPED:
             return
         self._cloud.log(f"{task.name}: Spot interruption")
@@ -207,7 +210,7 @@ class SimTasks:
         self._tell(task)
 
     def _tell(self, task: TimedTask) -> None:
-        """An ECS Task State Change event; the rule lets RUNNING, DEPROVISIONING and STOPPED through."""
+        """Send an "ECS Task State Change" event, unless the task is PROVISIONING: the template's rule takes no such event."""
         task.version += 1
         if task.last is Life.PROVISIONING:
             return

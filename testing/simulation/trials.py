@@ -1,8 +1,8 @@
-"""What the trial servers of sessions do on their simulated tasks: let the members in, play, and write their answers.
+"""The simulated trial servers of sessions: they let the members in, play, and write their answers.
 
-They do what trial/server/ and trial/core/ do with the defaults of config.yml: the game begins when all members are
-connected, is held while one is away, ends for all when one stays away longer than `ABSENT`, and goes on where an
-earlier server has recorded it.
+They behave like trial/server/ and trial/core/ with the defaults of config.yml. The game begins when all members are
+connected, pauses while one is away, and ends for all when one was away for more than `ABSENT` seconds. A server that
+replaces a lost one goes on where the recordings of the lost server end.
 """
 
 from __future__ import annotations
@@ -21,37 +21,36 @@ from testing.simulation.ports import SimPlatform
 from testing.simulation.tasks import TimedTask
 from testing.tasks import Life
 
-TICK = 1.0  # seconds between two looks of a trial at who is there
+TICK = 1.0  # seconds after which a trial looks again which members are connected
 COUNTDOWN, ABSENT = 3.0, 30.0  # seconds: `trial.countdown` and `trial.absent`
 LINGER = 3.0  # seconds from a trial's stored answers to its end
 
-
-_parsed = functools.lru_cache(maxsize=1000)(sessions.parse)  # a document is read every second, and seldom changes
+_parsed = functools.lru_cache(maxsize=1000)(sessions.parse)  # trials read documents every second; few of them change
 
 
 class SimTrial:
-    """The trial of one task. `over` is why it has ended: `done`, `lost` (its server), or empty while it goes on."""
+    """The trial of one task. `over` is empty while it goes on; then it is `done`, `lost` (with its server) or `idle`."""
 
     def __init__(self, trials: SimTrials, task: TimedTask, session_id: str, step: str, play: float) -> None:
         """The game takes `play` seconds."""
         self.task, self.session_id = task, session_id
         self.over = ""
-        self.began: float | None = None  # when all members were here for the first time
+        self.began: float | None = None  # when the game began
         self._step, self._play = step, play
         self._here: Counter[str] = Counter()  # connections, by member
-        self._away: defaultdict[str, float] = defaultdict(float)  # seconds, by member
+        self._away: defaultdict[str, float] = defaultdict(float)  # seconds of absence, by member
         self._countdown = COUNTDOWN
         self._trials, self._documents, self._clock = trials, trials.platform.documents, trials.platform.clock
         self._clock.spawn(self._run)
 
     @property
     def session(self) -> SessionDocument | None:
-        """The session's document, which the trial reads until it is there."""
+        """The session's document; None if there is none yet."""
         found = self._documents.kept.get(session_key(self._trials.project_id, self.session_id))
         return _parsed(found[0]) if found else None
 
     def connect(self, user: str, token: str) -> bool:
-        """Whether it lets this participant in: a member, with the token of this member."""
+        """Let a member in who has the member's token; return whether the participant was let in."""
         session = self.session
         if session is None or session.member(user) is None:
             return False
@@ -62,11 +61,11 @@ class SimTrial:
         return True
 
     def disconnect(self, user: str) -> None:
-        """One connection of the member is gone."""
+        """Close one connection of the member."""
         self._here[user] -= 1
 
     def _run(self) -> None:
-        """The game, a look a second; then the answers, and the end of the task."""
+        """Play, one tick after the other, until the answers are stored, the server is lost, or no member has come."""
         alone = 0.0
         while not self.over:
             self._clock.sleep(TICK)
@@ -84,7 +83,7 @@ class SimTrial:
             self._go_on(session, here)
 
     def _go_on(self, session: SessionDocument, here: set[str]) -> None:
-        """One look of the trial while some members are here."""
+        """Play or pause for one tick, and end the game if it is over. At least one member is connected."""
         members = {member.user_id for member in session.members}
         if members <= here:
             self._all_here()
@@ -94,9 +93,9 @@ class SimTrial:
         self._countdown = COUNTDOWN
         for user in members - here:
             self._away[user] += TICK
-        gone = {user for user in members if self._away[user] > ABSENT}
-        if gone:
-            self._store(session, {user: "left" if user in gone else "partnerLeft" for user in members})
+        absent = {user for user in members if self._away[user] > ABSENT}
+        if absent:
+            self._store(session, {user: "left" if user in absent else "partnerLeft" for user in members})
 
     def _all_here(self) -> None:
         self._away.clear()
@@ -105,10 +104,10 @@ class SimTrial:
             return
         if self.began is None:
             self.began = self._clock.seconds
-        self._trials.played[self.session_id] += TICK  # it is recorded
+        self._trials.played[self.session_id] += TICK  # the recording holds this tick
 
     def _store(self, session: SessionDocument, outcomes: Mapping[str, str]) -> None:
-        """An answer for each member. What is there stays: an earlier server may have written it."""
+        """Store an answer for each member, unless an earlier server has stored one."""
         for member in session.members:
             answers = {"score": 10, "outcome": outcomes[member.user_id], "session": session.id}
             record = {"step": self._step, "page": "game", "answers": answers, "schema": 1}
@@ -124,7 +123,7 @@ class SimTrial:
 
 
 def is_lost(task: TimedTask) -> bool:
-    """Whether its players have lost the server. Between Spot's warning and its end it goes on."""
+    """Return whether the players have lost their server. After Spot's warning it goes on until its container ends."""
     warned = task.stop_code == "SpotInterruption"
     return task.last is not Life.RUNNING or (task.desired is Life.STOPPED and not warned)
 
@@ -135,11 +134,14 @@ class SimTrials:
     def __init__(self, platform: SimPlatform, project_id: str, idle: float) -> None:
         """A trial without members ends after `idle` seconds."""
         self.platform, self.project_id, self.idle = platform, project_id, idle
-        self.played: defaultdict[str, float] = defaultdict(float)  # seconds that each session's recordings hold
+        self.played: defaultdict[str, float] = defaultdict(float)  # by session: seconds of play in its recordings
         self._trials: dict[str, SimTrial] = {}  # by task
 
     def at(self, task: TimedTask, step: str, play: float) -> SimTrial | None:
-        """The trial of a session's task; None if it is no session's, or of one that is not formed yet."""
+        """Return the trial of a session's task; None if the task has no session, or if the session is not formed yet.
+
+        The first call makes the trial, for this game step and with `play` seconds of play.
+        """
         session_id = self.platform.tasks.owner(task)
         if not sessions.is_session_id(session_id):
             return None

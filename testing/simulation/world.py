@@ -36,7 +36,7 @@ from testing.simulation.trials import SimTrials
 from testing.tasks import Life
 
 SWEEP_EVERY = 300.0  # seconds
-WIRES = {  # how the template feeds queues to functions; tests/simulation/test_simulation.py compares
+WIRES = {  # the event source mappings of the template; tests/simulation/test_simulation.py compares them
     "start_server": Wire(batch=1, window=0, concurrency=20, visibility=90),
     "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
     "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
@@ -47,7 +47,7 @@ TIMEOUTS = {
     "task_changed": 60,
     "stop_server": 60,
     "sweep": 240,
-}  # seconds, also as in the template
+}  # seconds, as in the template
 _NAMED, _MADE = template.functions(), template.resources("AWS::Lambda::Function")
 LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get("RecursiveLoop") == "Allow")
 WATCH_EVERY = 10.0  # seconds
@@ -72,7 +72,7 @@ PROJECT = Project(
 
 
 class SimulatedWorld:
-    """The installation and its clock. `run` lets time pass; `left` is what would stay on the bill."""
+    """The installation and its clock. `run` lets time pass; `left` counts the resources that are left."""
 
     RECEIVES = 8  # deliveries of a message before it is a dead letter
 
@@ -111,22 +111,22 @@ class SimulatedWorld:
         self._store_project()
         self.trials = SimTrials(platform, project.id, self.conditions.idle)
         self.matching = SimMatching(platform, project.id) if project.matching == "match" else None
-        self.people = 0  # participants who will come or are there
-        self.calls_until_quiet = 0  # of the functions, until the last thing was gone
+        self.people = 0  # participants who have not come yet, or have not finished
+        self.calls_until_quiet = 0  # calls of the functions until nothing was left, as `watch` has seen it
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     @property
     def functions(self) -> list[SimulatedFunction]:
-        """The functions that work behind the pages."""
+        """The functions other than `next_step`."""
         return [self.start_server, self.task_changed, self.stop_server, self.sweep]
 
     @property
     def queues(self) -> list[SimulatedQueue]:
-        """The three queues."""
+        """The queues of `start_server`, `stop_server` and `task_changed`."""
         return [self.start_queue, self.stop_queue, self.task_queue]
 
     def publish(self, topic: Topic, message: Message, lineage: Lineage = NO_LINEAGE) -> None:
-        """A topic brings the message to its queue, now and then twice."""
+        """Deliver a message of a topic to its queue, sometimes twice."""
         queue = self.start_queue if topic is Topic.START else self.stop_queue
         chance = self.clock.random
         queue.send(message, chance.uniform(*HOP), lineage)
@@ -134,10 +134,11 @@ class SimulatedWorld:
             queue.send(message, chance.uniform(0.5, 30), lineage)
 
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
-        """One request as a program makes it; status and JSON. Raises what the function raises.
+        """Send a request as a program does; return the status and the JSON of the answer. Raises what the function raises.
 
-        429 if the site answers no more requests at this second, 503 if the account has no concurrency left. Which
-        status an HTTP API has for that is not documented (REST APIs have 500); it is one of 5xx, and no page of ours.
+        The status is 429 if the site has no more requests left in this second, and 503 if the account has no
+        concurrency left. AWS does not document which status an HTTP API has then (a REST API has 500); it is one of
+        5xx, and the answer is none of our pages.
         """
         if not self.cloud.take("http"):
             self.cloud.throttled["http"] += 1
@@ -149,7 +150,7 @@ class SimulatedWorld:
         return answer["statusCode"], json.loads(answer["body"]) if answer.get("body") else None
 
     def run(self, until: float) -> None:
-        """Let things happen until then (seconds since the beginning)."""
+        """Let time pass until this second since the beginning."""
         before = installed._platform, installed._made
         try:
             self.clock.run(until)
@@ -157,9 +158,9 @@ class SimulatedWorld:
             installed._platform, installed._made = before
 
     def settle(self, until: float) -> None:
-        """Let things happen until then, or until no participant and no resource is left: after that, nothing can happen.
+        """Let time pass until this second, or until no participant, message or resource is left.
 
-        It waits for one more sweep, which may find what `left` does not count.
+        It waits for one more sweep, which may find leftovers that `left` does not count.
         """
         quiet = False
         while self.clock.seconds < until:
@@ -169,13 +170,18 @@ class SimulatedWorld:
                 return
 
     def _quiet(self) -> bool:
-        there = self.people or any(queue.waiting for queue in self.queues)
-        return not there and not any(count for what, count in self.left().items() if what != "dead letters")
+        if self.people or any(queue.waiting for queue in self.queues):
+            return False
+        return not any(count for kind, count in self.left().items() if kind != "dead letters")
 
     def left(self) -> Mapping[str, int]:
-        """What is still there: running tasks, DNS records, timers, servers' slots, open records, dead letters."""
+        """Count what is left of each kind.
+
+        These are tasks, DNS records, timers, servers' slots, warm servers that wait, entries and decisions of the lobby,
+        handovers, open records, and dead letters.
+        """
         kept = self.platform.documents.kept
-        records = [json.loads(body) for key, (body, _, _) in kept.items() if _is_server(key)]
+        records = [json.loads(body) for key, (body, _, _) in kept.items() if key.startswith(server.RECORDS)]
         return {
             "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
             "names": len(self.platform.dns.records) - len(self.platform.dns.strangers),
@@ -191,7 +197,7 @@ class SimulatedWorld:
         }
 
     def blamed(self) -> int:
-        """How many servers that Spot took back have another cause in their record."""
+        """Count the servers that Spot took back, and whose record has another cause."""
         kept, found = self.platform.documents.kept, 0
         for task in self.platform.tasks.tasks.values():
             label, attempt = ids.parse_server_name(task.name) or ("", 0)
@@ -202,7 +208,7 @@ class SimulatedWorld:
         return found
 
     def story(self) -> str:
-        """The seed and the timeline, for people."""
+        """Return the seed and the timeline as text, for people."""
         lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
         return "\n".join([f"seed {self.clock.seed}", *lines])
 
@@ -219,9 +225,10 @@ class SimulatedWorld:
         self.open()
 
     def _owner(self, task: TimedTask) -> str:
-        """To whom this warm server was assigned, by its handover, or the session that plays on this server.
+        """Return the id of the participant or session to whom this server belongs: a warm server by its handover.
 
-        Empty if it is not assigned yet, or if the session is not formed.
+        Empty for a warm server that is not assigned yet, for a session that is not formed, and for a server that was
+        started for one participant.
         """
         kept, owner = self.platform.documents.kept, task.session
         if task.is_warm_server and (found := kept.get(handover_key(self.project.id, task.name))):
@@ -239,7 +246,7 @@ class SimulatedWorld:
                 documents.keep(f"{self.project.id}/steps/{step.page}.html", page.encode())
 
     def watch(self) -> None:
-        """Note from time to time, in `calls_until_quiet`, whether anything is left. Costly where many take part."""
+        """Update `calls_until_quiet` every `WATCH_EVERY` seconds if anything is left. Slow with many participants."""
         if any(self.left().values()) or any(queue.waiting for queue in self.queues):
             self.calls_until_quiet = self.cloud.number
         self.clock.after(WATCH_EVERY, self.watch)
@@ -248,12 +255,8 @@ class SimulatedWorld:
         def once() -> None:
             try:
                 self.sweep.later({})
-            except (Crash, Exception) as error:  # noqa: BLE001 - the next one tries again
+            except (Crash, Exception) as error:  # noqa: BLE001 - the next sweep tries again
                 self.cloud.log(f"sweep failed: {type(error).__name__}")
 
         self.clock.spawn(once)
         self.clock.after(SWEEP_EVERY, self._sweep)
-
-
-def _is_server(key: str) -> bool:
-    return key.startswith("_servers/")

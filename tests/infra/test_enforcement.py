@@ -432,7 +432,7 @@ class Facts:
     def definition(self, name: str) -> tuple[str, list[str]]:
         return f"arn:aws:ecs:us-east-1:123456789012:task-definition/{name}", []
 
-    def call_it(self, arn: str) -> str:
+    def short_name(self, arn: str) -> str:
         return arn
 
 

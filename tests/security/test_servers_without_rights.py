@@ -112,7 +112,7 @@ class Site(StrictS3):
         self.warm_server = self._claim("maze", "~" + "0" * 20)
         for record in (self.mallory, self.alice, self.other, self.warm_server):
             self.keep(record)
-        self.credential = self.told(self.mallory)["CREDENTIAL"]
+        self.credential = self.variables(self.mallory)["CREDENTIAL"]
         put = self.documents.put
         put("project_master_list.json", b"the master list")
         put("maze/users/alice/answers/1.json", b"alice's answer")

@@ -61,7 +61,7 @@ class Town(StrictS3):
         return self.keep(server.close(record, reason, self.now()))
 
     def store(self, record):
-        told = self.told(record)
+        told = self.variables(record)
         return PresignedStore(told["STORE"], told["SERVER"], told["CREDENTIAL"], pause=lambda _: None)
 
     def body(self, key):
@@ -95,16 +95,16 @@ def played(launched, open_client, *, frames=10, stop=True):
 
 def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
     record = town.start()
-    running = launch(trial={"ui": UI}, **town.told(record))
+    running = launch(trial={"ui": UI}, **town.variables(record))
     played(running, open_client)
     assert running.wait() == 0
     assert json.loads(town.body(ANSWER))["answers"]["outcome"] == "stopped"
     ((key, lines),) = town.recordings(record.name).items()
     assert key.endswith("/3-episode-0001.jsonl.gz")
     assert lines[0]["kind"] == "header"
-    refused = [seen for seen in town.seen if seen[2] not in (200, 404)]
+    refused = [seen for seen in town.requests if seen[2] not in (200, 404)]
     assert refused == []
-    assert {method for method, path, _ in town.seen if path == "/sign"} == {"POST"}
+    assert {method for method, path, _ in town.requests if path == "/sign"} == {"POST"}
     assert not running.store.exists()
 
 
@@ -116,10 +116,10 @@ def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_clie
         town.documents.put(files.fullchain, chain)
         town.documents.put(files.privkey, private)
     keys = {"SSL_FULLCHAIN": files.fullchain, "SSL_PRIVKEY": files.privkey, "TLS": "on"}
-    running = launch(trial={"ui": UI}, **town.told(record), **keys)
+    running = launch(trial={"ui": UI}, **town.variables(record), **keys)
     shown = ssl.get_server_certificate(("127.0.0.1", running.port))
     assert x509.load_pem_x509_certificate(shown.encode()).serial_number == 7
-    assert {path.rpartition("/")[2] for method, path, status in town.seen if (method, status) == ("GET", 200)} == {
+    assert {path.rpartition("/")[2] for method, path, status in town.requests if (method, status) == ("GET", 200)} == {
         "fullchain.pem",
         "privkey.pem",
     }
@@ -130,27 +130,27 @@ def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
     spy = "\nimport os, sys\nprint(sorted(os.environ), file=sys.stderr, flush=True)\n"
     from tests.trial.conftest import grid_agent
 
-    running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.told(record))
+    running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.variables(record))
     town.failing = [500, 403]
     played(running, open_client)
     assert running.wait() == 0
     said = running.said()
     assert "CREDENTIAL" not in said
     assert "TOKEN" not in said
-    for secret in (town.told(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):
+    for secret in (town.variables(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):
         assert secret not in said
 
 
 def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
     first = town.start()
-    running = launch(trial={"ui": UI}, **town.told(first))
+    running = launch(trial={"ui": UI}, **town.variables(first))
     played(running, open_client, frames=30, stop=False)
     lost = town.close(first, Reason.LOST)  # its end is known before it has stored what it recorded
     running.terminate()
     assert running.wait() == 0
     (before,) = town.recordings(first.name).values()
     second = town.start(attempt=2, before=lost)
-    after = launch(trial={"ui": UI}, **town.told(second))
+    after = launch(trial={"ui": UI}, **town.variables(second))
     client = played(after, open_client)
     assert after.wait() == 0
     assert client.errors == []
@@ -161,7 +161,7 @@ def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client)
 
 def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(town, launch, open_client):
     record = town.start()
-    running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.told(record))
+    running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.variables(record))
 
     async def run():
         async with open_client(running.address) as client:
@@ -184,7 +184,7 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
 
 def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
     warm_server = town.start_warm("the-secret-token")
-    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.told(warm_server))
+    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.variables(warm_server))
     time.sleep(0.5)
     own = town.hand_over(warm_server, USER)
     played(running, open_client)
@@ -239,9 +239,9 @@ def test_reading_tries_again_what_may_pass(town, statuses):
     store = town.store(town.start())
     store.create(ANSWER, b"{}")
     town.failing = list(statuses)
-    signed = len(town.seen)
+    signed = len(town.requests)
     assert store.get(ANSWER) == b"{}"
-    asked = [path for _, path, _ in town.seen[signed:] if path == "/sign"]
+    asked = [path for _, path, _ in town.requests[signed:] if path == "/sign"]
     assert len(asked) == len(statuses) + 1, "each time with a new request"
 
 
@@ -290,10 +290,10 @@ def test_a_presigned_request_is_used_again_until_it_is_refused(town):
     assert [store.look(key), store.look(key)] == [None, None]
     town.documents.put(key, b"{}")
     assert store.look(key) == b"{}"
-    assert [path for _, path, _ in town.seen].count("/sign") == 1
+    assert [path for _, path, _ in town.requests].count("/sign") == 1
     town.failing = [403]  # it has expired
     assert store.look(key) == b"{}"
-    assert [path for _, path, _ in town.seen].count("/sign") == 2
+    assert [path for _, path, _ in town.requests].count("/sign") == 2
     town.failing = [403, 403]
     with pytest.raises(StoreError):
         store.look(key)

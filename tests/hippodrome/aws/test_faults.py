@@ -65,7 +65,7 @@ def nobody_plays(installation: TimedInstallation) -> list[VisitorOnMoto]:
 
 
 def ends_by_itself(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    installation.ran = lambda task: installation.clock.after(40, lambda: installation.end(task))
+    installation.on_running = lambda task: installation.clock.after(40, lambda: installation.end(task))
     return nobody_plays(installation)
 
 
@@ -78,15 +78,15 @@ def spot_strikes(installation: TimedInstallation) -> list[VisitorOnMoto]:
             first.append(task)
             installation.clock.after(30, lambda: installation.end(task, "SpotInterruption", 143))
 
-    installation.ran = ran
+    installation.on_running = ran
     return at_the_game(installation)
 
 
 def stop_overtakes_start(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """Told to stop before it was started; the participant then asks for another one."""
-    installation.hold["start"] = 20
+    installation.delays["start"] = 20
     people = at_the_game(installation)
-    installation.hold.clear()
+    installation.delays.clear()
     installation.publish("stop", {"projectId": PROJECT, "userId": USER})
     return people
 
@@ -111,7 +111,7 @@ def no_event_tells(installation: TimedInstallation) -> list[VisitorOnMoto]:
         installation.ended.add(task)
         installation.world.task_event(task, "STOPPED")
 
-    installation.ran = ran
+    installation.on_running = ran
     installation.sweeps_from = installation.clock.seconds + 600
     return [VisitorOnMoto(installation, USER, at_game=True, comes=1000)]
 
@@ -218,9 +218,9 @@ def registered(installation: TimedInstallation) -> list[str]:
 def erasing(installation: TimedInstallation) -> list[VisitorOnMoto]:
     """A participant is erased while their server runs; the administrator repeats it if it was interrupted."""
     VisitorOnMoto(installation, USER, at_game=True, leaves=True)
-    installation.kept.clear()
+    installation.promised.clear()
     installation.put(f"{PROJECT}/users/{OTHER}/answers/1.json", b'{"answers": {"said": "stays"}}')
-    installation.kept[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
+    installation.promised[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
 
     def administrator() -> Iterator[float]:
         yield 200  # a start message that failed comes again after 90 seconds, and would begin what was erased anew

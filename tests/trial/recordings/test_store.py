@@ -36,7 +36,7 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Opened]:
         if request.param == "folder":
             yield Opened(open_store(str(tmp_path)), recording, lambda key: (tmp_path / key).read_bytes())
             return
-        told = bucket.told(bucket.keep(record))
+        told = bucket.variables(bucket.keep(record))
         store = open_store(told["STORE"], told["SERVER"], told["CREDENTIAL"])
         yield Opened(store, recording, lambda key: bucket.documents.kept[key][0])
 
