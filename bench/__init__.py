@@ -1,1 +1,1 @@
-"""What it costs: each row with its yardstick, measured in the same run."""
+"""Measures what Hippodrome costs and delivers: rows of figures, each beside its yardstick of the same run, if any."""

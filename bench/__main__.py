@@ -1,6 +1,7 @@
-"""Measure: `python -m bench` for everything, `python -m bench control` for one group. Rows go to bench/results.json.
+"""Measures everything (`python -m bench`) or single groups (`python -m bench control`).
 
-A slow machine is no error: the exit status is 1 only if something could not be measured at all.
+The rows go to bench/results.json. A missed goal is no error: the exit status is 1 only if something could not be
+measured at all.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ GROUPS = (
     "data",
     "gym",
 )
-WIDTH = 132  # characters, where no terminal says otherwise
+WIDTH = 132  # characters, if the output is no terminal
 
 
 def measure(group: str) -> Iterator[Row]:
-    """The rows of one group, each with the group's name."""
+    """Yield the rows of one group, each with the group's name; if the group fails, a last row that says why."""
     try:
         for found in importlib.import_module(f"bench.{group}").rows():
             yield {"group": group, **found}
-    except Exception as error:  # noqa: BLE001 - the other groups are measured all the same
+    except Exception as error:  # noqa: BLE001 - the other groups are measured nevertheless
         yield {"group": group, **table.unmeasured(f"the rest of {group}", error)}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and report; the exit status."""
+    """Measure and print the rows; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("groups", nargs="*", metavar="GROUP", help=f"what to measure: {', '.join(GROUPS)}; default all")
     chosen = parser.parse_args(arguments).groups or list(GROUPS)

@@ -1,8 +1,8 @@
-"""The least that could answer a key with a picture, as a yardstick: `python -m bench.bare RATE FRAME [FRAME ...]`.
+"""The simplest server that answers a key with a picture, as a yardstick: `python -m bench.bare RATE FRAME [FRAME ...]`.
 
-A WebSocket server that sends one of its ready-made files at each tick, and the page for it. No game, no recording, no
-encoding, no flow control; the page decodes with the browser's own decoder. Nothing of Hippodrome takes part.
-Of the files the first half are shown while no key is down, the others while one is.
+A WebSocket server sends one of its ready-made JPEG files at each tick; PAGE is the page for it, which decodes them with
+the browser's own decoder. There is no game, recording, encoding or flow control, and no code of Hippodrome. The server
+sends the first half of the files while no key is down, and the other half while a key is.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-SECONDS = 300.0  # then it ends by itself
+SECONDS = 300.0  # the server ends by itself after so long
 PAGE = """<!doctype html><title>Bare</title><canvas id=screen></canvas><button id=overlay-button>Start</button><script>
 const canvas = document.getElementById("screen"), context = canvas.getContext("2d", { alpha: false });
 document.getElementById("overlay-button").onclick = () => {

@@ -1,6 +1,6 @@
-"""What a simulated run would be billed: its own counts times the list prices of `deploy/cost/prices.py`.
+"""Computes the bill of a simulated run: its counts times the list prices of `deploy/cost/prices.py`.
 
-Data sent to participants, recordings and logs are left out: nothing of them is simulated (`python -m deploy cost`
+Data sent to participants, recordings and logs are left out, since they are not simulated (`python -m deploy cost`
 estimates them).
 """
 
@@ -14,13 +14,13 @@ from testing import template
 from testing.simulation.world import SimulatedWorld
 
 HOUR = 3600.0
-SQS_REQUESTS = 3  # of a message: sent, received, deleted
+SQS_REQUESTS = 3  # requests for a message: send, receive, delete
 
 
 def bill(world: SimulatedWorld, prices: Prices, *, spot: bool) -> Mapping[str, Usd]:
-    """US dollars by what they are paid for. Servers are billed as if all of them had run on Spot, or on demand."""
+    """Return US dollars by kind of cost. Servers are billed as if all of them had run on Spot, or on demand."""
     calls = world.cloud.calls
-    writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deleting is free
+    writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deletions are free
     messages = sum(queue.sent for queue in world.queues)
     hour = prices.server_hour(world.project.size.cpu, world.project.size.memory, spot=spot)
     exactly = Usd.exactly
@@ -37,14 +37,17 @@ def bill(world: SimulatedWorld, prices: Prices, *, spot: bool) -> Mapping[str, U
 
 
 def server_seconds(world: SimulatedWorld) -> float:
-    """Of all tasks, from RunTask on, which is a little before Fargate begins to count; those that run, until now."""
+    """Return the seconds that all tasks together have lasted, from RunTask until their containers ended, or until now.
+
+    Fargate begins to count a little after RunTask, and bills at least `FARGATE_MINIMUM` seconds.
+    """
     now = world.clock.seconds
     tasks = world.platform.tasks.tasks.values()
     return sum(max(FARGATE_MINIMUM, (now if task.closed is None else task.closed) - task.born) for task in tasks)
 
 
 def _functions(world: SimulatedWorld, prices: Prices) -> float:
-    """Billed seconds by the memory that the template gives each function, and a fee for each invocation."""
+    """Return US dollars for the functions: billed seconds times memory, and a fee per invocation."""
     named, properties = template.functions(), template.resources("AWS::Lambda::Function")
     usd = 0.0
     for function in (world.next_step, *world.functions):

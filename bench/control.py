@@ -1,4 +1,4 @@
-"""What the control plane costs: cold starts, AWS calls, bytes. Everything runs on moto, and moto's recorder counts.
+"""Measures the control plane: cold starts, AWS calls, bytes. Everything runs on moto, which counts the calls.
 
 The study is the example project, with its real pages.
 """
@@ -46,7 +46,7 @@ def rows() -> Iterator[Row]:
     yield from each([cold_start, calls_of_requests, calls_of_a_participant, calls_of_the_trial, bytes_per_answer])
 
 
-HIPPO_CALLS = {  # of one request; its first visit of a page and its answer are one request
+HIPPO_CALLS = {  # HIPPO's AWS calls of one request; it has the same for the first visit of a page and for its answer
     "GET": len([*hippo.page_calls("survey")]),
     "POST": len([*hippo.page_calls("survey")]),
     "POST that publishes": len([*hippo.page_calls("survey", publishes=True)]),
@@ -55,7 +55,7 @@ HIPPO_CALLS = {  # of one request; its first visit of a page and its answer are 
 
 
 def calls_of_requests() -> Iterator[Row]:
-    """AWS calls of `next_step` on a participant's request: project and pages in its cache, as in a running study."""
+    """Count the AWS calls of `next_step` for each kind of request. Its caches are warm, as in a running study."""
     with on_moto() as study:
         warm(study)
         browser = travel(study, "P1")
@@ -83,7 +83,7 @@ def calls_of_requests() -> Iterator[Row]:
 
 
 def calls_of_a_participant() -> Iterator[Row]:
-    """AWS calls of a whole participant, from the link until all is cleaned up."""
+    """Count the AWS calls for a whole participant, from the link until everything is cleaned up."""
     limits = {"maxParticipants": 100, "maxServers": 10, "maxServerHours": 50}
     limited = read_project(ROOT).registration() | limits
     for name, pause, registration, most in (
@@ -111,7 +111,8 @@ def calls_of_a_participant() -> Iterator[Row]:
         total = sum(counted.total() for counted in by_function.values())
         theirs = [*hippo.calls({step["key"]: step["page"] for step in study.steps}, start="2", stop="4")]
         detail["the yardstick"] = (
-            f"HIPPO's calls for the same study and one poll, by its source: {dict(Counter(of for of, _ in theirs))}"
+            "HIPPO's calls for the same study and one poll, by its source: "
+            f"{dict(Counter(function for function, _ in theirs))}"
         )
         yield row(
             f"AWS calls, link to clean-up, {name}",
@@ -129,18 +130,18 @@ def calls_of_a_participant() -> Iterator[Row]:
 
 
 def bytes_per_answer() -> Iterator[Row]:
-    """Bytes that each answer writes: the first, and the last, against HIPPO's record of the same requests."""
+    """Measure the bytes that the first and the last answer write, beside HIPPO's record of the same requests."""
     steps = 8
     pages = [{"key": str(n + 1), "page": "survey", "variants": 0} for n in range(steps)]
     pages.append({"key": "finalStep", "page": "debrief", "variants": 0})
     registration = {"id": "long", "live": True, "maxRuntime": 30, "steps": pages}
     with on_moto(registration) as study:
-        browser, kept = MeasuredBrowser(study, "P1"), hippo.HippoRecord()
+        browser, record = MeasuredBrowser(study, "P1"), hippo.HippoRecord()
         written: list[int] = []
         page = browser.get()
         for _ in range(steps):
             body = urlencode({**hidden(page), **ANSWERS["4"]})
-            theirs = kept.request(http_event("POST", browser.query, body))
+            theirs = record.request(http_event("POST", browser.query, body))
             with study.world.recording() as calls:
                 browser.post(page, ANSWERS["4"])
             written.append(sum(size(call.params["Body"]) for call in calls if call.operation == "PutObject"))
@@ -149,11 +150,11 @@ def bytes_per_answer() -> Iterator[Row]:
 
 
 def judged_bytes(written: Sequence[int], theirs: int) -> Iterator[Row]:
-    """The rows of the bytes that each answer writes; `theirs` is what HIPPO writes for the last one."""
+    """Yield the rows of the bytes that each answer writes. `theirs` are the bytes that HIPPO writes for the last."""
     first, last = written[0], written[-1]
     detail = {
         "each answer in turn": written,
-        "the yardstick": "HIPPO's record, to which the event of every request is appended; nobody loads a page twice",
+        "the yardstick": "HIPPO's record, to which the event of every request is appended; no page is loaded twice",
     }
     yield row("bytes written by the first answer", first, "bytes")
     yield row("bytes written by the last answer, against the first", last, "bytes", yardstick=first, at_most=1)
@@ -168,13 +169,13 @@ def judged_bytes(written: Sequence[int], theirs: int) -> Iterator[Row]:
 
 
 def size(body: Any) -> int:
-    """The bytes of a body in moto's recorder: a stream, or "<n bytes>"."""
+    """Return the size of a body in the recorded parameters of a call: a stream, or the text "<n bytes>"."""
     if isinstance(body, io.BytesIO):
         return body.getbuffer().nbytes
     return int(re.findall(r"\d+", str(body))[0])
 
 
-# Cold start, and the trial server: against moto as a server in a process of its own
+# The cold start, on moto's server in a process of its own
 
 OURS = """
 import json, sys, time
@@ -187,7 +188,7 @@ assert answer["statusCode"] == 200 and len(answer["body"]) > 5000, answer
 print(json.dumps([wall, cpu]))
 """
 
-# The least that a function needs that makes the same calls: the same library, one client, no page.
+# The simplest code that makes the same calls: the same library, one client, no page.
 YARDSTICK = f"""
 import json, os, sys, time
 project, user, page = sys.argv[1:]
@@ -210,7 +211,10 @@ print(json.dumps([0.0, cpu]))
 
 
 def fresh(code: str, env: Mapping[str, str], *arguments: str) -> tuple[float, float]:
-    """Run code in a fresh process; the seconds it says it took, by the wall clock and of the processor."""
+    """Run code in a new process; return the seconds that it reports, by the wall clock and of processor time.
+
+    Raises RuntimeError if the process fails.
+    """
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments],
         cwd=ROOT,
@@ -227,7 +231,7 @@ def fresh(code: str, env: Mapping[str, str], *arguments: str) -> tuple[float, fl
 
 
 def example_documents() -> dict[str, bytes]:
-    """What a bucket holds once the example project is registered."""
+    """Return the documents of a bucket with the registered example project, by key."""
     with on_moto() as study:
         s3, bucket = study.world.client("s3"), study.world.env["BUCKET"]
         keys = [line["Key"] for line in s3.list_objects_v2(Bucket=bucket)["Contents"]]
@@ -235,7 +239,7 @@ def example_documents() -> dict[str, bytes]:
 
 
 def cold_start() -> Iterator[Row]:
-    """From the first import to a first visit's page, against botocore and the same calls; taken in turns."""
+    """Measure the time from the first import to the first page, in turns with botocore and the same calls."""
     documents = example_documents()
     with moto_server() as server:
         for key, body in documents.items():
@@ -250,7 +254,7 @@ def cold_start() -> Iterator[Row]:
             "an empty Python, before both": lambda n: fresh(EMPTY, server.env),
         }
         for measure in kinds.values():
-            measure(0)  # compiles what is not compiled yet
+            measure(0)  # the first run compiles modules that have no bytecode yet
         taken: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}
         for n in range(RUNS):
             for kind, measure in kinds.items():
@@ -259,7 +263,7 @@ def cold_start() -> Iterator[Row]:
 
 
 def judged_start(taken: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator[Row]:
-    """The rows of the cold start: `taken` are seconds by the wall clock and of the processor, by what was run."""
+    """Yield the rows of the cold start. `taken` has, by kind of run, seconds by the wall clock and of the processor."""
     for at, clock in ((1, "CPU"), (0, "wall")):
         times = {kind: [1000 * run[at] for run in runs] for kind, runs in taken.items()}
         detail = {kind: f"{min(t):.0f} to {max(t):.0f} ms in {len(t)} fresh processes" for kind, t in times.items()} | {
@@ -270,27 +274,27 @@ def judged_start(taken: Mapping[str, Sequence[tuple[float, float]]]) -> Iterator
             statistics.median(times["ours"]),
             "ms",
             yardstick=statistics.median(times["yardstick"]),
-            at_most=1.5,  # our own code and the page: at most half of what the library takes
+            at_most=1.5,  # our own code and the page may take half of the library's time
             detail=detail,
         )
 
 
 def calls_of_the_trial() -> Iterator[Row]:
-    """Requests of a trial server itself: a real one, over TLS, from its certificate to the end of its first game."""
+    """Count the requests of a real trial server with TLS, from its certificate to the end of its first episode."""
     with StrictS3().serving() as bucket, tempfile.TemporaryDirectory() as spool:
         project, now = study(id="bench"), bucket.now()
         record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="bench", nonce="bench")
         files = location(record.domain, bucket.settings.root_domain)
         for key, pem in zip((files.fullchain, files.privkey), authority().issue("localhost"), strict=True):
             bucket.documents.put(key, pem)
-        told = bucket.told(bucket.keep(record))
+        variables = bucket.variables(bucket.keep(record))
         trial = {"game": "ALE/MsPacman-v5", "maxEpisodes": 1, "ui": {"start": True, "stop": True}}
         serving = trial_server(
             ROOT,
-            told["STORE"],
+            variables["STORE"],
             trial,
-            SERVER=told["SERVER"],
-            CREDENTIAL=told["CREDENTIAL"],
+            SERVER=variables["SERVER"],
+            CREDENTIAL=variables["CREDENTIAL"],
             USER_ID="P1",
             GAME_STEPS=",".join(project.game_steps),
             SSL_FULLCHAIN=files.fullchain,
@@ -301,19 +305,19 @@ def calls_of_the_trial() -> Iterator[Row]:
         with serving as (port, process):
             asyncio.run(asyncio.wait_for(_play(port, project.game_steps[0]), 60))
             process.wait(60)
-        requests = [f"{method} {path.removeprefix(f'/{BUCKET}')}" for method, path, _ in bucket.seen]
-    more = "2 for each further recording, and for each thing read of an earlier server; 4 an hour for the certificate"
+        requests = [f"{method} {path.removeprefix(f'/{BUCKET}')}" for method, path, _ in bucket.requests]
+    more = "2 for each further recording, and for each document of an earlier server; 4 an hour for the certificate"
     detail = {"each": ", ".join(requests), "more": more}
     yield row("requests of the trial server, one episode", len(requests), "requests", detail=detail)
 
 
 async def _play(port: int, step: str) -> None:
-    """Begin a game, end it after a second, and stay until the trial is over."""
+    """Start the game, stop it after a second, and stay until the trial is over."""
     from websockets.asyncio.client import connect
     from websockets.exceptions import ConnectionClosed
 
     trusting = ssl.create_default_context()
-    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE  # its name is another's, on loopback
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE  # the certificate has another name
     options: dict[str, Any] = {"subprotocols": ["hippodrome.1"], "compression": None, "max_size": None, "proxy": None}
     async with connect(f"wss://127.0.0.1:{port}/", ssl=trusting, **options) as ws:
         await ws.send(json.dumps({"userId": "P1", "token": "bench", "step": step}))

@@ -1,7 +1,7 @@
-"""What `data` takes: participants per second and memory, from a bucket on moto's server in a process of its own.
+"""Measures the speed and the memory of `data`, with a bucket on moto's server in a process of its own.
 
-`python -m bench.data serve N` is that server: it fills a bucket with N participants, prints its environment, and goes
-when its input ends.
+`python -m bench.data serve N` is that server: it fills a bucket with N participants, prints the environment for its
+clients, and ends when its input ends.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from bench.table import Row, each, row
 
 ROOT = Path(__file__).parents[1]
 PARTICIPANTS = 10_000
-FEWER = 1_000  # the yardstick of memory: it must not grow with the study
-RECORDED = 50  # one participant in so many has a recording: moto's server answers some 200 requests a second at best
+FEWER = 1_000  # participants of the yardstick of memory, which must not grow with the study
+RECORDED = 50  # one participant in so many has a recording: moto's server answers about 200 requests a second at most
 WHEN = "2026-11-21T14:46:40.123456Z"
-FRAMES = 1_800  # of a recording: a minute of play
+FRAMES = 1_800  # steps of a recording: a minute of play
 
 
 class DataRun(NamedTuple):
-    """A run of the command: seconds, the most memory that it held (MB), and what it says it did."""
+    """A run of the command: its seconds, its peak memory in MB, and the JSON that it printed."""
 
     seconds: float
     memory: float
-    told: dict[str, Any]
+    report: dict[str, Any]
 
 
 def rows() -> Iterator[Row]:
-    """Measure; about two minutes."""
+    """Measure the command; about two minutes."""
     yield from each([download])
 
 
 def download() -> Iterator[Row]:
-    """All participants once, then again without anything new."""
+    """Measure a download of all participants, and another one without new data."""
     few, _ = _measured(FEWER)
     many, again = _measured(PARTICIPANTS)
-    counts = many.told["counts"]
+    counts = many.report["counts"]
     if counts["participants"] != PARTICIPANTS or counts["problems"]:
         raise RuntimeError(f"the data are not whole: {counts}")
-    objects = many.told["run"]["new"]
+    objects = many.report["run"]["new"]
     shape = f"one answer each, and one in {RECORDED} a recording of {FRAMES:,} frames, as moto is slow"
     yield row(
         f"data: {PARTICIPANTS:,} participants ({shape})",
@@ -76,7 +76,7 @@ def download() -> Iterator[Row]:
 
 
 def _measured(people: int) -> tuple[DataRun, DataRun]:
-    """The first run and the second, on a bucket with that many participants."""
+    """Run the command twice on a bucket with so many participants; return both runs."""
     with _served(people) as env, tempfile.TemporaryDirectory() as folder:
         return _run(env, Path(folder)), _run(env, Path(folder))
 
@@ -99,17 +99,17 @@ def _run(env: dict[str, str], folder: Path) -> DataRun:
 
 @contextlib.contextmanager
 def _served(people: int) -> Iterator[dict[str, str]]:
-    line = [sys.executable, "-m", "bench.data", "serve", str(people)]
+    command = [sys.executable, "-m", "bench.data", "serve", str(people)]
     with subprocess.Popen(
-        line, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as process:
         if process.stdout is None or process.stdin is None:
             raise RuntimeError("no pipes")
         try:
-            told = next((found for found in process.stdout if found.startswith("{")), "")
-            if not told:
+            env = next((line for line in process.stdout if line.startswith("{")), "")
+            if not env:
                 raise RuntimeError("moto's server did not start")
-            yield json.loads(told)
+            yield json.loads(env)
         finally:
             process.stdin.close()
             process.wait(30)
@@ -133,7 +133,7 @@ def _serve(people: int) -> None:
         backend, bucket = s3_backends[ACCOUNT]["aws"], world.env["BUCKET"]
 
         def put(key: str, body: bytes) -> None:
-            backend.put_object(bucket, key, body)  # not over HTTP: that would take longer than what is measured
+            backend.put_object(bucket, key, body)  # not over HTTP, which would take longer than the measured command
 
         put(MASTER_LIST, to_json(MasterList([project])))
         for number in range(people):
@@ -151,7 +151,7 @@ def _serve(people: int) -> None:
 
 
 def _recording() -> bytes:
-    """The lines of a recording, as long and as large as those of the example project's game."""
+    """Make the lines of a recording, as many and as long as those of the example project's game."""
     from trial.recordings import recording
 
     stamp = {"v": 1, "session": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}

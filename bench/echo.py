@@ -1,7 +1,7 @@
-"""The least that could answer a request over a WebSocket, as a yardstick: `python -m bench.echo REPLY BYTES`.
+"""The simplest server that answers requests over a WebSocket, as a yardstick: `python -m bench.echo REPLY BYTES`.
 
-The server of the package `websockets` as its documentation shows it; each text is answered by REPLY, and each binary
-message by BYTES bytes. Nothing of Hippodrome takes part. It prints its port and runs until it is killed.
+It is the server of the package `websockets` as its documentation shows it, without code of Hippodrome. It answers each
+text with REPLY, and each binary message with BYTES bytes. It prints its port, and runs until it is killed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ async def run(reply: str, binary: bytes) -> None:
         async for message in websocket:
             await websocket.send(reply if isinstance(message, str) else binary)
 
-    # No pings: a client that measures takes every message for an answer.
+    # No pings: the measuring client takes every message for an answer.
     async with serve(answer, "127.0.0.1", 0, compression=None, ping_interval=None) as server:
         print(server.sockets[0].getsockname()[1], flush=True)
         await asyncio.get_running_loop().create_future()

@@ -1,7 +1,7 @@
-"""The functions as they are deployed: how large their zips are, and what a cold start costs before anybody is served.
+"""Measures the functions as they are deployed: the sizes of their zips, and the processor time of a cold start.
 
-The zips are built for this machine and unpacked, and fresh processes import from them without writing bytecode, as on
-Lambda, where /var/task cannot be written. boto3 has its bytecode, as in Lambda's runtime.
+The zips are built for this machine and unpacked. Fresh processes import from them without writing bytecode, as on
+Lambda, where /var/task is read-only. boto3 has its bytecode, as in Lambda's runtime.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from deploy.code import build
 from deploy.code.packages import Target
 
 RUNS = 9  # fresh processes of each kind
-WITHIN = 1.25  # our own imports: at most a quarter of what the library takes with its client
-CLIENTS = {  # what each function asks of AWS in its usual work: docs/permissions.md
+WITHIN = 1.25  # our own imports may take a quarter of the time of the library and its client
+CLIENTS = {  # the services that each function usually calls: docs/permissions.md
     "next_step": ["s3"],
     "start_server": ["s3", "scheduler", "ecs"],
     "task_changed": ["s3", "ec2", "route53", "sqs"],
@@ -45,7 +45,7 @@ for service in sys.argv[3:]:
     from lambdas import installed
     installed.platform()._client(service)
 """
-# The least that makes such clients: the library that ours use, without boto3.
+# The simplest code that makes the same clients: the library that our code uses, without boto3.
 BARE = """
 import botocore.session, sys
 session = botocore.session.get_session()
@@ -55,12 +55,12 @@ for service in sys.argv[3:]:
 
 
 def rows() -> Iterator[Row]:
-    """Sizes and cold imports of all functions; about a minute."""
+    """Measure the sizes and cold imports of all functions; about a minute."""
     yield from each([zips_and_imports])
 
 
 def zips_and_imports() -> Iterator[Row]:
-    """One row per function: CPU seconds of the import and its clients, against botocore and the same clients."""
+    """Measure the processor time of each function's import and clients, beside botocore with the same clients."""
     built = {function.name: function for function in build.functions(Target())}
     here = {function.name: function for function in build.functions(Target.here())}
     for name, services in CLIENTS.items():
@@ -73,7 +73,7 @@ def zips_and_imports() -> Iterator[Row]:
 
 
 def judged_import(name: str, ours: float, bare: float, detail: Mapping[str, str]) -> Row:
-    """The row of one function: seconds of processor time, ours and the library's."""
+    """Return the row of one function. `ours` and `bare` are processor seconds, the function's and the library's."""
     return row(
         f"{name}: cold import and clients, against botocore with {', '.join(CLIENTS[name])}",
         1000 * ours,
@@ -85,7 +85,7 @@ def judged_import(name: str, ours: float, bare: float, detail: Mapping[str, str]
 
 
 def _alternating(folder: str, name: str, services: Sequence[str]) -> tuple[float, float]:
-    """Medians of CPU seconds, ours and bare; the two take turns, so that a busy minute meets both."""
+    """Return the medians of processor seconds. The two take turns, so that load on the machine slows down both."""
     ours, bare = [], []
     for _ in range(RUNS):
         ours.append(_cpu(OURS, folder, name, services))

@@ -1,12 +1,13 @@
-"""What the server of environments delivers and costs: `python -m bench.gym`.
+"""Measures the speed and the costs of the server of environments: `python -m bench.gym`.
 
 One client drives all servers: a loop over sockets that sends the next request of a connection as soon as the answer to
-the last one is there. The servers have one core, the client another one. Server CPU is that of all of a server's
-processes, from the scheduler (/proc/PID/schedstat, nanoseconds). The yardsticks are a bare echo by `websockets` of
-messages of the same length, and `env.step` alone in a process without a server, both in the same run on the same core.
+the last one has come. The servers run on one core, and the client on others. A server's processor time is that of all
+its processes, from the scheduler (/proc/PID/schedstat, in nanoseconds). The yardsticks are a bare echo by `websockets`
+of messages of the same length, and `env.step` alone in a process without a server, both in the same run on the same
+core.
 
-Gymie 0.5.4 needs gym 0.17.3 and eventlet 0.28, which have no wheels for a Python of today. What is said of it was
-measured elsewhere, on another machine: it is told beside the row and compared with nothing.
+Gymie 0.5.4 needs gym 0.17.3 and eventlet 0.28, which have no wheels for a present Python. Its figures were measured on
+another machine, so rows only mention them.
 """
 
 from __future__ import annotations
@@ -36,20 +37,19 @@ from bench.table import Row, each, row
 from testing.gym_server import gym_server
 
 ROOT = Path(__file__).resolve().parent.parent
-REQUESTS = 2000  # of a measurement, over all clients
+REQUESTS = 2000  # of one measurement, of all clients together
 ROUNDS = 15  # of each measurement, ours and the yardsticks' in turn; the quickest of each counts
 MANY = 64  # steps in one request
-IDLE = 500
+IDLE = 500  # connections that send no request
 THEIRS = {1: (4371, 136), 8: (11067, 88)}  # clients: Gymie 0.5.4's steps/s, and µs of server CPU per step
-CORES = sorted(os.sched_getaffinity(0))  # before this process takes a part of them
+CORES = sorted(os.sched_getaffinity(0))  # all cores, before `pinned` restricts this process
 _SEED = 3
-
 
 # The client
 
 
 class FrameConnection:
-    """A WebSocket whose requests are frames that were made before."""
+    """A WebSocket that sends ready-made frames, so that the client itself takes little time."""
 
     def __init__(self, url: str, subprotocol: str | None = None) -> None:
         uri = parse_uri(url)
@@ -64,12 +64,12 @@ class FrameConnection:
         assert answer.status_code == 101, answer
 
     def ask(self, frame: bytes) -> bytes:
-        """Send a frame; what the answer holds."""
+        """Send a frame; return the payload of the answer."""
         self.socket.sendall(frame)
         return self.receive()
 
     def receive(self) -> bytes:
-        """What the next message holds; a message is one frame."""
+        """Return the payload of the next message, which must be one frame."""
         data = self.socket.recv(262144)
         while True:
             start, length = 2, data[1]
@@ -81,31 +81,31 @@ class FrameConnection:
             data += self.socket.recv(262144)
 
 
-def frame(said: str | bytes) -> bytes:
-    """A client's frame."""
-    data = said.encode() if isinstance(said, str) else said
-    return Frame(Opcode.TEXT if isinstance(said, str) else Opcode.BINARY, data).serialize(mask=True)
+def frame(message: str | bytes) -> bytes:
+    """Return a client's frame with this message."""
+    data = message.encode() if isinstance(message, str) else message
+    return Frame(Opcode.TEXT if isinstance(message, str) else Opcode.BINARY, data).serialize(mask=True)
 
 
 @dataclass(frozen=True, slots=True)
 class GymRun:
-    """A measurement: µs of server CPU per request, requests a second, waits in µs."""
+    """A measurement: µs of server CPU per request, requests per second, and the time of each answer in µs."""
 
     cpu: float
     rate: float
     waits: Sequence[float]
 
     def wait(self, percentile: int) -> float:
-        """This percentile of the waits."""
+        """Return this percentile of the waits, in µs."""
         return statistics.quantiles(self.waits, n=100)[percentile - 1]
 
 
 Next = Callable[[bytes], bytes]
-"""The next request of a connection after this answer."""
+"""Gives the next request of a connection, from the answer to the last one."""
 
 
 def drive(pid: int, clients: Sequence[tuple[FrameConnection, Next]], requests: int) -> GymRun:
-    """Let each client send a request, and the next one when it is answered."""
+    """Let each client send a request after each answer, so many requests in all; `pid` is the server's process."""
     selector = selectors.DefaultSelector()
     sent, waits = {}, []
     begun, used = time.perf_counter(), cpu(pid)
@@ -131,18 +131,18 @@ def drive(pid: int, clients: Sequence[tuple[FrameConnection, Next]], requests: i
 
 
 def cpu(pid: int) -> float:
-    """Seconds of processor time of a process and of all that it has started and that runs."""
+    """Return the seconds of processor time of a process and of its descendants that run now."""
     parent = psutil.Process(pid)
     processes = [parent.pid, *(child.pid for child in parent.children(recursive=True))]
     return sum(int(Path(f"/proc/{one}/schedstat").read_text().split()[0]) for one in processes) / 1e9
 
 
-# What is driven
+# The servers
 
 
 @contextlib.contextmanager
 def pinned() -> Iterator[None]:
-    """What is started within gets the last core, and this process the first ones."""
+    """Give processes that are started within the block the last core; this process gets the other ones after it."""
     os.sched_setaffinity(0, CORES[-1:])
     try:
         yield
@@ -152,7 +152,7 @@ def pinned() -> Iterator[None]:
 
 @contextlib.contextmanager
 def echo(reply: str, binary: int = 0) -> Iterator[tuple[str, int]]:
-    """The yardstick's server: its address and process id."""
+    """Run the yardstick's server within the block; give its address and process id."""
     with pinned():
         process = subprocess.Popen(
             [sys.executable, "-m", "bench.echo", reply, str(binary)],
@@ -172,7 +172,7 @@ def echo(reply: str, binary: int = 0) -> Iterator[tuple[str, int]]:
 
 @contextlib.contextmanager
 def ours() -> Iterator[tuple[str, int]]:
-    """Our server: its address and process id."""
+    """Run our server within the block; give its address and process id."""
     with contextlib.ExitStack() as stack:
         with pinned():
             found = stack.enter_context(gym_server())
@@ -199,7 +199,7 @@ print(1e6 * (time.process_time() - begun) / len(actions))
 
 
 def alone() -> float:
-    """µs of CPU of `env.step` without a server, resets included as in a request of `step_many`."""
+    """Measure the µs of processor time of `env.step` without a server, with resets as in a request of `step_many`."""
     with pinned():
         done = subprocess.run(
             [sys.executable, "-c", _ALONE, str(_SEED)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True
@@ -211,7 +211,7 @@ def alone() -> float:
 
 
 def cartpole(url: str) -> tuple[FrameConnection, Next]:
-    """A client of Gymie's with an environment, which steps it and resets it after each episode."""
+    """Make a client as Gymie's, with an environment of its own, which it steps, and resets after each episode."""
     connection = FrameConnection(url)
     instance = connection.ask(frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')).decode()
     reset = frame(json.dumps({"method": "reset", "params": {"instance_id": instance}}, separators=(",", ":")))
@@ -231,18 +231,18 @@ def cartpole(url: str) -> tuple[FrameConnection, Next]:
 
 
 REPLY = "[[0.027395604178309441,-0.0061121615581214428,0.035859793424606323,0.019736802205443382],1.0,false,{}]"
-"""Of the length of a step's answer."""
+"""A text as long as the answer to a step."""
 
 
 def echoed(url: str) -> tuple[FrameConnection, Next]:
-    """A client that sends what looks like a step."""
-    said = {"method": "step", "params": {"action": 1, "instance_id": "0" * 32}}
-    step = frame(json.dumps(said, separators=(",", ":")))
+    """Make a client that sends requests as long as those of a step."""
+    request = {"method": "step", "params": {"action": 1, "instance_id": "0" * 32}}
+    step = frame(json.dumps(request, separators=(",", ":")))
     return FrameConnection(url), lambda _: step
 
 
 def single_steps() -> Iterator[Row]:
-    """A request for each step, in Gymie's JSON, from one client and from eight."""
+    """Measure one request for each step, in Gymie's JSON, from one client and from eight."""
     for count in THEIRS:
         with ours() as (url, pid), echo(REPLY) as (bare_url, bare_pid):
             clients, bare_clients = (
@@ -287,7 +287,7 @@ def _single(count: int, found: Sequence[GymRun], bare: Sequence[GymRun], step: f
 
 
 def batched_steps() -> Iterator[Row]:
-    """64 steps in a request, by the binary subprotocol."""
+    """Measure 64 steps in a request, by the binary subprotocol."""
     from trial.gym import arrays, spaces
 
     with ours() as (url, pid):
@@ -298,7 +298,7 @@ def batched_steps() -> Iterator[Row]:
         batch = arrays.batch_of(actions, [at * at % 3 % 2 for at in range(MANY)])
         request = frame(arrays.step_request(arrays.STEP_MANY, made["handle"], MANY, actions, batch))
         found, step = [], []
-        for turn in range(3 * ROUNDS):  # short ones: the machine may be quiet for a moment
+        for turn in range(3 * ROUNDS):  # many short ones, of which some may find the machine quiet
             found.append(drive(pid, [(connection, lambda _: request)], REQUESTS // 20))
             if turn % 3 == 0:
                 step.append(alone())
@@ -317,11 +317,11 @@ def _batched(found: Sequence[GymRun], step: float) -> Iterator[Row]:
     yield row(f"steps/s, {MANY} in a request, raw arrays", quickest.rate * MANY, "a second")
 
 
-# Connections that do nothing
+# Idle connections
 
 
 def idle() -> Iterator[Row]:
-    """Memory that a connection costs until its first request, and what one with an environment costs."""
+    """Measure the memory of a connection before its first request, and that of one with an environment."""
     with ours() as (url, pid), echo(REPLY) as (bare_url, bare_pid):
         found = [_grown(pid_, url_) for pid_, url_ in ((pid, url), (bare_pid, bare_url))]
         with_environment = _grown(pid, url, 8, lambda connection: connection.ask(_MAKE))
@@ -335,8 +335,8 @@ _MAKE = frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')
 
 
 def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[FrameConnection], Any] = lambda _: None) -> float:
-    """KB of memory that each of `count` connections adds to a server."""
-    opened = [FrameConnection(url)]  # what the first one loads is not counted
+    """Return the KB of memory that each of `count` connections adds to a server, after `then` was called with it."""
+    opened = [FrameConnection(url)]  # the memory of what the first one loads is not counted
     then(opened[0])
     before = memory(pid)
     opened += [FrameConnection(url) for _ in range(count)]
@@ -350,10 +350,10 @@ def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[FrameConnectio
 
 
 def memory(pid: int) -> int:
-    """Bytes of a process and of all that it has started, with pages that they share counted once.
+    """Return the bytes of a process and its descendants; pages that they share count once.
 
-    Pages of files are left out (`Pss_Anon`, proc_pid_smaps(5)): the share of a library's pages that counts as theirs
-    changes whenever another process on the machine that uses it comes or goes.
+    Pages of files are left out (`Pss_Anon`, proc_pid_smaps(5)): how much of a library's pages counts for a process
+    changes whenever another process on the machine loads the library or ends.
     """
     parent = psutil.Process(pid)
     return sum(_anonymous(one.pid) for one in (parent, *parent.children(recursive=True)))

@@ -1,7 +1,7 @@
-"""Which Python runs, and how fast it is.
+"""Tells the version and the speed of this Python, to be printed beside processor times.
 
-Builds of one version differ by a fifth: with or without profile-guided optimisation, which the image's Python has
-(`--enable-optimizations`; docs.python.org, "Configure Python"). So a figure of processor time says which one it is of.
+Builds of the same version differ by a fifth in speed, with or without profile-guided optimisation. The image's Python
+has it (`--enable-optimizations`; docs.python.org, "Configure Python").
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ class _Counted:
 
 
 def interpreter() -> dict[str, str | float]:
-    """What to print beside processor times: the version, and what one turn of a plain loop costs it here."""
+    """Return the version of Python, and the processor time of one turn of a plain loop in nanoseconds."""
     return {"Python": platform.python_version(), "a turn of a plain loop of it, ns": min(_turn() for _ in range(TIMES))}
 
 
 def _turn() -> float:
-    """Nanoseconds of processor time in which an object is made, called, and noted."""
-    noted: dict[int, int] = {}
+    """Measure the nanoseconds of processor time in which an object is made and called, and its result stored."""
+    results: dict[int, int] = {}
     begun = time.process_time_ns()
     for number in range(TURNS):
-        noted[number % 100] = _Counted(number).next()
+        results[number % 100] = _Counted(number).next()
     return (time.process_time_ns() - begun) / TURNS

@@ -1,8 +1,8 @@
-"""What a trial costs its machine, without a browser: processor time, trials on one core, memory, and slow policies.
+"""Measures what a trial costs its machine: processor time, trials on one core, memory, and slow policies.
 
-`python -m bench.load`. Clients are sockets that acknowledge frames as our page does and press keys, so that
-nothing but the servers is measured. The yardstick of processor time is the game alone: the example's agent, called as
-often by a bare loop.
+`python -m bench.load`. Clients are sockets instead of browsers: they acknowledge frames as our page does, and press
+keys. So only the servers are measured. The yardstick of processor time is the game alone: a bare loop that calls the
+example's agent as often.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from bench.table import Row, each, row
 from trial.recordings import recording
 
 RATE = 30  # frames a second
-SETTLE = 2.0  # seconds of play before anything is measured
-SECONDS = 8.0
-MOST_CPU = 1.2  # ms of a processor for a frame of the example
-TRIALS = 32  # that one core has to hold
-MOST_MEMORY = 45.0  # MB of each
+SETTLE = 2.0  # seconds of play before the measurement
+SECONDS = 8.0  # of the measurement
+MOST_CPU = 1.2  # the goal for a frame of the example: ms of processor time
+TRIALS = 32  # trials that one core has to serve
+MOST_MEMORY = 45.0  # the goal for the memory of each trial: MB
 ACTIONS = ("noop", "up", "right", "left", "down")
-TOGETHER = 0.05  # seconds between two pictures that are acknowledged together
-_ID = struct.Struct("!BI")  # how a binary message begins
+TOGETHER = 0.05  # pictures that are drawn within so many seconds are acknowledged together
+_ID = struct.Struct("!BI")  # the beginning of a binary message: kind and number
 
 ALONE = """
 import random, sys, time
@@ -62,7 +62,7 @@ while True:
         agent.reset(seed=7)
 """
 
-# A game that costs nothing, and a partner whose every answer comes three ticks late.
+# A game that takes hardly any time, and a partner whose answers all come three ticks late.
 SLOW = """
 import time
 import numpy as np
@@ -92,23 +92,26 @@ class Partner:
 
 @dataclass
 class ServerLoad:
-    """What a server delivered and cost. `cpu` is ms for each frame, `memory` and `resident` are MB."""
+    """What a server delivered and cost.
+
+    `share` is that of the frames that were due, `cpu` is in ms per frame, memory in MB.
+    """
 
     share: float
     cpu: float
     memory: float
-    """Its own pages, and its part of those that several processes share (Pss)."""
+    """The process's own pages, and its part of shared pages (Pss)."""
     resident: float
 
 
 def frame_id(data: bytes) -> int:
-    """The number of the picture in a binary message."""
+    """Return the number of the picture in a binary message."""
     return int(_ID.unpack_from(data)[1])
 
 
 @dataclass
 class Count:
-    """What came to one client."""
+    """What one client has received."""
 
     pictures: int = 0
     bytes: int = 0
@@ -121,11 +124,11 @@ class Acknowledging:
         self._send = send
         self._loop = asyncio.get_running_loop()
         self._drawn = -math.inf
-        self._later: asyncio.TimerHandle | None = None  # the picture before waits for one more
-        self._telling: asyncio.Task[None] | None = None
+        self._later: asyncio.TimerHandle | None = None  # set while an acknowledgement waits
+        self._sending: asyncio.Task[None] | None = None
 
     async def drawn(self, picture: int) -> None:
-        """A picture is drawn."""
+        """Acknowledge this picture, which was just drawn, now or together with the next one."""
         now = self._loop.time()
         quick, self._drawn = now - self._drawn < TOGETHER, now
         if quick and self._later is None:
@@ -134,28 +137,28 @@ class Acknowledging:
         if self._later is not None:
             self._later.cancel()
             self._later = None
-        await self._tell(picture)
+        await self._acknowledge(picture)
 
     def _no_other_came(self, picture: int) -> None:
         self._later = None
-        self._telling = self._loop.create_task(self._tell(picture))
+        self._sending = self._loop.create_task(self._acknowledge(picture))
 
-    async def _tell(self, picture: int) -> None:
+    async def _acknowledge(self, picture: int) -> None:
         with contextlib.suppress(ConnectionClosed):
             await self._send(json.dumps({"ack": picture}))
 
 
 @dataclass
 class Delivered:
-    """What one server delivered while it was measured: to each of its clients. `cpu` is seconds."""
+    """What one server delivered to each of its clients during the measurement. `cpu` is in seconds."""
 
-    due: float  # pictures
+    due: float  # pictures for each client
     clients: list[Count]
     cpu: float
 
 
 async def play(url: str, count: Count) -> None:
-    """Play until it is cancelled."""
+    """Play until the task is cancelled."""
     keys = random.Random(7)
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.2")], max_size=None, compression=None, open_timeout=60
@@ -177,16 +180,19 @@ async def play(url: str, count: Count) -> None:
 async def delivered(
     servers: Sequence[tuple[str, int]], plays: Sequence[Callable[[str, Count], Coroutine[Any, Any, None]]]
 ) -> list[Delivered]:
-    """Play on all of these servers at once, on each with these clients; what each delivered and cost."""
+    """Play on all of these servers at once, on each with these clients; return what each delivered and cost.
+
+    Raises RuntimeError if a server ends its connection, TimeoutError if the clients get no pictures within 120 seconds.
+    """
     counts = [[Count() for _ in plays] for _ in servers]
     clients = [
         asyncio.create_task(play(url, count))
-        for (url, _), of_server in zip(servers, counts, strict=True)
-        for play, count in zip(plays, of_server, strict=True)
+        for (url, _), received in zip(servers, counts, strict=True)
+        for play, count in zip(plays, received, strict=True)
     ]
     try:
         async with asyncio.timeout(120):
-            while not all(count.pictures > RATE for of_server in counts for count in of_server):
+            while not all(count.pictures > RATE for received in counts for count in received):
                 await asyncio.sleep(0.1)
                 for client in clients:
                     if client.done():
@@ -199,8 +205,8 @@ async def delivered(
         await asyncio.sleep(SECONDS)
         due = RATE * (loop.time() - begun)
         return [
-            Delivered(due, [*map(_since, of_server, earlier)], seen.cpu_seconds(pid) - used)
-            for (_, pid), of_server, earlier, used in zip(servers, counts, before, cpu, strict=True)
+            Delivered(due, [*map(_since, received, earlier)], seen.cpu_seconds(pid) - used)
+            for (_, pid), received, earlier, used in zip(servers, counts, before, cpu, strict=True)
         ]
     finally:
         for client in clients:
@@ -213,7 +219,7 @@ def _since(now: Count, before: Count) -> Count:
 
 
 async def played(servers: Sequence[tuple[str, int]]) -> list[ServerLoad]:
-    """Play on all of these servers at once; what each delivered and cost."""
+    """Play on all of these servers at once; return what each delivered and cost."""
     found = await delivered(servers, [play])
     return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
 
@@ -224,7 +230,7 @@ def _played(pid: int, found: Delivered) -> ServerLoad:
 
 
 def memory(pid: int) -> tuple[float, float]:
-    """MB of a process: its own pages with its part of shared ones (Pss), and all that are resident."""
+    """Return the memory of a process in MB: own pages with its part of shared ones (Pss), and resident pages (Rss)."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
     sizes = {line.split()[0]: int(line.split()[1]) / 1024 for line in lines if line.startswith(("Rss:", "Pss:"))}
     return sizes["Pss:"], sizes["Rss:"]
@@ -232,12 +238,12 @@ def memory(pid: int) -> tuple[float, float]:
 
 @contextlib.contextmanager
 def example(count: int = 1) -> Iterator[list[tuple[str, int]]]:
-    """Servers of the example's game. More than one share a core."""
+    """Run so many servers of the example's game; give their addresses and pids. More than one share a core."""
     cores = os.sched_getaffinity(0)
     core = cores if count == 1 else {max(cores)}
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as running:
         Path(folder, "agent.py").write_bytes((ROOT / "agent.py").read_bytes())
-        # A process begins on the cores of the thread that starts it.
+        # A process inherits the cores of the thread that starts it.
         with ThreadPoolExecutor(4, initializer=os.sched_setaffinity, initargs=(0, core)) as starting:
 
             def start(_: int) -> tuple[str, int]:
@@ -250,7 +256,7 @@ def example(count: int = 1) -> Iterator[list[tuple[str, int]]]:
 
 
 def game_alone() -> float:
-    """Processor ms of the example's agent for each of its frames, at the same rate."""
+    """Measure the processor time of the example's agent without a server, in ms per frame, at the same rate."""
     process = subprocess.Popen(
         [sys.executable, "-c", ALONE.format(game=GAME, rate=RATE)],
         cwd=ROOT,
@@ -274,7 +280,7 @@ def game_alone() -> float:
 
 
 def one_trial() -> Iterator[Row]:
-    """What a frame of the example costs its server."""
+    """Measure one trial of the example."""
     alone = game_alone()
     with example() as servers:
         (found,) = asyncio.run(played(servers))
@@ -282,7 +288,7 @@ def one_trial() -> Iterator[Row]:
 
 
 def judged_cpu(found: ServerLoad, alone: float) -> Row:
-    """The row of processor time."""
+    """Return the row of processor time. `alone` is what `game_alone` returns."""
     return row(
         f"server's CPU per frame of the example at {RATE}/s, against its game alone",
         found.cpu,
@@ -290,26 +296,26 @@ def judged_cpu(found: ServerLoad, alone: float) -> Row:
         yardstick=alone,
         at_most=MOST_CPU,
         judge="value",
-        bound="ours, for a processor and a Python as quick as that of the image: their speed is below",
+        bound="ours, for a processor and a Python as fast as the image's; the detail has their speed here",
         detail={"share of the frames delivered": found.share, "MB resident": found.resident, **interpreter()},
     )
 
 
 def one_core() -> Iterator[Row]:
-    """How many trials one core holds, and the memory of each."""
+    """Measure many trials on one core, and the memory of each."""
     with example(TRIALS) as servers:
         found = asyncio.run(played(servers))
     yield from judged_core(found)
 
 
 def judged_core(found: list[ServerLoad]) -> Iterator[Row]:
-    """The rows of trials that share a core."""
+    """Yield the rows of trials that share a core."""
     yield row(
         f"frames delivered at {RATE}/s by {len(found)} trials of the example on one core",
         statistics.mean(one.share for one in found),
         "of those due",
         at_least=0.99,
-        bound="ours: one core holds so many",
+        bound="ours: one core serves so many",
         detail={
             "of the trial that got least": min(one.share for one in found),
             "CPU per frame, ms": statistics.mean(one.cpu for one in found),
@@ -327,14 +333,14 @@ def judged_core(found: list[ServerLoad]) -> Iterator[Row]:
 
 
 def slow_policy() -> Iterator[Row]:
-    """Whether a policy that is late holds up the game."""
+    """Measure whether a policy that answers late delays the game."""
     slow, late = beside("agent:Partner")
     idle, _ = beside("idle")
     yield judged_policy(slow, idle, late)
 
 
 def beside(partner: str) -> tuple[float, float]:
-    """The share of the ticks that a server delivers beside this partner, and that of steps for which it was late."""
+    """Play beside this partner; return the share of the ticks delivered, and that of steps for which it was late."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as store:
         Path(folder, "agent.py").write_text(SLOW, encoding="utf-8")
         trial = {"startingFrameRate": RATE, "actionSpace": ["noop", "up"]}
@@ -351,7 +357,7 @@ def _recorded(store: Path) -> list[dict[str, Any]]:
 
 
 def judged_policy(slow: float, idle: float, late: float) -> Row:
-    """The row of a slow policy. It shows nothing unless the policy was late."""
+    """Return the row of a slow policy. Raises RuntimeError if the policy was never late: the row would show nothing."""
     if late == 0.0:
         raise RuntimeError("the policy was never late")
     return row(

@@ -1,4 +1,4 @@
-"""moto as a server in a process of its own, for processes that take it for AWS."""
+"""Runs moto as a server in a process of its own, for processes that use it as AWS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ sys.stdin.read()
 
 
 class MotoServer:
-    """moto behind a port of its own. `env` is what processes need to take it for AWS."""
+    """moto's server at a free port, with one bucket. Processes with the environment `env` use it as AWS."""
 
     def __init__(self, log: Path) -> None:
         self._log = log
@@ -39,7 +39,7 @@ class MotoServer:
         self.env = {
             **inherited,
             "AWS_ACCESS_KEY_ID": "testing",
-            "AWS_SECRET_ACCESS_KEY": "testing",  # moto takes any
+            "AWS_SECRET_ACCESS_KEY": "testing",  # moto accepts any
             "AWS_REGION": "us-east-1",
             "AWS_DEFAULT_REGION": "us-east-1",
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
@@ -65,7 +65,7 @@ class MotoServer:
         self.s3.put_object(Bucket="hippodrome", Key=key, Body=body)
 
     def requests(self) -> list[str]:
-        """Every request so far: `PUT /hippodrome/some/key`."""
+        """Return every request so far, such as `PUT /hippodrome/some/key`."""
         return re.findall(r'"([A-Z]+ /\S*) HTTP/', self._log.read_text())
 
     def close(self) -> None:

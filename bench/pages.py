@@ -1,4 +1,4 @@
-"""What the pages weigh, and how many participants one machine holds on its step pages."""
+"""Measures the size of the pages, and how many requests one machine answers on its step pages."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from hippodrome.model import ids
 from testing.aws_events import FORM
 from testing.visitors import body_of, hidden, sent
 
-PEOPLE = 200  # at once
-SECONDS = 120  # after which the crowd is given up
+PEOPLE = 200  # participants at once
+SECONDS = 120  # after which the measurement fails
 GAME_PAGE = 40 * 1024  # bytes, compressed
-GAME_PAGE_BOUND = "ours: what the game page may weigh on its way"
+GAME_PAGE_BOUND = "ours: the size of the game page over the network"
 
 
 def rows() -> Iterator[Row]:
@@ -36,11 +36,11 @@ def rows() -> Iterator[Row]:
     yield from each([weights, crowd])
 
 
-# Weights
+# Sizes
 
 
 def weights() -> Iterator[Row]:
-    """The example project's pages as `next_step` answers them."""
+    """Measure the example project's pages as `next_step` answers them."""
     with on_moto() as study:
         warm(study)
         pages = dict(_walk(study))
@@ -81,7 +81,7 @@ def weights() -> Iterator[Row]:
 
 
 def _walk(study: MeasuredStudy) -> Iterator[tuple[str, tuple[bytes, int]]]:
-    """Every page of the study with the bytes that go over the line for it."""
+    """Yield every page of the study: its name, its body, and how many bytes go over the network for it."""
     browser = MeasuredBrowser(study, "P1")
     for step in study.steps:
         answer = browser.open()
@@ -98,7 +98,7 @@ def _walk(study: MeasuredStudy) -> Iterator[tuple[str, tuple[bytes, int]]]:
 
 
 class Exchange(NamedTuple):
-    """One answer."""
+    """The answer to one request."""
 
     status: int
     headers: Mapping[str, str]
@@ -106,7 +106,7 @@ class Exchange(NamedTuple):
 
 
 class KeptConnection:
-    """One kept connection. Plain HTTP/1.1: a lighter client leaves more of the machine to the server."""
+    """A client with one kept connection. It does plain HTTP/1.1, so it leaves more of the machine to the server."""
 
     def __init__(self, address: str) -> None:
         url = urlsplit(address)
@@ -114,7 +114,7 @@ class KeptConnection:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, method: str, target: str, body: bytes = b"") -> Exchange:
-        """One request, and the whole answer to it."""
+        """Send a request; return the whole answer."""
         if self._streams is None:
             self._streams = await asyncio.open_connection(self._host, self._port)
         reader, writer = self._streams
@@ -139,22 +139,24 @@ Walk = Callable[[int, Callable[..., Awaitable[Exchange]]], Awaitable[None]]
 
 
 class PageCrowd(NamedTuple):
-    """What a crowd met: how long it took, and how long each request."""
+    """How long a crowd took, and how long each of its requests took, in seconds."""
 
     seconds: float
     waits: list[float]
 
     @property
     def rate(self) -> float:
+        """Requests per second."""
         return len(self.waits) / self.seconds
 
     @property
     def p99(self) -> float:
+        """The 99th percentile of a request, in seconds."""
         return statistics.quantiles(self.waits, n=100)[-1]
 
 
 async def send_crowd(address: str, people: int, walk: Walk) -> PageCrowd:
-    """All of them at once, each on a connection of their own."""
+    """Let so many participants walk at once, each on a connection of their own. Raises TimeoutError after SECONDS."""
     waits: list[float] = []
 
     async def person(number: int) -> None:
@@ -178,7 +180,7 @@ async def send_crowd(address: str, people: int, walk: Walk) -> PageCrowd:
 
 
 async def through_the_study(number: int, ask: Callable[..., Awaitable[Exchange]]) -> None:
-    """GET, POST, GET … as a browser does, until there is no form any more."""
+    """Go through the study as a browser does, to the last page. Raises RuntimeError for an unexpected status."""
     target = f"/next?projectId=crowd&userId=P{number}"
     fields: Mapping[str, object]
     for fields in [*ANSWERS.values(), {}]:
@@ -196,7 +198,7 @@ async def through_the_study(number: int, ask: Callable[..., Awaitable[Exchange]]
 
 
 async def hello(number: int, ask: Callable[..., Awaitable[Exchange]]) -> None:
-    """As many requests as a participant makes, to a server that does nothing."""
+    """Send as many requests as a participant does, for the server of `HELLO`."""
     for _ in ANSWERS:
         await ask("GET", f"/?{number}")
         await ask("POST", f"/?{number}", b"x=1")
@@ -219,18 +221,18 @@ asyncio.run(uvicorn.Server(config).serve([listener]))
 
 @contextlib.contextmanager
 def serving(command: list[str], cwd: Path) -> Iterator[str]:
-    """A server in a process of its own; the first address that it prints."""
+    """Run a server in a process of its own within the block; give the first address that it prints."""
     env = {**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200", "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert process.stdout is not None
-        said = ""
-        while not (address := re.search(r"http://127\.0\.0\.1:\d+/", said)):
-            printed = process.stdout.readline()
-            if not printed:
-                raise RuntimeError(f"the server did not start: {said}")
-            said += printed
-        threading.Thread(target=process.stdout.read, daemon=True).start()  # so that it never waits for us
+        output = ""
+        while not (address := re.search(r"http://127\.0\.0\.1:\d+/", output)):
+            line = process.stdout.readline()
+            if not line:
+                raise RuntimeError(f"the server did not start: {output}")
+            output += line
+        threading.Thread(target=process.stdout.read, daemon=True).start()  # so that the pipe never fills
         yield address[0]
     finally:
         process.send_signal(signal.SIGTERM)
@@ -242,7 +244,7 @@ def serving(command: list[str], cwd: Path) -> Iterator[str]:
 
 
 def project_without_game(folder: Path) -> None:
-    """The example project's pages without its game."""
+    """Write a project with the example project's pages but without its game."""
     (folder / "steps").mkdir()
     for file in (ROOT / "steps").glob("*.html"):
         (folder / "steps" / file.name).write_bytes(file.read_bytes())
@@ -253,7 +255,7 @@ def project_without_game(folder: Path) -> None:
 
 
 def crowd() -> Iterator[Row]:
-    """Participants at once on the step pages of `python -m local`, against a server that says hello."""
+    """Measure many participants at once on the step pages of `python -m local`, beside a server that answers hello."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         project_without_game(folder)
@@ -272,10 +274,10 @@ def crowd() -> Iterator[Row]:
         "the client": "one process beside the server; all participants begin at the same moment and never pause",
         "answers stored": f"{stored}, every one of them",
     }
-    what = f"{PEOPLE} participants at once, local step pages"
-    yield row(f"{what}, against hello", ours.rate, "requests/s", yardstick=theirs.rate, detail=detail)
+    name = f"{PEOPLE} participants at once, local step pages"
+    yield row(f"{name}, against hello", ours.rate, "requests/s", yardstick=theirs.rate, detail=detail)
     for kind, mine, yardstick in (
         ("p50", statistics.median(ours.waits), statistics.median(theirs.waits)),
         ("p99", ours.p99, theirs.p99),
     ):
-        yield row(f"{what}, {kind} of a request, against hello", 1000 * mine, "ms", yardstick=1000 * yardstick)
+        yield row(f"{name}, {kind} of a request, against hello", 1000 * mine, "ms", yardstick=1000 * yardstick)

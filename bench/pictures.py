@@ -1,4 +1,4 @@
-"""The kinds of picture that frames are measured on, as a sequence of frames each."""
+"""The kinds of picture with which frames are measured, each as a sequence of frames."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from trial.pictures.frames import Frame, as_frame
 
 ROOT = Path(__file__).parents[1]
 GAME = "ALE/MsPacman-v5"
-FRAMES = 300
+FRAMES = 300  # of each kind
 
 
 def example_agent() -> Any:
-    """The agent of the example study."""
+    """Make the agent of the example study."""
     spec = importlib.util.spec_from_file_location("example_agent", ROOT / "agent.py")
     assert spec is not None
     assert spec.loader is not None
@@ -28,7 +28,7 @@ def example_agent() -> Any:
 
 
 def ms_pacman() -> list[Frame]:
-    """Ms. Pac-Man as the example agent shows it, with random keys: 160 x 210, flat, little moves."""
+    """Draw the example agent's game with random keys: 160 x 210 pixels, flat colours, small parts that move."""
     agent = example_agent()
     agent.start(GAME)
     keys = random.Random(7)
@@ -46,7 +46,7 @@ def ms_pacman() -> list[Frame]:
 
 
 def cart_pole() -> list[Frame]:
-    """Gymnasium's CartPole, drawn by its own code, with random pushes: 600 x 400, flat, with smoothed lines."""
+    """Draw Gymnasium's CartPole by its own code, with random pushes: 600 x 400 pixels, flat colours, smoothed lines."""
     import gymnasium
 
     env: Any = gymnasium.make("CartPole-v1", render_mode="rgb_array")
@@ -63,7 +63,7 @@ def cart_pole() -> list[Frame]:
 
 
 def texture(width: int, height: int = 400) -> Frame:
-    """Something like grass and gravel: coloured noise of several sizes."""
+    """Make coloured noise of several sizes, which looks like grass and gravel."""
     noise = np.random.default_rng(7)
     mixed = np.full((height, width, 3), (110.0, 120.0, 90.0))
     for size in (1, 2, 4, 8, 16):
@@ -74,7 +74,7 @@ def texture(width: int, height: int = 400) -> Frame:
 
 
 def scrolling_texture() -> list[Frame]:
-    """A texture of 600 x 400 that moves by three pixels a frame: each frame differs from the last nearly everywhere."""
+    """Make a texture of 600 x 400 pixels that moves by three pixels a frame, so that nearly all pixels change."""
     whole = texture(600 + 3 * FRAMES)
     return [np.ascontiguousarray(whole[:, 3 * number : 3 * number + 600]) for number in range(FRAMES)]
 

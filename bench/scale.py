@@ -1,9 +1,10 @@
-"""Crowds on the simulated account, and every fault of every journey. Figures of the simulation, not of AWS.
+"""Measures crowds on the simulated account, and every fault of every journey.
 
-What the simulation assumes is printed beside the figures, from its own constants (`testing/simulation/assumptions.py`),
-and crowds come again under worse assumptions. Waiting counts from the moment at which a participant sends the answer
-that calls for their server until their page shows it: topic, queue, functions, events, DNS and the page's own questions
-are all in it. The yardstick is what AWS alone would take (`testing/simulation/aws_bound.py`): nothing of ours is in it.
+The figures are those of the simulation, not of AWS. The simulation's assumptions are printed beside the figures
+(`testing/simulation/assumptions.py`), and crowds come again under worse assumptions. A participant waits from the
+moment at which they send the answer for which their server is started until their page gets its address: topic, queue,
+functions, events, DNS and the page's polls are all included. The yardstick is the time of AWS alone, without our code
+(`testing/simulation/aws_bound.py`).
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from testing.simulation.tasks import ADDRESSES
 from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
-SEEDS = range(2026, 2044)  # of the crowds whose waits are judged: slow spans let the p95 of six of them vary by 3 %
+SEEDS = range(2026, 2044)  # of the crowds whose waits are judged; with only six, slow spans change the p95 by 3 %
 SMALL, SMALL_WITHIN = 250, 600.0
 MANY, MANY_WITHIN = 10_000, 900.0
-HOUR = 3600.0  # seconds that those many play
-HOURS = 2.0  # after which a crowd must be through, its servers gone
+HOUR = 3600.0  # seconds for which MANY play
+HOURS = 2.0  # after which a crowd must have finished, and its servers must be gone
 WORSE: Mapping[str, Conditions] = {
     "a zone busy for 2 to 5 s": Conditions(busy_zone=(2.0, 5.0)),
     "a zone busy for 5 to 15 s": Conditions(busy_zone=(5.0, 15.0)),
@@ -48,8 +49,8 @@ WORSE: Mapping[str, Conditions] = {
     "Route 53 slow all the time": Conditions(slow_zone=1.0),
     "3 % of the events lost": Conditions(lost=0.03),
 }
-FEW, FEW_WITHIN, FEW_EXECUTIONS = 200, 60.0, 10  # of a new account
-DEFAULT_QUOTAS = {  # adjustable, each in Service Quotas
+FEW, FEW_WITHIN, FEW_EXECUTIONS = 200, 60.0, 10  # participants, seconds, and the concurrent executions of a new account
+DEFAULT_QUOTAS = {  # Service Quotas can raise each of them
     "network interfaces in the Region": 5_000,  # VPC User Guide, "Amazon VPC quotas"
     "records in the hosted zone": 10_000,  # Route 53 Developer Guide, "Quotas"
     "Fargate Spot vCPUs": 6,  # Amazon ECS endpoints and quotas; AWS raises it with use
@@ -57,7 +58,7 @@ DEFAULT_QUOTAS = {  # adjustable, each in Service Quotas
 
 
 def rows() -> Iterator[Row]:
-    """Crowds with our functions and in HIPPO's way; then all faults. About six minutes."""
+    """Measure crowds with our functions and in HIPPO's way, and then all faults; about six minutes."""
     with quiet():
         yield from each([crowds, worse_crowds, small_crowd, small_account, many_at_once, faults_of_journeys])
 
@@ -67,7 +68,7 @@ def rows() -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class ServedCrowd:
-    """How it went for those who came. Times are virtual seconds."""
+    """The outcome of a crowd. Times are virtual seconds."""
 
     world: SimulatedWorld
     visits: Sequence[SimulatedVisit]
@@ -76,19 +77,19 @@ class ServedCrowd:
 
     @property
     def served(self) -> float:
-        """The share that played to the end, in percent."""
+        """The percentage of the participants who have finished."""
         return 100 * sum(visit.finished is not None for visit in self.visits) / len(self.visits)
 
     @property
     def waits(self) -> list[float]:
-        """From asking for a server until the page showed it; of those who never saw one, until they gave up or now."""
+        """From the answer that starts a server until the page has its address, or until now if it never got one."""
         now = self.world.clock.seconds
         asked = [(visit, visit.asked) for visit in self.visits if visit.asked is not None]
         return [(now if visit.ready is None else visit.ready) - at for visit, at in asked]
 
     @property
     def alone(self) -> list[float]:
-        """What AWS alone would take for the same participants."""
+        """How long the same participants would wait with AWS alone."""
         return aws_alone([visit.asked for visit in self.visits if visit.asked is not None], self.seed, self.conditions)
 
 
@@ -101,7 +102,7 @@ def crowd(
     wires: Mapping[str, Wire] = WIRES,
     concurrency: int = CONCURRENCY,
 ) -> ServedCrowd:
-    """So many participants who come within so many seconds, until all of them are through."""
+    """Simulate so many participants who come within so many seconds, until nothing is left, or for HOURS at most."""
     conditions = conditions or Conditions()
     world = SimulatedWorld(seed, conditions, wires=wires, concurrency=concurrency)
     arrived = [SimulatedParticipant(world, number) for number in range(people)]
@@ -112,7 +113,7 @@ def crowd(
 
 
 def crowds() -> Iterator[Row]:
-    """1,000 participants in a minute, eighteen times."""
+    """Measure 1,000 participants within a minute, eighteen times."""
     begun = time.perf_counter()
     made = [crowd(seed) for seed in SEEDS]
     theirs = hippo(CROWD, WITHIN)
@@ -123,11 +124,11 @@ def crowds() -> Iterator[Row]:
 
 
 def worse_crowds() -> Iterator[Row]:
-    """The same where AWS is worse than the simulation usually has it."""
-    for what, conditions in WORSE.items():
+    """Measure the same crowd under worse conditions than the usual ones of the simulation."""
+    for worse, conditions in WORSE.items():
         begun = time.perf_counter()
         came = crowd(SEED, conditions=conditions)
-        name = f"{CROWD:,} arrive within {WITHIN:.0f} s, {what}"
+        name = f"{CROWD:,} arrive within {WITHIN:.0f} s, {worse}"
         yield served(name, [came], hippo(CROWD, WITHIN, conditions), time.perf_counter() - begun)
         yield row(
             f"{name}: asked for a server until the page shows it, p95, beside AWS alone",
@@ -139,7 +140,7 @@ def worse_crowds() -> Iterator[Row]:
 
 
 def small_crowd() -> Iterator[Row]:
-    """As many as HIPPO's way can serve."""
+    """Measure a crowd that is small enough for HIPPO's way."""
     begun = time.perf_counter()
     came, theirs = crowd(SEED, SMALL, SMALL_WITHIN), hippo(SMALL, SMALL_WITHIN)
     name = f"{SMALL} arrive within {SMALL_WITHIN / 60:.0f} minutes"
@@ -147,22 +148,22 @@ def small_crowd() -> Iterator[Row]:
 
 
 def small_account() -> Iterator[Row]:
-    """As many as share an account's ten executions, with the mappings that the deploy command chooses there."""
+    """Measure a crowd in an account with ten executions, with the concurrency that the deploy command chooses there."""
     wires = {**WIRES, "start_server": WIRES["start_server"]._replace(concurrency=starts(FEW_EXECUTIONS))}
     begun = time.perf_counter()
     came = crowd(SEED, FEW, FEW_WITHIN, wires=wires, concurrency=FEW_EXECUTIONS)
     name = f"{FEW} arrive within {FEW_WITHIN:.0f} s in an account of {FEW_EXECUTIONS} executions"
     yield served(name, [came], hippo(FEW, FEW_WITHIN), time.perf_counter() - begun)
     pages = sum(visit.pages for visit in came.visits)
-    late = sum(visit.unanswered for visit in came.visits)
+    later = sum(visit.unanswered for visit in came.visits)
     yield row(
         f"{name}: pages that come at the first try",
-        100 * (1 - late / pages),
+        100 * (1 - later / pages),
         "%",
         bound="nearly all; the others come at the second try, and none stays away",
         at_least=99,
         detail={
-            "pages, those that came at a later try": f"{pages:,}, {late}",
+            "pages, those that came at a later try": f"{pages:,}, {later}",
             "executions refused, polls included": came.world.cloud.throttled["lambda:Invoke"],
             "asked for a server until the page shows it, p50, p95, max": spread(came.waits),
             "AWS alone": spread(came.alone),
@@ -170,41 +171,44 @@ def small_account() -> Iterator[Row]:
     )
 
 
-def served(what: str, made: Sequence[ServedCrowd], theirs: Mapping[str, Any], seconds: float) -> Row:
-    """Everybody is served and nothing is left, beside the share that HIPPO's way gives a server."""
+def served(name: str, made: Sequence[ServedCrowd], theirs: Mapping[str, Any], seconds: float) -> Row:
+    """Return the row of the share that finishes (0 if anything is left), beside the share that HIPPO's way serves.
+
+    `theirs` is what `hippo` returns; `seconds` is how long the simulation took.
+    """
     left = Counter[str]()
     for one in made:
         left.update({thing: count for thing, count in one.world.left().items() if count})
     told = Counter(visit.told for one in made for visit in one.visits if visit.finished is None)
     worst = min(one.served for one in made)
     return row(
-        f"{what}: share that plays to the end, nothing left behind",
+        f"{name}: share that plays to the end, nothing left behind",
         0.0 if left else worst,
         "%",
         yardstick=100 * theirs["ready"],
         at_least=100,
         judge="value",
-        bound="everybody is served, and nothing is left behind",
+        bound="all participants finish, and nothing is left behind",
         detail={
             "the yardstick": "share that gets a server in HIPPO's way, the better of two models: "
             f"address with the interface {theirs['both'][0]}, when the task runs {theirs['both'][1]}",
             "assumed of HIPPO's way": ASSUMED,
             "what failed there": dict(theirs["failed"]) or "nothing",
             "left behind": dict(left) or "nothing",
-            "played to the end, and what the others were told": f"{worst:g} %, {dict(told) or 'nobody else'}",
+            "played to the end, and what the others were told": f"{worst:g} %, {dict(told) or 'no others'}",
             "simulated in": f"{seconds:.1f} s",
-            **{f"assumed: {of}": text for of, text in assumed(made[0].conditions).items()},
+            **{f"assumed: {thing}": text for thing, text in assumed(made[0].conditions).items()},
         },
     )
 
 
 def assumed(conditions: Conditions) -> Mapping[str, str]:
-    """What to print of the assumptions: all of the usual ones, of others what differs from those."""
+    """Return the assumptions to print: all of the usual conditions, of others those that differ from them."""
     return changed(conditions) or assumptions(conditions)
 
 
 def waiting(made: Sequence[ServedCrowd]) -> Row:
-    """How long participants wait for their servers."""
+    """Return the row of the time that participants wait for their servers."""
     waits, alone = [wait for one in made for wait in one.waits], [wait for one in made for wait in one.alone]
     return row(
         "asked for a server until the page shows it, p95, against AWS alone (quotas, start, DNS)",
@@ -221,7 +225,7 @@ def waiting(made: Sequence[ServedCrowd]) -> Row:
 
 
 def costs(came: ServedCrowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
-    """Billed seconds and calls of one crowd."""
+    """Yield the rows of the billed seconds and the calls of one crowd."""
     world, people = came.world, len(came.visits)
     yield row(
         "billed seconds per participant behind the pages, beside HIPPO's start_server",
@@ -253,7 +257,7 @@ def costs(came: ServedCrowd, theirs: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def many_at_once() -> Iterator[Row]:
-    """10,000 servers that run at the same time for an hour."""
+    """Measure 10,000 servers that run at the same time for an hour."""
     world = SimulatedWorld(SEED, project=msgspec.structs.replace(PROJECT, max_runtime=110))
     people = [SimulatedParticipant(world, number, play=HOUR) for number in range(MANY)]
     for person in people:
@@ -280,13 +284,13 @@ def many_at_once() -> Iterator[Row]:
 
 
 def sweeps(world: SimulatedWorld) -> Iterator[Row]:
-    """The rows of the sweeps. The longest one says nothing if it was cut off: its time is the timeout then."""
+    """Yield the rows of the sweeps. If a sweep was cut off, the time of the longest one is the timeout."""
     yield row(
         "the longest sweep among them, beside its function's timeout",
         world.sweep.longest,
         "s",
         yardstick=TIMEOUTS["sweep"],
-        detail={"counted": "what AWS's answers take; what the function itself computes is not simulated"},
+        detail={"counted": "the latency of AWS's calls; the function's own processor time is not simulated"},
     )
     yield row(
         "sweeps among them that are cut off by the timeout",
@@ -299,38 +303,38 @@ def sweeps(world: SimulatedWorld) -> Iterator[Row]:
 
 
 def served_many(came: ServedCrowd, detail: Mapping[str, Any]) -> Row:
-    """Everybody is served in the network that the template makes."""
+    """Return the row of the share that finishes, 0 if anything is left, in the network that the template makes."""
     left = {thing: count for thing, count in came.world.left().items() if count}
     return row(
         f"{len(came.visits):,} servers at once for an hour: share that plays to the end, nothing left behind",
         0.0 if left else came.served,
         "%",
-        bound="everybody, in the network that infra/template.yml makes",
+        bound="all participants, in the network that infra/template.yml makes",
         at_least=100,
         detail={"left behind": left or "nothing", "played to the end": f"{came.served:g} %", **detail},
     )
 
 
 def needs(world: SimulatedWorld) -> Mapping[str, str]:
-    """What the run needed at once, and what a Region allows."""
+    """Return how much the run needed at once, and how much AWS allows."""
     tasks = world.platform.tasks.most_interfaces
-    most = {
+    needed = {
         "network interfaces in the Region": tasks,
         "records in the hosted zone": world.platform.dns.most_records,
         "Fargate Spot vCPUs": tasks * world.project.size.cpu,
     }
     quotas = {
-        f"{what} at once": f"{count:,.0f}; AWS allows {DEFAULT_QUOTAS[what]:,} unless that quota is raised"
-        for what, count in most.items()
+        f"{quota} at once": f"{count:,.0f}; AWS allows {DEFAULT_QUOTAS[quota]:,} unless that quota is raised"
+        for quota, count in needed.items()
     }
     return {"addresses at once": f"{tasks:,} of {ADDRESSES:,} in the template's subnets", **quotas}
 
 
 def _cost(world: SimulatedWorld) -> Row:
-    """What the run costs for each who took part."""
+    """Return the row of the cost of the run per participant."""
     prices = Prices()
     spot, on_demand = (
-        {what: usd * (1 / MANY) for what, usd in bill(world, prices, spot=kind).items()} for kind in (True, False)
+        {part: usd * (1 / MANY) for part, usd in bill(world, prices, spot=kind).items()} for kind in (True, False)
     )
     total, dearer = (sum(parts.values(), Usd()) for parts in (spot, on_demand))
     return row(
@@ -340,7 +344,7 @@ def _cost(world: SimulatedWorld) -> Row:
         detail={
             "Spot from, to": [total.low, total.high],
             "on demand": dearer.likely,
-            **{what: usd.likely for what, usd in spot.items()},
+            **{part: usd.likely for part, usd in spot.items()},
             "minutes of a server": server_seconds(world) / 60 / MANY,
             "prices": prices.note(prices.region),
         },
@@ -348,7 +352,7 @@ def _cost(world: SimulatedWorld) -> Row:
 
 
 def _by_quota(calls: Mapping[str, int]) -> Counter[str]:
-    """Calls by the quota that they share."""
+    """Return the number of calls by the quota that they share."""
     found: Counter[str] = Counter()
     for action, count in calls.items():
         api = action if action in QUOTAS else action.partition(":")[0]
@@ -361,7 +365,7 @@ def _by_quota(calls: Mapping[str, int]) -> Counter[str]:
 
 
 def faults_of_journeys() -> Iterator[Row]:
-    """A crash before, after and with the lost reply of every call."""
+    """Run every journey with each of its faults: a crash before and after every call, and its lost reply."""
     counts: Counter[str] = Counter()
     detail: dict[str, Any] = {}
     for journey in faults.JOURNEYS:
@@ -369,13 +373,13 @@ def faults_of_journeys() -> Iterator[Row]:
         bad = sum(not outcome.well for outcome in outcomes)
         counts["points"] += len(outcomes)
         counts["bad"] += bad
-        detail[journey.name] = f"{len(outcomes)} faults, {bad} with something left or somebody stranded"
+        detail[journey.name] = f"{len(outcomes)} faults; after {bad}, something is left or a participant stranded"
     yield row("fault points tried", counts["points"], "", detail=detail)
     yield row(
-        "of those, with something left or somebody stranded",
+        "of those, with something left or a participant stranded",
         counts["bad"],
         "",
-        bound="whatever goes wrong, nobody is stranded and nothing is left",
+        bound="no fault strands a participant or leaves anything",
         at_most=0,
     )
 
@@ -384,10 +388,10 @@ def faults_of_journeys() -> Iterator[Row]:
 
 
 def hippo(people: int, within: float, conditions: Conditions | None = None) -> dict[str, Any]:
-    """The same crowd in HIPPO's way: the better of its two models."""
-    found = [_hippo(people, within, conditions, early=early) for early in (True, False)]
-    best = max(found, key=lambda model: float(model["ready"]))
-    return best | {"both": [f"{model['ready']:.1%}" for model in found]}
+    """Simulate the same crowd in HIPPO's way; return the outcome of the better of its two models."""
+    models = [_hippo(people, within, conditions, early=early) for early in (True, False)]
+    best = max(models, key=lambda model: float(model["ready"]))
+    return best | {"both": [f"{model['ready']:.1%}" for model in models]}
 
 
 def _hippo(people: int, within: float, conditions: Conditions | None, *, early: bool) -> dict[str, Any]:
@@ -397,10 +401,8 @@ def _hippo(people: int, within: float, conditions: Conditions | None, *, early: 
         delay = world.clock.random.uniform(0, within)
         world.clock.spawn(lambda n=number: starts.start(n), delay=delay)  # type: ignore[misc]
     world.run(HOURS * 3600)
-    times = [start.ready - start.asked for start in starts.starts if start.ready is not None]
     return {
-        "ready": len(times) / people,
-        "times": spread(times) if times else [],
+        "ready": sum(start.ready is not None for start in starts.starts) / people,
         "billed": sum(start.billed for start in starts.starts) / people,
         "failed": Counter(start.failed for start in starts.starts if start.failed),
         "throttled": world.cloud.throttled,
@@ -408,14 +410,15 @@ def _hippo(people: int, within: float, conditions: Conditions | None, *, early: 
 
 
 def spread(values: Sequence[float]) -> list[float]:
-    """p50, p95 and the longest."""
+    """Return p50, p95 and the maximum."""
     return [quantile(values, 0.5), quantile(values, 0.95), max(values)]
 
 
 def seconds_of(moment: str) -> float:
+    """Return the virtual seconds from the beginning to a time in ISO format."""
     return (datetime.fromisoformat(moment) - EPOCH).total_seconds()
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """The value below which that share of them lies."""
+    """Return the value below which this share of the values lies."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]

@@ -1,7 +1,7 @@
-"""Games drawn by objects beside the same games drawn by frames, in a real Chromium: `python -m bench.scenes`.
+"""Compares a game drawn by objects with the same game drawn by frames, in a real Chromium: `python -m bench.scenes`.
 
-One game is shown in both ways: forty objects of which twelve move, 600 x 400 pixels, 30 ticks a second. Ticks that are
-drawn and the effects of keys are timed in the page by its own clock, as in `bench/seen.py`.
+The game has forty objects, of which twelve move, on 600 x 400 pixels at 30 ticks a second. The page times drawn ticks
+and the effects of keys by its own clock, as in `bench/seen.py`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from testing.browser import chromium, game_page
 
 RATE = 30  # ticks a second
 MOST_WAIT = 1_000 / RATE + 5
-"""Milliseconds from a key to its effect, the median: one tick and 5 ms."""
+"""The goal of the median time from a key to its effect, in milliseconds: one tick and 5 ms."""
 MOST_WEIGHT = 40_000
-"""Bytes of the game page on its way, without the study's images."""
+"""The goal of the size of the game page, compressed and without the study's images, in bytes."""
 SCENE = {"width": 600, "height": 400, "background": "#202830"}
 
-# The last object is a block in the corner that is white while "left" acts. As frames the same objects are drawn by the
-# server, as for clients that draw none.
+# The last object is a block in the corner that is white while the action is "left". For frames the server draws the
+# same objects, as it does for clients that cannot draw objects.
 AGENT = """
 import math, sys
 sys.path.insert(0, ROOT)
@@ -60,7 +60,7 @@ class Agent:
         pass
 """
 
-# Notes each scene, which begins with its background, and from a key until the corner shows it.
+# Notes each draw of a scene, which begins with its background, and the ms from a key event until the corner shows it.
 WATCH = """(() => {
   const { fillRect, fill } = CanvasRenderingContext2D.prototype;
   CanvasRenderingContext2D.prototype.fillRect = function (...box) {
@@ -78,16 +78,16 @@ WATCH = """(() => {
 
 @dataclass
 class Shown:
-    """What was measured of one way to show the game."""
+    """The figures of one way to draw the game."""
 
     seen: seen.Seen = field(default_factory=seen.Seen)
     bytes_a_tick: float = 0.0
     weight: int = 0
-    """Bytes of the page, compressed."""
+    """The size of the page in bytes, compressed."""
 
 
 def look(browser: Any, *, objects: bool) -> Shown:
-    """Play in a page; then press keys."""
+    """Play in a page, then press keys; return the figures."""
     found = Shown()
     with _game(objects) as (address, pid):
         context = browser.new_context(viewport={"width": 1280, "height": 800})
@@ -118,7 +118,7 @@ def _size(data: Any) -> int:
 
 @contextlib.contextmanager
 def _game(objects: bool) -> Iterator[tuple[str, int]]:
-    """The page's address, the server's process id."""
+    """Run the game's page and server within the block; give the page's address and the server's process id."""
     trial: dict[str, Any] = {"scene": SCENE} if objects else {}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "agent.py").write_text(f"ROOT, OBJECTS = {str(ROOT)!r}, {objects}\n{AGENT}", encoding="utf-8")
@@ -131,13 +131,13 @@ def _game(objects: bool) -> Iterator[tuple[str, int]]:
 
 
 def in_chromium() -> Iterator[Row]:
-    """What participants see of a game drawn by objects. Raises NoChromium."""
+    """Measure what participants see of the game in both ways. Raises NoChromium."""
     with chromium() as browser:
         yield from judged(look(browser, objects=True), look(browser, objects=False))
 
 
 def judged(objects: Shown, frames: Shown) -> Iterator[Row]:
-    """The rows of both."""
+    """Yield the rows of both ways."""
     for name, shown in (("objects", objects), ("frames", frames)):
         yield row(
             f"ticks drawn at {RATE}/s, {name}",
@@ -166,7 +166,7 @@ def judged(objects: Shown, frames: Shown) -> Iterator[Row]:
         objects.weight,
         "bytes",
         at_most=MOST_WEIGHT,
-        bound="ours: what the game page may weigh on its way",
+        bound="ours: the size of the game page over the network",
         detail={"without them": frames.weight},
     )
 

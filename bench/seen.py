@@ -1,4 +1,4 @@
-"""What a participant sees, and when: drawn frames and the effects of keys, timed in the page by its own clock."""
+"""Measures what a participant sees: drawn frames and the effects of keys, timed in the page by its own clock."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from testing.browser import game_page, html_page
 from trial.pictures.frames import Frame
 
 SECONDS = 6.0
-PRESSES = 60  # of a key; each goes down and comes up again
-PATIENCE = 20_000  # ms, for any one thing
-BLOCK = 16  # pixels; the block in the corner that shows whether the key is down
+PRESSES = 60  # presses of a key, each down and up
+PATIENCE = 20_000  # ms to wait for any condition
+BLOCK = 16  # pixels: the side of the block in the corner that shows whether the key is down
 
-# Runs in the page before its own scripts. Notes each draw on the canvas, and from a key until the corner shows it.
+# Runs in the page before its own scripts. Notes each draw on the canvas, and the ms from a key event until the corner
+# shows it.
 WATCH = """(() => {
   const seen = (window.benchSeen = { draws: [], drawn: 0, waits: [], wanted: null, since: 0 });
   const draw = (name, corner) => {
@@ -53,8 +54,8 @@ WATCH = """(() => {
   addEventListener("keyup", press(false), true);
 })()"""
 
-# The example's game, Gymnasium's CartPole, or a texture that scrolls, with a block in the corner that is white while
-# "left" acts.
+# The example's game, Gymnasium's CartPole, and a scrolling texture, each with a block in the corner that is white while
+# the action is "left".
 AGENTS = {
     "Ms. Pac-Man": """
 import importlib.util, sys
@@ -82,7 +83,7 @@ class Agent:
     def step(self, action):
         self.action = action
         _, _, terminated, truncated, _ = self.env.step(action)
-        if terminated or truncated:  # it goes on: no picture of another game comes between
+        if terminated or truncated:  # the trial's episode goes on, so that the page shows nothing else in between
             self.env.reset(seed=7)
         return None, 0.0, False, False, {}
     def render(self):
@@ -118,22 +119,23 @@ LEFT = {"Ms. Pac-Man": 3, "CartPole, 600 x 400": 1, "scrolling texture, 600 x 40
 
 @dataclass
 class Seen:
-    """Figures of one page. Times are milliseconds."""
+    """Figures of one page, by frames per second. Times are milliseconds."""
 
-    share: dict[int, float] = field(
-        default_factory=dict
-    )  # of the frames that were due, by rate; above 1 if some were late
-    gaps: dict[int, float] = field(default_factory=dict)  # 99th percentile between two draws
-    cpu: dict[int, float] = field(default_factory=dict)  # of the server, for each frame
+    share: dict[int, float] = field(default_factory=dict)
+    """The share of the frames that were due; above 1 if earlier frames were drawn late."""
+    gaps: dict[int, float] = field(default_factory=dict)
+    """The 99th percentile of the time between two draws."""
+    cpu: dict[int, float] = field(default_factory=dict)
+    """The server's processor time per drawn frame."""
     waits: list[float] = field(default_factory=list)
-    since_opened: dict[int, float] = field(
-        default_factory=dict
-    )  # all draws, of the frames due since the page was opened
+    """From each key event to the draw that shows its effect, at one rate."""
+    since_opened: dict[int, float] = field(default_factory=dict)
+    """All draws, as a share of the frames that were due since the page was opened."""
 
 
 @contextlib.contextmanager
 def server(agent_dir: Path, *, store: Path | None = None, **trial: Any) -> Iterator[tuple[str, int]]:
-    """A running trial server: its address and process id. `store` is the folder of what it records."""
+    """Run a trial server within the block; give its address and process id. `store` is the folder of its recordings."""
     with tempfile.TemporaryDirectory() as folder:
         section = {"game": GAME, "maxEpisodes": 1000, **trial}
         with trial_server(agent_dir, str(store or folder), section, USER_ID="bench") as (port, process):
@@ -141,16 +143,16 @@ def server(agent_dir: Path, *, store: Path | None = None, **trial: Any) -> Itera
 
 
 def cpu_seconds(pid: int) -> float:
-    """Processor time a process has used, user and system: its clock, numbered as clock_getcpuclockid(3) does on Linux.
+    """Return the processor seconds of a process, user and system, from the clock that clock_getcpuclockid(3) names.
 
-    `/proc/PID/stat` counts in hundredths of a second, in which a server sends dozens of pictures.
+    `/proc/PID/stat` counts in hundredths of a second, which is too coarse: a server can send dozens of pictures in one.
     """
     return time.clock_gettime((~pid << 3) | 2)
 
 
 @contextlib.contextmanager
 def ours(picture: str, rate: int) -> Iterator[tuple[str, int]]:
-    """Hippodrome's game page and trial server: the page's address, the server's process id."""
+    """Run Hippodrome's game page and trial server for the block; give the page's address and the server's pid."""
     with tempfile.TemporaryDirectory() as folder:
         source = f"ROOT, LEFT = {str(ROOT)!r}, {LEFT[picture]}\n{AGENTS[picture]}"
         Path(folder, "agent.py").write_text(source, encoding="utf-8")
@@ -164,7 +166,7 @@ def ours(picture: str, rate: int) -> Iterator[tuple[str, int]]:
 
 @contextlib.contextmanager
 def bare(picture: str, rate: int) -> Iterator[tuple[str, int]]:
-    """The yardstick's page and server, showing pictures of the same kind as JPEGs."""
+    """Run the yardstick's page and server, which show the same kind of picture as JPEGs; give the same as `ours`."""
     frames = KINDS[picture]()[:8]
     with tempfile.TemporaryDirectory() as folder:
         names = []
@@ -194,7 +196,7 @@ def _jpeg(frame: Frame, corner: int) -> bytes:
 
 
 def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], pressed_at: int) -> Seen:
-    """Play in a page at each rate; at `pressed_at`, press keys too. `setting` is `ours` or `bare`."""
+    """Play in a page at each rate, with keys at `pressed_at`; return the figures. `setting` is `ours` or `bare`."""
     seen = Seen()
     for rate in rates:
         with setting(picture, rate) as (address, pid):
@@ -214,27 +216,28 @@ def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], press
     return seen
 
 
-def until(page: Any, what: str, count: int) -> None:
-    """Wait until the page has noted so many. Raises Playwright's Error, with what the page shows, after PATIENCE."""
+def until(page: Any, kind: str, count: int) -> None:
+    """Wait until the page has noted so many `draws` or `waits`. Raises Playwright's Error after PATIENCE."""
     page.evaluate(
-        """([what, count, patience]) => new Promise((done, fail) => {
+        """([kind, count, patience]) => new Promise((done, fail) => {
             const end = performance.now() + patience;
-            const missing = () => new Error(`fewer than ${count} ${what}: ${document.body.innerText}`);
+            const missing = () => new Error(`fewer than ${count} ${kind}: ${document.body.innerText}`);
             const look = () => {
-                if (benchSeen[what].length >= count) done();
+                if (benchSeen[kind].length >= count) done();
                 else if (performance.now() > end) fail(missing());
                 else setTimeout(look, 10);
             };
             look();
         })""",
-        [what, count, PATIENCE],
+        [kind, count, PATIENCE],
     )
 
 
 def frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
-    """Watch the page for SECONDS, even if its timer is late; longer only until there are two draws.
+    """Watch the page for SECONDS, or longer until there are two draws, and enter the figures in `seen`.
 
-    Raises Playwright's Error, with what the page shows, after PATIENCE more.
+    Draws after SECONDS do not count, even if the page's timer is late. Raises Playwright's Error, with the page's text,
+    after PATIENCE more without two draws.
     """
     cpu = cpu_seconds(pid)
     draws, watched = page.evaluate(
@@ -262,7 +265,7 @@ def frames(page: Any, pid: int, rate: int, seen: Seen) -> None:
 
 
 def presses(page: Any) -> list[float]:
-    """Press keys; the milliseconds until each showed."""
+    """Press keys; return the milliseconds until each effect was drawn."""
     moments = random.Random(7)
     for number in range(2 * PRESSES):
         page.wait_for_timeout(moments.uniform(20, 120))  # so that keys come at any moment between two frames

@@ -1,9 +1,9 @@
-"""Crowds that play together on the simulated account, and faults of their journeys: `python -m bench sessions`.
+"""Measures crowds that play together on the simulated account, and faults of their journeys.
 
-Figures of the simulation, not of AWS; what it assumes is printed beside them. Participants come within a minute,
-read two pages, meet in the lobby, and play in pairs or fours. A server for each session starts ahead, while they read.
-Waiting counts from the lobby to the first picture. Beside it stands what AWS alone would take, where the server that is
-ready first is the next session's (`testing/simulation/aws_bound.py`).
+`python -m bench sessions`. The figures are those of the simulation, not of AWS; its assumptions are printed beside
+them. Participants come within a minute, read two pages, meet in the lobby, and play in pairs or fours. A server for
+each session starts ahead, while they read. They wait from the lobby to the first picture. The yardstick is the time of
+AWS alone, where the next session gets the server that is ready first (`testing/simulation/aws_bound.py`).
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from testing.simulation.members import Habits, SimulatedMember
 from testing.simulation.world import PROJECT, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
-SMALLER, SMALLER_WITHIN = 340, 20.0  # as many a second: where something goes wrong, and crowds that come several times
-SEEDS = range(2026, 2029)  # of the crowds whose waits are compared: a slow span of Route 53 decides the p95 of one
-HOURS = 2.0  # after which a crowd must be through, its servers gone
+SMALLER, SMALLER_WITHIN = 340, 20.0  # as many per second: for worse conditions, and for crowds that come several times
+SEEDS = range(2026, 2029)  # of the crowds whose waits are compared; a slow span of Route 53 decides the p95 of one
+HOURS = 2.0  # after which a crowd must have finished, and its servers must be gone
 PAIRS: Project = msgspec.structs.replace(PROJECT, players=2, patience=300.0)
 FOURS: Project = msgspec.structs.replace(PAIRS, players=4)
-POINTS = 30  # fault points of each journey that are tried; `make hunt` tries all
+POINTS = 30  # about so many faults of each journey are tried; `make hunt` tries all
 USUAL = Habits()
-LEAVE = (Habits(leaves=0.8), Habits(leaves=1.6, beacon=None))  # with a beacon, and without one
+LEAVE = (Habits(leaves=0.8), Habits(leaves=1.6, beacon=None))  # they close the lobby's page, with a beacon and without
 
 
 def rows() -> Iterator[Row]:
-    """Crowds, then faults, each with a row as soon as it is measured. About twenty minutes of one processor."""
+    """Measure crowds, then faults; about twenty minutes of one processor."""
     with quiet():
         yield from each([crowds, faults_of_groups])
 
 
 @dataclass(frozen=True)
 class Together:
-    """How it went for those who came. Times are virtual seconds."""
+    """The outcome of a crowd. Times are virtual seconds."""
 
     world: SimulatedWorld
     came: Sequence[SimulatedMember]
-    seconds: float  # that the simulation took
+    seconds: float  # of real time that the simulation took
 
     @property
     def project(self) -> Project:
@@ -62,30 +62,30 @@ class Together:
 
     @property
     def wrong(self) -> list[str]:
-        """Sessions whose members are split, or that are merged, and ghosts."""
+        """The faults of the sessions, as `session_checks.wrong` finds them."""
         return session_checks.wrong(self.world.platform.documents.kept, self.project, self.came)
 
     @property
     def waits(self) -> list[float]:
-        """From the lobby to the first picture, of those who saw one."""
+        """From the lobby to the first picture, of the participants who saw one."""
         seen = [(one.lobby, one.first_picture) for one in self.came]
         return [picture - came for came, picture in seen if came is not None and picture is not None]
 
     @property
     def matched(self) -> list[float]:
-        """From the lobby until their page says that they are matched, or unmatched."""
+        """From the lobby until the page says that the participant is matched, or unmatched."""
         return [one.matched - one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
 
     @property
     def alone(self) -> list[float]:
-        """What AWS alone would take for those who stay."""
+        """How long the participants who stayed in the lobby would wait with AWS alone."""
         asked = [one.visit.asked for one in self.came if one.visit.asked is not None]
         there = [one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
         return aws_alone_together(asked, there, self.project.players, self.world.clock.seed, self.world.conditions)
 
     @property
     def at_best(self) -> list[float]:
-        """With servers that are ready when these were: each at once for the next session, in the order of arrival."""
+        """How long they would wait if each ready server went to the next session at once, in the order of arrival."""
         found = (from_json(body, Server) for key, (body, _, _) in self._kept.items() if key.startswith(RECORDS))
         ready = sorted((one.ready - EPOCH).total_seconds() for one in found if one.ready)
         there = sorted(one.lobby for one in self.came if one.lobby is not None and one.matched is not None)
@@ -108,7 +108,7 @@ def crowd(
     within: float = WITHIN,
     seed: int = SEED,
 ) -> Together:
-    """So many participants who come within so many seconds, until all of them are through."""
+    """Simulate so many participants who come within so many seconds, until nothing is left, or for HOURS at most."""
     begun = time.perf_counter()
     world = SimulatedWorld(seed, conditions, project)
     came = [SimulatedMember(world, number, habits=habits(number)) for number in range(people)]
@@ -119,7 +119,7 @@ def crowd(
 
 
 def crowds() -> Iterator[Row]:
-    """1,000 participants in a minute as pairs; as many a second as fours, and where something goes wrong."""
+    """Measure 1,000 participants within a minute as pairs; then smaller crowds, as fours and under worse conditions."""
     usual = crowd(PAIRS)
     yield from judged("in pairs", usual)
     yield from costs(usual)
@@ -137,17 +137,17 @@ def smaller(
     habits: Callable[[int], Habits] = lambda number: USUAL,
     seed: int = SEED,
 ) -> Together:
-    """A crowd of a third as many in a third of the time."""
+    """Simulate a crowd of a third of the size in a third of the time."""
     return crowd(project, conditions, habits, people=SMALLER, within=SMALLER_WITHIN, seed=seed)
 
 
 def spreads(waits: Sequence[float], alone: Sequence[float]) -> dict[str, list[float]]:
-    """How waits are spread, beside those with AWS alone, for the detail of a row."""
+    """Return the quantiles of the waits and of those with AWS alone, for the details of a row."""
     return {"p50, p95, max": spread(waits), "AWS alone p50, p95, max": spread(alone)}
 
 
 def waits_of(crowds: Sequence[Together]) -> Row:
-    """How long participants of several crowds waited, together."""
+    """Return the row of the waits of several crowds together."""
     waits = [wait for one in crowds for wait in one.waits]
     alone = [wait for one in crowds for wait in one.alone]
     return row(
@@ -169,14 +169,17 @@ def waits_of(crowds: Sequence[Together]) -> Row:
 
 
 def one_in_ten_leaves(number: int) -> Habits:
-    """Half of those who leave close the page without a beacon."""
+    """Let one member in ten leave the lobby; half of these close the page without a beacon."""
     return USUAL if number % 10 else LEAVE[number // 10 % 2]
 
 
 def judged(how: str, found: Together) -> Iterator[Row]:
-    """All are matched or told, no session is split or merged, nothing is left; and how long they waited."""
+    """Yield the rows of a crowd: the share that finishes or is told why not, and the waits.
+
+    The share is 0 if a session is split or merged, or if anything is left.
+    """
     world, came = found.world, found.came
-    left = {what: count for what, count in world.left().items() if count}
+    left = {kind: count for kind, count in world.left().items() if count}
     ended = Counter("played to the end" if one.visit.finished is not None else one.visit.told for one in came)
     well = 100 * sum(faults.served_or_told(one.visit) for one in came) / len(came)
     sizes = Counter(len(one.members) for one in lobby.formed(world.platform.documents.kept, found.project))
@@ -186,7 +189,7 @@ def judged(how: str, found: Together) -> Iterator[Row]:
         f"{name}: share that plays to the end or is told; 0 if groups are split or merged, or anything is left",
         0.0 if left or found.wrong else well,
         "%",
-        bound="all participants; no group is split or merged, none is matched with a participant who has gone",
+        bound="all participants; no group is split or merged, and no participant is matched who has gone",
         at_least=100,
         detail={
             "how it ended for them": dict(ended),
@@ -195,7 +198,7 @@ def judged(how: str, found: Together) -> Iterator[Row]:
             "left behind": left or "nothing",
             "servers that Spot took": sum(task.interrupted for task in world.platform.tasks.tasks.values()),
             "simulated in": f"{found.seconds:.0f} s",
-            **{f"assumed: {of}": text for of, text in assumed(world.conditions).items()},
+            **{f"assumed: {thing}": text for thing, text in assumed(world.conditions).items()},
         },
     )
     waits, alone = found.waits, found.alone
@@ -213,7 +216,7 @@ def judged(how: str, found: Together) -> Iterator[Row]:
 
 
 def costs(found: Together) -> Iterator[Row]:
-    """What the lobby costs for each who waits there."""
+    """Yield the rows of the lobby's calls and costs per participant."""
     world, people, calls = found.world, len(found.came), found.world.cloud.lobby_calls
     yield row(
         "calls of S3 about the lobby and the session, per participant of these pairs",
@@ -221,14 +224,14 @@ def costs(found: Together) -> Iterator[Row]:
         "calls",
         detail={
             **{action: count / people for action, count in calls.items()},
-            "questions of the lobby's page": sum(one.polls for one in found.came) / people,
-            "writes of the lobby's document that met another, in all": world.cloud.conflicts[
+            "polls of the lobby's page": sum(one.polls for one in found.came) / people,
+            "writes of the lobby's document that were refused, in all": world.cloud.conflicts[
                 decisions.key(found.project.id)
             ],
         },
     )
     yield row(
-        "cost of these calls and of the lobby's questions per participant",
+        "cost of these calls and of the lobby's polls per participant",
         lobby_cost(calls, sum(one.polls for one in found.came), Prices()) / people,
         "$",
         detail={"left out": "the seconds of next_step, which rows of `scale` count"},
@@ -236,14 +239,14 @@ def costs(found: Together) -> Iterator[Row]:
 
 
 def lobby_cost(calls: Mapping[str, int], polls: int, prices: Prices) -> float:
-    """US dollars of requests."""
+    """Return the US dollars for these calls of S3, and for so many polls of `next_step`."""
     writes = calls.get("s3:PutObject", 0) + calls.get("s3:ListObjectsV2", 0)
     requests = prices.http_request.usd + prices.lambda_request.usd
     return calls.get("s3:GetObject", 0) * prices.s3_read.usd + writes * prices.s3_write.usd + polls * requests
 
 
 def faults_of_groups() -> Iterator[Row]:
-    """A crash before, after and with the lost reply of calls of each journey of a session."""
+    """Run each journey of sessions with a sample of its faults."""
     tried, bad, detail = 0, 0, dict[str, Any]()
     for journey in faults.JOURNEYS_OF_GROUPS:
         points = faults.points(journey, SEED)
@@ -257,7 +260,7 @@ def faults_of_groups() -> Iterator[Row]:
 
 
 def judged_faults(bad: int) -> Row:
-    """The row of those that did harm."""
+    """Return the row of the faults that did harm."""
     return row(
         "fault points of groups that strand a participant, leave something behind, or split or merge a group",
         bad,

@@ -1,5 +1,7 @@
-"""What `apply` takes on the emulator: the first one, and one that finds nothing to do. Real AWS takes minutes for the
-first; what is measured is our own share, and that the second makes no change set."""
+"""Measures how long `apply` takes on the emulator: the first time, and again when there is nothing to change.
+
+Real AWS takes minutes for the first one; here our own code is measured, with what the emulator takes.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,12 @@ RUNS = 3
 
 
 def rows() -> Iterator[Row]:
-    """One installation, applied once and then again; half a minute."""
+    """Measure one installation; about half a minute."""
     yield from each([applies])
 
 
 def applies() -> Iterator[Row]:
-    """Seconds of the whole command, Python's start included."""
+    """Measure the seconds of the whole command, with the start of Python."""
     venv = find_venv()
     if venv is None:
         raise RuntimeError("the emulator is not installed: `make bench` makes .venv-ministack")
@@ -47,5 +49,5 @@ def _apply(world: MinistackWorld, *options: str) -> float:
 
 
 def _within(world: MinistackWorld) -> float:
-    """Seconds that the command itself says a run without changes took."""
+    """Return the seconds that the command itself reports of a run without changes."""
     return float(json.loads(world.deploy("apply", "--json").out)["seconds"])

@@ -1,4 +1,4 @@
-"""The example study on moto, with its real pages, and a participant who goes through it; AWS calls are counted."""
+"""The example study on moto with its real pages, and a participant who goes through it, whose AWS calls are counted."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ANSWERS: Mapping[str, Mapping[str, object]] = {
 
 
 class AgingPlatform(AwsPlatform):
-    """AWS on a clock that the bench moves, so that the functions' caches are as fresh or stale as it says."""
+    """AWS on a clock that the bench moves, so that the bench decides whether the functions' caches are stale."""
 
     def __init__(self, env: Mapping[str, str]) -> None:
         super().__init__(env)
@@ -51,13 +51,16 @@ class AgingPlatform(AwsPlatform):
 
 
 class MeasuredStudy:
-    """The example project in an AWS account on moto, and its functions, each with a memory (its caches) of its own."""
+    """The example project in an AWS account on moto, and its functions, each with caches of its own.
+
+    `registration` is used instead of the example project's. Raises RuntimeError if the study cannot be registered.
+    """
 
     def __init__(self, world: MotoWorld, registration: Mapping[str, Any] | None = None) -> None:
         self.world = world
         self.platform = AgingPlatform(world.env)
-        self.calls: dict[str, list[ApiCall]] = {}
-        self._memory: dict[str, dict[Any, Any]] = {}
+        self.calls: dict[str, list[ApiCall]] = {}  # by function
+        self._caches: dict[str, dict[Any, Any]] = {}  # by function
         installed.use(self.platform)
         project = dict(registration) if registration else read_project(ROOT).registration()
         self.id = str(project["id"])
@@ -75,9 +78,12 @@ class MeasuredStudy:
         self.world.client("s3").put_object(Bucket=self.world.env["BUCKET"], Key=key, Body=body)
 
     def invoke(self, function: ModuleType, event: Mapping[str, Any]) -> dict[str, Any]:
-        """Run a function as Lambda would, on its own caches, and write down its AWS calls."""
+        """Run a function with its own caches, and note its AWS calls; return its answer.
+
+        Raises RuntimeError if a message of the batch fails, or if the status is 400 or more.
+        """
         name = function.__name__.rpartition(".")[2]
-        installed._made = self._memory.setdefault(name, {})  # each function is a process of its own
+        installed._made = self._caches.setdefault(name, {})  # each function is a process of its own
         with self.world.recording() as calls:
             answer: dict[str, Any] = function.handler(dict(event), None)
         self.calls.setdefault(name, []).extend(calls)
@@ -86,15 +92,16 @@ class MeasuredStudy:
         return answer
 
     def play(self, user: str, step: str = "3") -> None:
-        """The trial is done: it has written the answer of the game step."""
+        """Store the answer of the game step, as the trial does at its end."""
         self.upload(answer_key(self.id, user, step), b'{"step": "3", "answers": {"score": 120}}')
 
     def wait(self, time: timedelta) -> None:
+        """Move the clock."""
         self.platform.clock += time
 
 
 class MeasuredBrowser:
-    """A participant's browser: opens the link, sends forms, follows redirects. Notes what each request cost."""
+    """A participant's browser: it opens the link and sends forms. `costs` has the AWS calls of each request."""
 
     def __init__(self, study: MeasuredStudy, user: str) -> None:
         self.study, self.user = study, user
@@ -103,11 +110,11 @@ class MeasuredBrowser:
         self.step = ""
 
     def open(self) -> dict[str, Any]:
-        """The link, as the function answers it."""
+        """Open the link; return the function's answer."""
         return self._send("GET", http_event("GET", self.query))
 
     def get(self, more: str = "", accept: str = "text/html,application/xhtml+xml") -> str:
-        """A page, or with `more` in the query what else there is."""
+        """Load the page; or with `more` in the query, poll. Return the body."""
         event = http_event("GET", self.query + more, accept=accept)
         page = body_of(self._send(f"poll at step {self.step}" if more else "GET", event)).decode()
         if not more:
@@ -116,7 +123,7 @@ class MeasuredBrowser:
         return page
 
     def post(self, page: str, answers: Mapping[str, object]) -> None:
-        """Submit the page's form; the redirect is followed with `get`."""
+        """Submit the page's form with these answers. The caller follows the redirect with `get`."""
         body = urlencode({**hidden(page), **answers})
         self._send(f"POST step {self.step}", http_event("POST", self.query, body))
 
@@ -130,7 +137,7 @@ class MeasuredBrowser:
 def http_event(
     method: str, query: str, body: str | None = None, accept: str = "text/html,application/xhtml+xml"
 ) -> dict[str, Any]:
-    """A request as an HTTP API hands it to its function (payload format 2.0), with a browser's usual headers."""
+    """Return a request with a browser's usual headers, as an HTTP API passes it on (payload format 2.0)."""
     headers = {
         "accept": accept,
         "accept-encoding": "gzip, deflate, br, zstd",
@@ -163,11 +170,11 @@ def http_event(
 
 @contextlib.contextmanager
 def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[MeasuredStudy]:
-    """The study in a fresh account; what the functions log is not shown."""
-    quiet = io.StringIO()
+    """Make the study in a new account for the block. The functions' logs are not shown."""
+    discarded = io.StringIO()
     handler = logger.registered_handler
     assert isinstance(handler, logging.StreamHandler)
-    before = handler.setStream(quiet)
+    before = handler.setStream(discarded)
     try:
         with MotoWorld(enforce=False) as world:
             yield MeasuredStudy(world, registration)
@@ -181,10 +188,11 @@ def on_moto(registration: Mapping[str, Any] | None = None) -> Iterator[MeasuredS
 
 
 def travel(study: MeasuredStudy, user: str, pause: timedelta = timedelta()) -> MeasuredBrowser:
-    """One participant from the link until nothing of them is left but their data.
+    """Take a participant from the link to the end, until only their data are left; return their browser.
 
-    `pause` passes before each thing they do. The server starts while they fill in the questionnaire; the waiting page
-    asks once. As in Route 53, a change of names is PENDING when it is first asked for, and in sync the second time.
+    `pause` passes before each of their actions. The server starts while they fill in the questionnaire; the waiting
+    page polls once. A DNS change is PENDING at the first look, and in sync at the second. Raises RuntimeError if
+    anything else is left.
     """
     world, browser = study.world, MeasuredBrowser(study, user)
     study.wait(pause)
@@ -220,7 +228,7 @@ def travel(study: MeasuredStudy, user: str, pause: timedelta = timedelta()) -> M
 
 
 def warm(study: MeasuredStudy) -> None:
-    """Others have been there before the one that is measured: every function has project and pages in its cache."""
+    """Take other participants through the study first, so that every function has project and pages in its cache."""
     for n in range(6):
         travel(study, f"before-{n}")
     study.calls.clear()

@@ -1,4 +1,4 @@
-"""Rows of measurements: how they are made, shown and kept."""
+"""Makes, prints and stores the rows of measurements."""
 
 from __future__ import annotations
 
@@ -29,14 +29,16 @@ def row(
     bound: str = "",
     detail: Mapping[str, Any] | None = None,
 ) -> Row:
-    """One measurement. A goal (one of `at_most` and `at_least`) is about the ratio where there is a yardstick, unless
-    `judge` is "value"; without one, it is about the value.
+    """Return the row of one measurement.
 
-    Only a goal about a ratio makes a row *compared*. A goal about a value is a bound, even if a yardstick stands beside
-    it, and `bound` says whose: a promise of the documentation or a limit of AWS. A row without a goal is information
-    and says so. `detail` is printed below the table.
+    The goal is `at_most` or `at_least`. It is about the ratio of the value to the yardstick; without a yardstick, or if
+    `judge` is "value", it is about the value.
 
-    Raises ValueError if a goal cannot be judged: a bound that is nobody's, or a ratio to a yardstick of 0.
+    Only a goal about a ratio makes a row *compared*. A goal about a value makes it a *bound*, even if there is a
+    yardstick; then `bound` must say whose bound it is: a promise of the documentation or a limit of AWS. A row without
+    a goal is *information*. `detail` is printed below the table.
+
+    Raises ValueError if the goal cannot be judged: if `bound` is missing, or if the yardstick of the ratio is 0.
     """
     ratio = value / yardstick if yardstick else None
     about_ratio = judge == "ratio" and yardstick is not None
@@ -61,36 +63,36 @@ def row(
         "met": met,
         "kind": INFORMATION if met is None else COMPARED if about_ratio else BOUND,
     }
-    told = {**({"bound": bound} if bound else {}), **(detail or {})}
-    return {**made, "detail": told} if told else made
+    details = {**({"bound": bound} if bound else {}), **(detail or {})}
+    return {**made, "detail": details} if details else made
 
 
 def unmeasured(name: str, error: BaseException) -> Row:
-    """The row of something that could not be measured, and why."""
+    """Return the row of a measure that has failed, with the error."""
     why = "".join(traceback.format_exception(error)).rstrip()
     empty = dict.fromkeys(("value", "yardstick", "ratio", "goal", "met", "kind"))
     return {"name": name, "unit": "", **empty, "error": why}
 
 
 def each(measures: Iterable[Measure]) -> Iterator[Row]:
-    """The rows of all measures; one that fails becomes a row that says so, and the others go on."""
+    """Yield the rows of all measures. A measure that fails becomes a row with its error, and the others go on."""
     for measure in measures:
         try:
             yield from measure()
-        except Exception as error:  # noqa: BLE001 - whatever it was, the other measures go on
+        except Exception as error:  # noqa: BLE001 - whatever the error, the other measures go on
             yield unmeasured(measure.__name__.replace("_", " "), error)
 
 
 def measured(found: Mapping[str, Any]) -> bool:
-    """Whether a row holds a figure."""
+    """Return whether a row holds a figure."""
     return found.get("value") is not None
 
 
-# Showing
+# Printing
 
 
 def number(value: Any) -> str:
-    """A figure as people read it: three digits that count."""
+    """Write a figure for people: three significant digits; no decimals from 1,000 on, and for whole numbers."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -103,14 +105,14 @@ def number(value: Any) -> str:
 
 
 def line(found: Mapping[str, Any]) -> str:
-    """A row in one line, for the progress."""
+    """Write a row in one line, for the progress."""
     if not measured(found):
         return f"{found.get('name')}: could not be measured"
     return f"{found['name']}: {number(found['value'])} {found['unit']}"
 
 
 def show(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Print the table, what stands behind single rows, the goals that are missed, and what could not be measured."""
+    """Print the table, the details of the rows, the goals that are missed, and what could not be measured."""
     table = Table(title="Measured here and now", title_justify="left")
     table.add_column("what", ratio=1)
     for heading in ("value", "yardstick", "ratio", "goal"):
@@ -163,16 +165,16 @@ def _plain(value: Any) -> str:
     return number(value)
 
 
-# Keeping
+# Storing
 
 
 def keep(rows: Sequence[Row], file: Path = RESULTS) -> None:
-    """Write the rows; of groups that were not measured now, those of earlier runs stay."""
+    """Write the rows to the file. The rows of groups that were not measured now stay."""
     groups = {found.get("group") for found in rows}
     try:
-        before = json.loads(file.read_text(encoding="utf-8"))
+        stored = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        before = []
-    others = [r for r in before if isinstance(r, dict) and r.get("group") not in groups]
+        stored = []
+    others = [r for r in stored if isinstance(r, dict) and r.get("group") not in groups]
     ordered = sorted([*others, *rows], key=lambda found: str(found.get("group")))
     file.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

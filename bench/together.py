@@ -1,8 +1,8 @@
-"""Games of several participants on real servers, and in a real Chromium: `python -m bench together`.
+"""Measures games of several participants on real servers, and in a real Chromium: `python -m bench together`.
 
-The game costs next to nothing, so that the server is measured: players on a board, drawn by objects, 30 ticks a second.
-Clients are sockets that acknowledge pictures as our page does and press keys. What participants see is timed in their
-pages, by their own clocks.
+The game itself takes hardly any time, so the figures are those of the server: players on a board, drawn by objects, 30
+ticks a second. Clients are sockets that acknowledge pictures as our page does, and press keys. In the browsers, pages
+time what participants see, by their own clocks.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from protocol.session import Member, SessionDocument, member_token
 from testing.browser import chromium, game_page
 
 RATE = load.RATE  # ticks a second
-GAMES = 40  # of two that one core has to hold
+GAMES = 40  # games of two that one core has to serve
 MOST_WAIT = 1_000 / RATE + 5
-"""Milliseconds from a key to its effect, the median: one tick and 5 ms."""
+"""The goal of the median time from a key to its effect, in milliseconds: one tick and 5 ms."""
 PLAYERS = tuple(f"player_{number}" for number in range(8))
 ACTIONS = ("wait", "up", "right", "down", "left")
 SESSION, TOKEN = "s." + 20 * "0", "bench"
 SCENE = {"width": 600, "height": 400}
 
-# A block for each player shows whether their "left" acts; the text is the tick.
+# A block for each player shows whether the player's action is "left"; the text is the number of the tick.
 AGENT = """
 class Agent:
     possible_agents = PLAYERS
@@ -75,8 +75,8 @@ class Agent:
         pass
 """
 
-# Notes each draw with its tick, which the text says and which is drawn last; and from a key until the participant's
-# own block shows it.
+# Notes each draw and its tick, which is the text that is drawn last; and the ms from a key event until the
+# participant's own block shows it.
 WATCH = """(() => {
   const seat = %d, { fillText } = CanvasRenderingContext2D.prototype;
   benchSeen.ticks = [];
@@ -97,21 +97,22 @@ WATCH = """(() => {
 
 @dataclass
 class TogetherLoad:
-    """What one server delivered and cost. `cpu` is ms for each tick, `memory` MB."""
+    """What one server delivered and cost. `cpu` is in ms per tick, `memory` in MB."""
 
-    shares: list[float]  # of the ticks that were due, by member
+    shares: list[float]  # by member: the share of the ticks that were due
     bytes_a_tick: float  # to each member
     cpu: float
     memory: float
 
 
 def members(players: int) -> list[str]:
+    """Return the ids of so many members."""
     return [f"p{number}" for number in range(players)]
 
 
 @contextlib.contextmanager
 def server(players: int) -> Iterator[tuple[str, int]]:
-    """A running server of a session with so many members: its address and process id."""
+    """Run the server of a session with so many members within the block; give its address and process id."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as store:
         Path(folder, "agent.py").write_text(f"PLAYERS = {list(PLAYERS[:players])}\n{AGENT}", encoding="utf-8")
         trial = {
@@ -121,7 +122,7 @@ def server(players: int) -> Iterator[tuple[str, int]]:
             "startingFrameRate": RATE,
             "scene": SCENE,
             "countdown": 0,
-            "gather": 3600,  # while dozens of servers start, clients of one game may come far apart
+            "gather": 3600,  # while dozens of servers start, the clients of one game may come far apart
             "maxEpisodes": 1000,
         }
         document = SessionDocument(
@@ -135,7 +136,7 @@ def server(players: int) -> Iterator[tuple[str, int]]:
 
 
 async def play(user: str, url: str, count: load.Count) -> None:
-    """Play as this member until it is cancelled."""
+    """Play as this member until the task is cancelled."""
     keys = random.Random(user)
     async with connect(
         url, subprotocols=[Subprotocol("hippodrome.3")], max_size=None, compression=None, open_timeout=60
@@ -153,7 +154,7 @@ async def play(user: str, url: str, count: load.Count) -> None:
 
 
 async def played(servers: Sequence[tuple[str, int]], players: int) -> list[TogetherLoad]:
-    """Play on all of these servers at once; what each delivered and cost."""
+    """Play on all of these servers at once; return what each delivered and cost."""
     found = await load.delivered(servers, [partial(play, user) for user in members(players)])
     return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
 
@@ -169,7 +170,7 @@ def _played(pid: int, found: load.Delivered) -> TogetherLoad:
 
 
 def on_sockets() -> Iterator[Row]:
-    """What one game delivers to each of two and of eight participants, and costs."""
+    """Measure one game of two participants and one of eight."""
     for players in (2, 8):
         with server(players) as one:
             (found,) = asyncio.run(played([one], players))
@@ -177,7 +178,7 @@ def on_sockets() -> Iterator[Row]:
 
 
 def judged_game(players: int, found: TogetherLoad) -> Iterator[Row]:
-    """The rows of one game."""
+    """Yield the rows of one game."""
     yield row(
         f"ticks delivered at {RATE}/s to each of {players} participants in one game",
         min(found.shares),
@@ -190,27 +191,27 @@ def judged_game(players: int, found: TogetherLoad) -> Iterator[Row]:
 
 
 def one_core() -> Iterator[Row]:
-    """How many games of two one core holds, and the memory of each."""
+    """Measure many games of two on one core, and the memory of each."""
     with (
         contextlib.ExitStack() as running,
         ThreadPoolExecutor(
             4, initializer=os.sched_setaffinity, initargs=(0, {max(os.sched_getaffinity(0))})
         ) as starting,
-    ):  # a process begins on the cores of the thread that starts it
+    ):  # a process inherits the cores of the thread that starts it
         servers = list(starting.map(lambda _: running.enter_context(server(2)), range(GAMES)))
         found = asyncio.run(played(servers, 2))
     yield from judged_core(found)
 
 
 def judged_core(found: Sequence[TogetherLoad]) -> Iterator[Row]:
-    """The rows of games that share a core."""
+    """Yield the rows of games that share a core."""
     cpu = statistics.mean(one.cpu for one in found)
     yield row(
         f"ticks delivered at {RATE}/s to both participants of {len(found)} games on one core",
         statistics.mean(share for one in found for share in one.shares),
         "of those due",
         at_least=0.99,
-        bound="ours: one core holds so many games of two",
+        bound="ours: one core serves so many games of two",
         detail={
             "of the participant who got least": min(min(one.shares) for one in found),
             "server's CPU per tick, ms": cpu,
@@ -233,19 +234,19 @@ def judged_core(found: Sequence[TogetherLoad]) -> Iterator[Row]:
 class PairSeen:
     """What two participants saw. Times are milliseconds."""
 
-    shares: list[float]  # of the ticks that were due, by participant
-    waits: list[list[float]]  # from a key to its effect, by participant
-    apart: list[int]  # at each draw of either: how many ticks lie between what the two show
+    shares: list[float]  # by participant: the share of the ticks that were due
+    waits: list[list[float]]  # by participant: the times from a key event to its effect
+    apart: list[int]  # at each draw in either page: how many ticks lie between the pictures of the two pages
 
 
 def in_two_browsers() -> Iterator[Row]:
-    """Two participants of one game, each in a browser's context of their own. Raises NoChromium."""
+    """Measure two participants of one game, each in a browser context of their own. Raises NoChromium."""
     with chromium() as browser:
         yield from judged_views(look(browser))
 
 
 def look(browser: Any) -> PairSeen:
-    """Let both watch; then each presses keys."""
+    """Let both participants watch the game, then let each press keys; return what they saw."""
     with server(2) as (url, pid), contextlib.ExitStack() as opened:
         pages = []
         for seat, user in enumerate(members(2)):
@@ -272,9 +273,9 @@ def look(browser: Any) -> PairSeen:
 
 
 def apart(one: Sequence[Sequence[float]], other: Sequence[Sequence[float]]) -> list[int]:
-    """At each draw of either page, how many ticks lie between what the two show. A draw is its ms and its tick.
+    """Return, at each draw of either page, how many ticks lie between the pictures of the two.
 
-    Before both have drawn, nothing can be said.
+    A draw is its ms and its tick. Draws before both pages have drawn are left out.
     """
     shown: list[int | None] = [None, None]
     found = []
@@ -286,7 +287,7 @@ def apart(one: Sequence[Sequence[float]], other: Sequence[Sequence[float]]) -> l
 
 
 def judged_views(found: PairSeen) -> Iterator[Row]:
-    """The rows of what two participants saw."""
+    """Yield the rows of what two participants saw."""
     yield row(
         f"ticks drawn at {RATE}/s in each of two browsers",
         min(found.shares),
@@ -299,7 +300,7 @@ def judged_views(found: PairSeen) -> Iterator[Row]:
         max(found.apart),
         "ticks",
         at_most=1,
-        bound="ours: both participants see the game at the same time",
+        bound="ours: both participants see the same tick, but for one",
         detail={"draws": len(found.apart), "of them further apart": sum(each > 1 for each in found.apart)},
     )
     for number, waits in enumerate(found.waits, 1):

@@ -1,8 +1,8 @@
-"""What a trial server delivers and costs: `python -m bench.trial`.
+"""Measures what a trial server delivers and costs: `python -m bench.trial`.
 
-Every figure is measured here and now. The yardstick of the encoding is HIPPO's (Pillow's JPEG, base64, JSON) on the
-very same frames. What a participant sees is measured in a real Chromium; its yardstick is the least that could answer a
-key with a picture (`bench/bare.py`), in the same browser and run. One script times both pages (`bench/seen.py`).
+The yardstick of the encoding is HIPPO's (Pillow's JPEG, base64, JSON) on the same frames. What a participant sees is
+measured in a real Chromium; its yardstick is the simplest server that answers a key with a picture (`bench/bare.py`),
+in the same browser and run. The same script times both pages (`bench/seen.py`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trial.pictures.frames import DIFFERENCE, JPEG, KEY, Decoder, Frame, jpeg_me
 
 ROUNDS = 3  # of each measurement of processor time; the quickest counts
 IDLE_SECONDS = 5.0
-RATES = (30, 60)
+RATES = (30, 60)  # frames a second
 PRESSED_AT = 30  # frames a second while keys are pressed
 
 
@@ -30,10 +30,10 @@ PRESSED_AT = 30  # frames a second while keys are pressed
 
 
 def encoding() -> Iterator[Row]:
-    """Bytes and processor time of each kind of picture, ours beside HIPPO's."""
+    """Measure bytes and processor time for each kind of picture, ours beside HIPPO's."""
     for kind, make in pictures.KINDS.items():
         frames = make()
-        # Ms. Pac-Man, which every frame of ours shows exactly, has a stricter goal than what holds for all pictures.
+        # The goal for Ms. Pac-Man, of which all frames arrive unchanged, is stricter than that for other pictures.
         flat = kind.startswith("Ms.")
         theirs, their_bytes, _ = cost(frames, None)
         ours, our_bytes, sent = cost(frames, Encoder(lossy=True))
@@ -66,9 +66,9 @@ _NAMES = {KEY: "key frames", DIFFERENCE: "differences", JPEG: "JPEGs"}
 
 
 def cost(frames: Sequence[Frame], encoder: Encoder | None) -> tuple[float, float, list[bytes]]:
-    """Processor ms and bytes per frame, and the frames; HIPPO's without `encoder`."""
+    """Encode the frames, in HIPPO's way without `encoder`; return ms CPU and bytes per frame, and the messages."""
     pack = encoder.encode if encoder is not None else lambda frame, number: jpeg_message(frame, number).encode()
-    jpeg_message(frames[0], 0)  # imports happen outside the measurement
+    jpeg_message(frames[0], 0)  # so that its imports are not measured
     took = []
     sent: list[bytes] = []
     for turn in range(ROUNDS):
@@ -81,7 +81,7 @@ def cost(frames: Sequence[Frame], encoder: Encoder | None) -> tuple[float, float
 
 
 def unchanged(frames: Sequence[Frame], sent: Sequence[bytes]) -> float:
-    """The share of the frames that are the same on arrival."""
+    """Return the share of the frames that are unchanged after decoding."""
     decoder = Decoder()
     return float(
         np.mean([np.array_equal(decoder.decode(data)[1], frame) for data, frame in zip(sent, frames, strict=True)])
@@ -92,7 +92,7 @@ def unchanged(frames: Sequence[Frame], sent: Sequence[bytes]) -> float:
 
 
 def in_chromium() -> Iterator[Row]:
-    """What participants see, drawn by the browser. Raises NoChromium."""
+    """Measure what participants see. Raises NoChromium."""
     with chromium() as browser:
         for picture in seen.AGENTS:
             yield from _seen(
@@ -120,12 +120,12 @@ def _seen(picture: str, ours: seen.Seen, bare: seen.Seen) -> Iterator[Row]:
         yield row(
             f"server's CPU per drawn frame at {rate}/s, {picture}, game and recording included", ours.cpu[rate], "ms"
         )
-    for name, of in (("p50", statistics.median), ("p95", _p95)):
+    for name, quantile in (("p50", statistics.median), ("p95", _p95)):
         yield row(
             f"key to drawn effect at {PRESSED_AT}/s, {picture}, {name}, against a bare server",
-            of(ours.waits),
+            quantile(ours.waits),
             "ms",
-            yardstick=of(bare.waits),
+            yardstick=quantile(bare.waits),
             at_most=1.25,
             detail={
                 "presses": len(ours.waits),
@@ -145,7 +145,7 @@ def _p95(waits: Sequence[float]) -> float:
 
 
 def waiting() -> Iterator[Row]:
-    """What a server costs to which no participant is connected."""
+    """Measure a server to which no participant is connected."""
     with seen.server(pictures.ROOT) as (_, pid):
         time.sleep(3.0)
         before = seen.cpu_seconds(pid)
@@ -155,13 +155,13 @@ def waiting() -> Iterator[Row]:
 
 
 def judged_idle(share: float) -> Row:
-    """The row of a server without a participant: the share of a core that it takes."""
+    """Return the row of a server without a participant, with its share of a core."""
     return row(
         "CPU with nobody connected",
         100 * share,
         "% of a core",
         at_most=1,
-        bound="ours: a warm server costs next to nothing beside its memory",
+        bound="ours: a warm server needs hardly any processor time",
     )
 
 

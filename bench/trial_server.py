@@ -1,4 +1,4 @@
-"""A real trial server as a process of this machine, for the groups that measure one."""
+"""Runs a real trial server as a process of this machine, for the groups that measure it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ def trial_server(
     inherited: Mapping[str, str] = os.environ,
     **variables: str,
 ) -> Iterator[tuple[int, subprocess.Popen[bytes]]]:
-    """A running trial server: its port and its process.
+    """Run a trial server within the block; give its port and its process.
 
-    `variables` are added to its environment: `USER_ID` or `SESSION`, and any that is to be another than here.
+    `trial` is the section of config.yml, `store` the folder or address of its recordings. `variables` are added to its
+    environment: `USER_ID` or `SESSION`, and all that differ from those here.
     """
     env = {
         **inherited,

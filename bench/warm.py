@@ -1,4 +1,4 @@
-"""Servers that are kept warm (`warmServers`) and none: on the simulated account, and for real in local mode."""
+"""Compares a study with warm servers (`warmServers`) and one without, on the simulated account and in local mode."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from deploy.cost import estimate
 from deploy.cost.prices import Prices
 from hippodrome.model import ids, server, warm_pool
 from testing.quiet_log import quiet
-from testing.simulation.people import SimulatedParticipant
+from testing.simulation.people import POLLS, SimulatedParticipant
 from testing.simulation.world import PROJECT, SimulatedWorld
 from testing.visitors import hidden
 
 WARM = 10  # servers
-OPENS, HOUR = 300.0, 3600.0  # seconds from the registration to the first participant; for how long they come
+OPENS, HOUR = 300.0, 3600.0  # seconds until the first participant comes; seconds in which participants come
 GAPS = (10.0, 15.0)  # seconds between participants, uniform
 BURST, WITHIN = 40, 10.0  # participants, seconds
-CLOSES, ENDS = 5000.0, 7500.0  # when the study is closed, and when nothing may be left
-READS = 2.0  # seconds for a page: who reads for long would wait less
+CLOSES, ENDS = 5000.0, 7500.0  # the seconds at which the study is closed, and at which nothing may be left
+READS = 2.0  # seconds for a page; participants who read longer would wait less
 RUNS = 5  # participants in local mode, one after the other
-SETTLES = 2.0  # seconds from a warm server's `ready` until a participant comes: its agent has made its imports by then
-PATIENCE = 60.0  # seconds for any one thing in local mode
+SETTLES = 2.0  # seconds from a warm server's `ready` until a participant comes; by then its agent has made its imports
+PATIENCE = 60.0  # seconds to wait for any condition in local mode
 
 
 def rows() -> Iterator[Row]:
-    """A simulated hour and a simulated crowd, and a few participants for real; about a minute."""
+    """Measure a simulated hour, a simulated crowd, and a few participants in local mode; about a minute."""
     with quiet():
         yield from each([an_hour, a_burst, what_they_cost])
     yield from each([for_real])
@@ -56,17 +56,20 @@ def rows() -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class Came:
-    """How it went for those who came. Times are seconds, of each participant."""
+    """The outcome of a simulated study. Times are seconds, one for each participant."""
 
     world: SimulatedWorld
-    took_warm_server: float  # the share that was given a warm server
-    to_shown: list[float]  # from sending the answer that asks for the server until the page shows it
-    at_game: list[float]  # from the first sight of the game page until there is a server
+    took_warm_server: float  # the share of the participants who got a warm server
+    to_shown: list[float]  # from the answer that starts the server until the page has its address
+    at_game: list[float]  # from the first view of the game page until the page has the address
     calls: float  # of AWS, per participant
 
 
 def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends: float = ENDS) -> Came:
-    """Participants who come at these seconds to a study with so many warm servers, which is closed afterwards."""
+    """Simulate participants who come at these seconds to a study with so many warm servers, which closes at `closes`.
+
+    Raises RuntimeError if one of them did not come to a server before the second `ends`.
+    """
     world = SimulatedWorld(SEED, project=msgspec.structs.replace(PROJECT, warm_servers=warm))
     world.open()
     people = [SimulatedParticipant(world, number, read=READS) for number in range(len(arrivals))]
@@ -88,7 +91,7 @@ def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends
 
 
 def hour_of_arrivals() -> list[float]:
-    """When participants come who come one after the other."""
+    """Return the seconds at which participants come, one after the other for an hour."""
     chance, found = random.Random(SEED), [OPENS]
     while found[-1] < OPENS + HOUR:
         found.append(found[-1] + chance.uniform(*GAPS))
@@ -96,13 +99,13 @@ def hour_of_arrivals() -> list[float]:
 
 
 def an_hour() -> Iterator[Row]:
-    """The pool keeps up with those who come."""
+    """Compare an hour in which the pool can keep up with the participants."""
     arrivals = hour_of_arrivals()
     came, without = simulated(WARM, arrivals), simulated(0, arrivals)
-    what = f"{WARM} warm servers, a participant every {GAPS[0]:.0f} to {GAPS[1]:.0f} s for an hour"
-    yield from _compared(what, came, without, goal=0.1)
+    name = f"{WARM} warm servers, a participant every {GAPS[0]:.0f} to {GAPS[1]:.0f} s for an hour"
+    yield from _compared(name, came, without, goal=0.1)
     yield row(
-        f"{what}: API calls per participant, against none warm",
+        f"{name}: API calls per participant, against none warm",
         came.calls,
         "calls",
         yardstick=without.calls,
@@ -114,7 +117,7 @@ def an_hour() -> Iterator[Row]:
         },
     )
     yield row(
-        f"{what}: left when the study is closed",
+        f"{name}: left when the study is closed",
         sum(came.world.left().values()),
         "things",
         bound="no server outlives its study",
@@ -124,21 +127,20 @@ def an_hour() -> Iterator[Row]:
 
 
 def a_burst() -> Iterator[Row]:
-    """More come at once than servers wait."""
+    """Compare a crowd that is larger than the pool."""
     chance = random.Random(SEED)
     arrivals = [OPENS + chance.uniform(0, WITHIN) for _ in range(BURST)]
     came, without = simulated(WARM, arrivals), simulated(0, arrivals)
     yield from _compared(f"{WARM} warm servers, {BURST} participants within {WITHIN:.0f} s", came, without)
 
 
-def _compared(what: str, came: Came, without: Came, goal: float | None = None) -> Iterator[Row]:
-    took = f"{100 * came.took_warm_server:.0f} % were given a warm server"
+def _compared(name: str, came: Came, without: Came, goal: float | None = None) -> Iterator[Row]:
     for kind, mine, theirs in (
         ("asked for a server until the page shows it", came.to_shown, without.to_shown),
         ("wait at the game page", came.at_game, without.at_game),
     ):
         yield row(
-            f"{what}: {kind}, p50, against none warm",
+            f"{name}: {kind}, p50, against none warm",
             quantile(mine, 0.5),
             "s",
             yardstick=quantile(theirs, 0.5),
@@ -146,15 +148,19 @@ def _compared(what: str, came: Came, without: Came, goal: float | None = None) -
             detail={
                 "p50, p95, max": [quantile(mine, 0.5), quantile(mine, 0.95), max(mine)],
                 "none warm: p50, p95, max": [quantile(theirs, 0.5), quantile(theirs, 0.95), max(theirs)],
-                "who": took,
-                "they": f"read a page for {0.5 * READS:g} to {1.5 * READS:g} s",
-                **({f"assumed: {of}": text for of, text in assumed(came.world.conditions).items()} if goal else {}),
+                "participants who got a warm server": f"{100 * came.took_warm_server:.0f} %",
+                "participants read a page for": f"{0.5 * READS:g} to {1.5 * READS:g} s",
+                **(
+                    {f"assumed: {thing}": text for thing, text in assumed(came.world.conditions).items()}
+                    if goal
+                    else {}
+                ),
             },
         )
 
 
 def _waited(world: SimulatedWorld) -> float:
-    """Seconds that servers waited for a participant, in all."""
+    """Return the seconds for which all warm servers together existed before they were assigned or removed."""
     records = [
         json.loads(body) for key, (body, _, _) in world.platform.documents.kept.items() if _is_warm_server(key, body)
     ]
@@ -162,11 +168,11 @@ def _waited(world: SimulatedWorld) -> float:
 
 
 def _is_warm_server(key: str, body: bytes) -> bool:
-    return key.startswith("_servers/") and ids.is_warm_id(json.loads(body).get("userId"))
+    return key.startswith(server.RECORDS) and ids.is_warm_id(json.loads(body).get("userId"))
 
 
 def what_they_cost() -> Iterator[Row]:
-    """What is paid for readiness."""
+    """Compute the price of the warm servers while they wait."""
     prices = Prices()
     warm = estimate.warm(PROJECT.id, WARM, PROJECT.size.cpu, PROJECT.size.memory, prices)
     yield row(
@@ -178,7 +184,7 @@ def what_they_cost() -> Iterator[Row]:
     )
 
 
-# For real
+# In local mode
 
 
 CONFIG = """
@@ -198,7 +204,7 @@ trial:
 
 
 def write_study(folder: Path, warm: int) -> None:
-    """A page, the example's game with its agent, and the end."""
+    """Write a study with one page, the example's game with its agent, and a last page."""
     (folder / "steps").mkdir(parents=True)
     (folder / "config.yml").write_text(CONFIG.format(warm=warm))
     shutil.copy(ROOT / "agent.py", folder)
@@ -207,7 +213,10 @@ def write_study(folder: Path, warm: int) -> None:
 
 
 def in_local_mode(warm: int, participants: int) -> list[float]:
-    """Seconds from the form that asks for a server to the first picture, of participants one after the other."""
+    """Let participants come one after the other; return for each the seconds from the form to the first picture.
+
+    The form is the one that starts a server.
+    """
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name)
         write_study(folder, warm)
@@ -222,7 +231,7 @@ def in_local_mode(warm: int, participants: int) -> list[float]:
 
 
 def _wait_for_pool(data: Path, warm: int) -> None:
-    """Until so many servers wait."""
+    """Wait until so many servers are ready. Raises RuntimeError after PATIENCE."""
     pool, until = data / warm_pool.pool_key("warm"), time.monotonic() + PATIENCE
     while sum(one.get("ready", False) for one in _read(pool).get("spares", {}).values()) < warm:
         if time.monotonic() > until:
@@ -256,8 +265,8 @@ async def _to_first_picture(address: str, user: str) -> float:
             took = time.perf_counter() - begun
             await ws.send('{"command": "start"}')
             await ws.send('{"command": "stop"}')
-            async for said in ws:  # until the trial is over, so that it does not stand in the next one's way
-                if isinstance(said, str) and json.loads(said).get("done"):
+            async for message in ws:  # until the trial is over, so that it takes no time from the next participant
+                if isinstance(message, str) and json.loads(message).get("done"):
                     break
             return took
     finally:
@@ -265,7 +274,7 @@ async def _to_first_picture(address: str, user: str) -> float:
 
 
 def for_real() -> Iterator[Row]:
-    """`python -m local` with real trial processes."""
+    """Compare one warm server and none with `python -m local` and real trial processes."""
     warm, cold = in_local_mode(1, RUNS), in_local_mode(0, RUNS)
     yield row(
         "local mode: form that asks for a server to the first picture, 1 warm server, against none",
@@ -277,7 +286,7 @@ def for_real() -> Iterator[Row]:
             "each": warm,
             "none warm, each": cold,
             "the agent": "the example's; one that loads a model gains more",
-            "participants": f"{RUNS}, one after the other; the next comes {SETTLES:g} s after a server waits again",
-            "the page": "polls every 50 ms; a browser's looks every two seconds come on top of both",
+            "participants": f"{RUNS}, one after the other; the next comes {SETTLES:g} s after a server is ready again",
+            "the client": f"polls every 50 ms; a browser's page every {POLLS['first']:g} to {POLLS['longest']:g} s",
         },
     )
