@@ -17,7 +17,7 @@ LINES: Mapping[str, str] = {
     "site": "the domain leads to the site, served by API Gateway with ACM's certificate, and it says HSTS",
     "links": "a link without its signature, or with another's, is refused",
     "pages": "participants come by signed links, and the pages take their answers",
-    "servers": "servers start, on Fargate Spot or on demand, get an address, a name that is known, and a certificate",
+    "servers": "servers start, on Fargate Spot or on demand, get an address, a name that resolves, and a certificate",
     "game": "players get in by their token, see frames, press keys, and come to the end",
     "killed": "a server whose task is killed is replaced, and the game goes on",
     "end": "the stop step ends a server, and nothing of it is left",
