@@ -51,26 +51,26 @@ def play(launched, open_client, *, frames=10, stop=True):
 
 def test_a_session_is_stored_by_presigned_requests_alone_and_goes_on_on_the_next_server(town, launch, open_client):
     first = town.start(user=SID)
-    running = launch_session(launch, **town.told(first))
+    running = launch_session(launch, **town.variables(first))
     form(town)
     assert play(running, open_client, frames=30, stop=False) == [1001, 1001]
     lost = town.close(first, Reason.LOST)
     (before,) = recordings(town, first.name).values()
     second = town.start(user=SID, attempt=2, before=lost)
-    assert play(launch_session(launch, **town.told(second)), open_client) == [1000, 1000]
+    assert play(launch_session(launch, **town.variables(second)), open_client) == [1000, 1000]
     (after,) = recordings(town, second.name).values()
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
     assert after[0]["seed"] == before[0]["seed"]
     for each, outcome in {"anna": "stopped", "bert": "partnerLeft"}.items():
         found = json.loads(town.body(answer_key("study", each, "3")))["answers"]
         assert (found["outcome"], found["session"]) == (outcome, SID)
-    assert [seen for seen in town.seen if seen[2] not in (200, 404)] == []
+    assert [seen for seen in town.requests if seen[2] not in (200, 404)] == []
 
 
 def test_a_warm_server_that_a_session_gets_stores_what_the_session_leaves(town, launch, open_client):
     warm = town.start_warm(TOKEN)
     told = {"SPARE": "on", "SESSION": "", "SPARE_SECONDS": "0.2"}
-    running = launch_session(launch, **{**town.told(warm), **told})
+    running = launch_session(launch, **{**town.variables(warm), **told})
     own = town.hand_over(warm, SID)
     form(town)
     assert play(running, open_client) == [1000, 1000]
