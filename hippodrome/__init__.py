@@ -1,1 +1,1 @@
-"""The control plane: records and their transitions in the middle, AWS (or one machine) at the edges."""
+"""The control plane: pure records and transitions, the services over them, and the ports on AWS."""

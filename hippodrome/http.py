@@ -1,4 +1,4 @@
-"""Requests and responses of API Gateway, as plain values: HTTP APIs (payload formats 2.0 and 1.0) and REST APIs.
+"""Reads requests from events of API Gateway, and makes its responses: HTTP APIs (payloads 2.0 and 1.0) and REST APIs.
 
 Formats: https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html and, of
 REST APIs, https://docs.aws.amazon.com/apigateway/latest/developerguide/set-up-lambda-proxy-integrations.html
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
-MAX_QUERY_FIELDS = 64
+MAX_QUERY_FIELDS = 64  # a query with more is malformed
 MIN_GZIP_LENGTH = 1000  # characters
 
 # HIPPO's front end is served from another origin. No cookie protects anything here, so any origin is allowed.
@@ -39,9 +39,9 @@ _COMMON_HEADERS = {
 class Request:
     """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded.
 
-    `path` is the path within the API. If the API has a named stage, clients may see other paths: the gateway puts the
-    stage in front, or a custom domain maps it to something else, and the event does not say which
-    (CodeGenieApp/serverless-express, issue 465). `own_path` is False then.
+    `path` is the path within the API. If the API has a named stage, clients may see another path: the gateway puts the
+    stage in front, or a custom domain maps another path to it. The event does not say which
+    (CodeGenieApp/serverless-express, issue 465), so `own_path` is False then.
     """
 
     method: str
@@ -49,12 +49,12 @@ class Request:
     query: tuple[tuple[str, str], ...] | None  # None: malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
-    own_path: bool = True  # clients see `path`
+    own_path: bool = True  # whether clients see the same `path`
     binary: bool = True  # the gateway decodes responses in base64; a REST API does so only if it is told to
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> Request:
-        """Read an event of API Gateway. Nothing that a client can send makes it raise."""
+        """Read an event of API Gateway. No request of a client makes this raise."""
         context = event.get("requestContext") or {}
         second = event.get("version") == "2.0" or "http" in context or "rawQueryString" in event
         method = (context.get("http") or {}).get("method") if second else event.get("httpMethod")
@@ -92,9 +92,9 @@ class Request:
 
     @property
     def is_front_end(self) -> bool:
-        """Whether a page of another site, such as HIPPO's front end, asks for JSON: browsers then say its origin.
+        """Whether a page of another site, such as HIPPO's front end, asks for JSON: browsers send its origin then.
 
-        They leave the header out of a GET to a page's own site (Fetch, 3.1, "append a request Origin header").
+        They send no such header with a GET to the page's own site (Fetch, 3.1, "append a request Origin header").
         """
         return self.wants_json and "origin" in self.headers
 
@@ -105,18 +105,19 @@ class Request:
 
     @property
     def accepts_gzip(self) -> bool:
-        """Whether the client accepts gzip, and the gateway can pass it on."""
+        """Whether the client accepts gzip, and the gateway can return a binary body."""
         return self.binary and _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def steps_folder(self, project_id: str) -> str:
-        """Where the project's files are served, relative to this request's address; it ends with a slash."""
+        """The address of the project's files, relative to this request's address; it ends with a slash."""
         return f"{'/' if self.own_path else ''}steps/{project_id}/"
 
     def url(self, **changes: str) -> str:
         """This request's address, relative to the host, with these query fields set.
 
-        `path` arrives decoded and goes into headers, so it is encoded again. It never begins with `//`, which would
-        name another host. Without a path of its own it is the query alone, which browsers put behind the path they see.
+        The result goes into headers, so the path, which arrives decoded, is encoded again. It never begins with `//`,
+        which would name another host. If `own_path` is False, the result is the query alone, which browsers add to the
+        path that they see.
         """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
         if not self.own_path:
@@ -126,7 +127,7 @@ class Request:
 
 
 def _path(event: Mapping[str, Any], key: str, own_path: bool) -> str:
-    """The path within the API: without a stage or the path of a custom domain in front, if the route tells."""
+    """The path within the API. The route, if the event has it, says which part in front is a stage's or a domain's."""
     path = str(event.get(key) or "/")
     route = str(event.get("resource") or event.get("routeKey") or "").rpartition(" ")[2]
     if own_path or not route.startswith("/"):
@@ -149,7 +150,7 @@ def _raw_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
 
 
 def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
-    """The query of payload format 1.0, which is decoded; `queryStringParameters` alone has one value of each field."""
+    """The query of payload format 1.0, which arrives decoded. `queryStringParameters` has only one value per field."""
     several = event.get("multiValueQueryStringParameters") or {
         key: [value] for key, value in (event.get("queryStringParameters") or {}).items()
     }
@@ -162,7 +163,7 @@ def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | Non
 
 
 def _headers(event: Mapping[str, Any]) -> dict[str, str]:
-    """The headers, names in lower case. Several values of one are joined, as payload format 2.0 has them."""
+    """The headers, with names in lower case. Several values of one header are joined by commas, as in format 2.0."""
     several = {key: ",".join(map(str, values or ())) for key, values in (event.get("multiValueHeaders") or {}).items()}
     return {str(key).lower(): str(value) for key, value in {**(event.get("headers") or {}), **several}.items()}
 
@@ -186,20 +187,20 @@ class Response:
     headers: Mapping[str, str] = field(default_factory=dict)
 
     def to_event(self, compress: bool = False, *, https: bool = False) -> dict[str, Any]:
-        """The response in the format of API Gateway, which does not compress: with `compress`, long texts are in gzip.
+        """The response in API Gateway's format. With `compress` a long text is compressed with gzip.
 
-        With `https`, the header HSTS is set. A response over plain HTTP must not have it (RFC 6797, section 7.2).
+        API Gateway's HTTP APIs compress nothing themselves. With `https` the response gets the header HSTS, which a
+        response over plain HTTP must not have (RFC 6797, section 7.2).
         """
         headers, body = {**_COMMON_HEADERS, **(HSTS if https else {}), **self.headers}, self.body
         if compress and isinstance(body, str) and len(body) > MIN_GZIP_LENGTH:
             headers |= {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"}
             body = gzip.compress(body.encode(), compresslevel=6, mtime=0)
-        text = isinstance(body, str)
         return {
             "statusCode": self.status,
             "headers": headers,
             "body": body if isinstance(body, str) else base64.b64encode(body).decode(),
-            "isBase64Encoded": not text,
+            "isBase64Encoded": not isinstance(body, str),
         }
 
 

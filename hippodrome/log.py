@@ -1,7 +1,7 @@
-"""The functions' log: structured lines without ids, answers or tokens.
+"""Writes the functions' log: JSON lines without ids, answers or tokens.
 
-A participant is identified at most by a server's name, which is a hash. Exceptions are logged by type and place in the
-code, because their texts may quote what a participant sent.
+A line identifies a participant at most by the name of a server, which is a hash. Exceptions are logged by their types
+and their place in the code, because their texts may quote what a participant sent.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ logger = Logger(service="hippodrome", log_uncaught_exceptions=False)
 
 
 def failure(text: str, error: BaseException, **fields: object) -> None:
-    """Log an error without its message: its type, the types of its causes, and the place in the code.
+    """Log an error without its message: its type, the types of its causes, the place in the code, and AWS's code.
 
-    An error with the attribute `expected`, such as `RetryLater`, is logged as information.
+    An error whose attribute `expected` is true, such as `RetryLater`, is logged at the level INFO, others at ERROR.
     """
     chain: list[str] = []
     cause: BaseException | None = error

@@ -1,9 +1,9 @@
-"""Metrics in CloudWatch. The sweep reports how many servers run, the age of the oldest, and what it found; functions
-that see servers fail report how many failed, by `causes.FailureCategory`. No project is a dimension: alarms watch
-dimensions that are known beforehand. `deploy status` names the project.
+"""Writes CloudWatch metrics. The sweep reports how many servers run, the age of the oldest, and what it removed.
+Functions that see servers fail report how many failed, by `causes.FailureCategory`. No dimension names a project:
+alarms watch dimensions that are known beforehand. `deploy status` names the project.
 
-They are written to the log in CloudWatch's embedded metric format, which needs no call and no permission. Cold starts
-take no longer: Powertools loads its metrics with its Logger. `infra/template.yml` has the alarms and the dashboard.
+The metrics are lines of the log in CloudWatch's embedded metric format, which needs no call and no permission. Cold
+starts take no longer: Powertools loads its metrics with its Logger. `infra/template.yml` has the alarms and dashboard.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from aws_lambda_powertools.metrics import EphemeralMetrics, MetricUnit
 
 from hippodrome.servers.causes import Cause
 
-if TYPE_CHECKING:  # the functions that start servers do not carry the sweep
+if TYPE_CHECKING:  # the zips of functions that start servers do not contain the sweep
     from hippodrome.servers.sweep import RunningServers, SweepResult
 
 NAMESPACE = "Hippodrome"
@@ -26,7 +26,7 @@ FAULT = "Fault"
 
 
 def report(stack: str, running: RunningServers, result: SweepResult) -> None:
-    """Write the sweep's metrics, one line, for the installation of this name."""
+    """Write a sweep's metrics as one line of the log. `stack` names the installation."""
     metrics = EphemeralMetrics(namespace=NAMESPACE)
     metrics.add_dimension(DIMENSION, stack)
     metrics.add_metric("Servers", MetricUnit.Count, running.count)
@@ -40,13 +40,13 @@ def report(stack: str, running: RunningServers, result: SweepResult) -> None:
 
 
 def report_failures(stack: str, causes: Iterable[Cause]) -> None:
-    """Write a line of metrics for each category of failure; its causes are metadata."""
+    """Write one line of metrics for each category of failures, with the number of each cause as metadata."""
     counted = Counter(causes)
-    for fault in sorted({cause.category for cause in counted}):
-        these = {str(cause): number for cause, number in counted.items() if cause.category is fault}
+    for category in sorted({cause.category for cause in counted}):
+        numbers = {str(cause): number for cause, number in counted.items() if cause.category is category}
         metrics = EphemeralMetrics(namespace=NAMESPACE)
         metrics.add_dimension(DIMENSION, stack)
-        metrics.add_dimension(FAULT, fault)
-        metrics.add_metadata("causes", these)
-        metrics.add_metric("ServersFailed", MetricUnit.Count, sum(these.values()))
+        metrics.add_dimension(FAULT, category)
+        metrics.add_metadata("causes", numbers)
+        metrics.add_metric("ServersFailed", MetricUnit.Count, sum(numbers.values()))
         metrics.flush_metrics()

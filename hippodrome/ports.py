@@ -1,4 +1,4 @@
-"""The five ports that the control plane uses, and the platform that holds them.
+"""Defines the five ports that the control plane uses, and the platform that holds them.
 
 `hippodrome.aws` implements them on S3, ECS, Route 53, EventBridge Scheduler and SNS/SQS; `local` implements them on one
 machine. Every implementation passes the same contract tests. All of them keep these rules:
@@ -21,15 +21,15 @@ T = TypeVar("T")
 
 
 class Conflict(Exception):
-    """Another writer created, changed or removed the document meanwhile: read it again and decide anew."""
+    """Another writer has created, changed or removed the document. The caller reads it again and decides anew."""
 
 
 class NoCapacity(Exception):
-    """There is no capacity for this kind of task now (Spot is sold out, or the launch quota is used up)."""
+    """There is no capacity for this kind of task now: Spot is sold out, or a quota is used up."""
 
 
 class ServiceBusy(Exception):
-    """The platform does not take this call now, and has changed nothing: call again in a few seconds."""
+    """The platform refuses this call now and has changed nothing. The caller calls again in a few seconds."""
 
 
 class Refused(Exception):
@@ -37,7 +37,7 @@ class Refused(Exception):
 
 
 class RefusedDnsRecords(Exception):
-    """The zone will never take these `records`. All others of the call are changed, with the id `change`."""
+    """The zone will never take these `records`. The call's other records are changed; `change` is that change's id."""
 
     def __init__(self, records: Sequence[DnsRecord], change: str) -> None:
         super().__init__(f"{len(records)} names are refused")  # names may hold ids
@@ -63,7 +63,7 @@ class Documents(Protocol):
     """Whole documents under keys, with compare-and-swap (S3 conditional writes)."""
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        """The document, or None. If it has not changed since `known`, that very object is returned."""
+        """Return the document; None if it is missing. If it has not changed since `known`, return that same object."""
 
     def create(self, key: str, body: bytes) -> str:
         """Create a document; return its ETag. Raises `Conflict` if it exists."""
@@ -72,10 +72,10 @@ class Documents(Protocol):
         """Replace the version with this ETag; return the new ETag. Raises `Conflict` if another version is present."""
 
     def put(self, key: str, body: bytes) -> None:
-        """Write a document, whatever is there: the last of several writers wins. For entries that say "still here"."""
+        """Write a document without a condition: the last of several writers wins. Only the lobby's entries need it."""
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """All documents whose key begins with `prefix`, in key order."""
+        """Yield an entry for each document whose key begins with `prefix`, in the order of the keys."""
 
     def delete(self, key: str) -> None:
         """Remove the document if it is there."""
@@ -90,10 +90,10 @@ class Address(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """A server to run. `name` ("label-attempt") is its `startedBy`; with `nonce` it makes the request repeatable.
+    """A server to run. `name` ("label-attempt") is its `startedBy`.
 
-    A repeated request has the same nonce. If a name is used again, the nonce differs: a participant may come back after
-    all their data was erased.
+    `name` and `nonce` make the request repeatable: a repeated request has the same nonce. If a participant comes back
+    after all their data were erased, a server of the same name gets another nonce, so that it is a new task.
     """
 
     name: str
@@ -104,13 +104,13 @@ class TaskRequest:
     environment: Mapping[str, str] = field(repr=False)
     spot: bool = True
     nonce: str = field(default="", repr=False)
-    port: int = 5000  # where it should listen; on one machine it takes a free port
+    port: int = 5000  # the port on which it should listen; on one machine it takes a free port
 
 
 class RunningTask(NamedTuple):
-    """A task of ours that was not told to stop. `name` is the `startedBy` it was run with.
+    """A server's task that has not ended. `name` is the `startedBy` that it was run with.
 
-    `interface`: the id of its network interface, once it has one. `runs`: whether it is RUNNING.
+    `interface`: the id of its network interface, once it has one. `runs`: whether its status is RUNNING.
     """
 
     task: str
@@ -124,25 +124,26 @@ class Tasks(Protocol):
     """Servers (ECS tasks on Fargate, or processes). Their state changes arrive as ECS events at `task_changed`."""
 
     def run(self, request: TaskRequest) -> str:
-        """Start a task and return its id at once. The same name and kind again returns the same task, even if it ended.
+        """Start a task and return its id, without waiting until it runs. Raises `NoCapacity` or `Refused`.
 
-        Raises `NoCapacity` or `Refused`.
+        A second request with the same name, nonce and kind (Spot or on demand) returns the same task, even if that task
+        has ended.
         """
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
         """Stop a task (SIGTERM, then SIGKILL after its stop timeout)."""
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        """The public address of each network interface that has one. One call for all."""
+        """Return the public address of each of these network interfaces that has one, by the interface's id."""
 
     def find(self, name: str, cluster: str) -> str | None:
-        """The id of the living task that was run under this name; None if it was told to stop.
+        """Return the id of the living task that was run under this name; None if there is none or it was told to stop.
 
-        A task run a moment ago may not be found yet (ECS is eventually consistent).
+        A task that was run a moment ago may not be found yet (ECS is eventually consistent).
         """
 
     def list(self) -> Iterator[RunningTask]:
-        """All living tasks of ours that were not told to stop, in all our clusters."""
+        """Yield all living tasks of servers that were not told to stop, in all our clusters."""
 
     def create_cluster(self, name: str) -> None:
         """Create a participant's own cluster (`cluster: participant`)."""
@@ -151,7 +152,7 @@ class Tasks(Protocol):
         """Delete a cluster. Raises while tasks are still ending in it; the caller's queue retries."""
 
     def clusters(self) -> Iterator[str]:
-        """The names of the participants' own clusters."""
+        """Yield the names of the participants' own clusters."""
 
 
 class DnsRecord(NamedTuple):
@@ -162,28 +163,28 @@ class DnsRecord(NamedTuple):
 
 
 class Dns(Protocol):
-    """DNS names of servers (a Route 53 hosted zone)."""
+    """DNS records of servers (a Route 53 hosted zone)."""
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         """Make all these changes at once; return an id for `in_sync`, or "" if they are in sync already.
 
-        A record that is already gone counts as removed; one that is both added and removed is added. Raises
-        `ServiceBusy` if other changes keep the zone busy for long, and, after all other changes, `RefusedDnsRecords`
-        for records that cannot be added.
+        A record that does not exist counts as removed; one that is both added and removed is added. Raises
+        `ServiceBusy` if other changes keep the zone busy for long. If records cannot be added, all other changes are
+        made, then `RefusedDnsRecords` is raised.
         """
 
     def in_sync(self, change: str) -> bool:
-        """Whether every name server of the zone has this change. Raises `ServiceBusy` if it cannot be asked now."""
+        """Whether every name server of the zone has this change. Raises `ServiceBusy` if the zone is too busy now."""
 
     def list(self) -> Iterator[DnsRecord]:
-        """The A records of servers in our zone: those whose first label has the form of a server's name."""
+        """Yield the servers' A records in our zone: those whose first label has the form of a server's name."""
 
     def browser_host(self, record: DnsRecord) -> str:
-        """The host that browsers connect to: the DNS name, or the address where there is no DNS."""
+        """The host that browsers connect to: the DNS name; the IPv4 address if the platform has no DNS."""
 
 
 class Timers(Protocol):
-    """One-time timers that publish a message to the stop topic. They do not depend on any process of ours."""
+    """One-time timers, each of which publishes a message to the stop topic, even if no function of ours runs."""
 
     def set(self, name: str, at: datetime, message: Message) -> None:
         """Publish `message` to the stop topic at `at` (aware, to the second). Replaces a timer of the same name.
@@ -195,11 +196,11 @@ class Timers(Protocol):
         """Delete the timer."""
 
     def list(self) -> Iterator[str]:
-        """The names of all timers that have not fired."""
+        """Yield the names of all timers that have not fired."""
 
 
 class Topic(StrEnum):
-    """Where messages go: each topic feeds a queue, and each queue a function."""
+    """The topics of messages: each topic feeds a queue, and each queue a function."""
 
     START = "start"
     STOP = "stop"
@@ -212,11 +213,11 @@ class Bus(Protocol):
         """Send the message to the topic's subscribers."""
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        """Deliver the message to `task_changed`'s own queue after 0 to 900 seconds. Raises ValueError for others."""
+        """Send the message to the queue of `task_changed`, delayed by 0 to 900 `seconds`; else raise ValueError."""
 
 
 PORTS = (443, 5000)
-"""Ports of servers on AWS. A server listens on the one its project was registered with; some networks block 5000."""
+"""Ports of servers on AWS. A server listens on the port of its project's registration; some networks block 5000."""
 
 
 @dataclass(frozen=True)
@@ -227,16 +228,16 @@ class Settings:
     region: str = ""
     root_domain: str = ""
     servers_host: str = ""  # the level below `root_domain` of the servers' names; "": directly below it
-    max_runtime: int = 24 * 60  # minutes; no server lives longer, whatever its project says
+    max_runtime: int = 24 * 60  # minutes; no server lives longer, even if its project's maxRuntime is longer
     cluster: str = "hippodrome"
     task_definition: str = "hippodrome"
-    game_sources: str = ""  # what the pages' Content-Security-Policy lets the game connect to
+    game_sources: str = ""  # the sources in the pages' Content-Security-Policy to which the game may connect
     user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
     plain_clients: bool = False  # whether projects' front ends may open servers without a token (`plainClients`)
 
     @property
     def servers_domain(self) -> str:
-        """The domain directly above servers' names."""
+        """The domain directly above the servers' names."""
         return f"{self.servers_host}.{self.root_domain}" if self.servers_host else self.root_domain
 
     @property
@@ -246,10 +247,11 @@ class Settings:
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:
-        """Read `BUCKET ROOT_DOMAIN MAX_RUNTIME CLUSTER TASK_DEFINITION SERVER_NAMES SERVERS_HOST PLAIN_CLIENTS`.
+        """Read the settings from a function's environment variables.
 
-        And Lambda's `AWS_REGION`. Missing ones get their defaults; without `SERVER_NAMES` no server is named after an
-        id.
+        They are `BUCKET`, `ROOT_DOMAIN`, `MAX_RUNTIME`, `CLUSTER`, `TASK_DEFINITION`, `SERVER_NAMES`, `SERVERS_HOST`,
+        `PLAIN_CLIENTS`, and Lambda's `AWS_REGION`. A missing variable gives the default; without `SERVER_NAMES` no
+        server is named after a participant's id.
         """
         domain, host = (env.get(key, "").strip(".").lower() for key in ("ROOT_DOMAIN", "SERVERS_HOST"))
         return cls(
@@ -267,13 +269,13 @@ class Settings:
 
 
 def _game_sources(domain: str, host: str) -> str:
-    """Sources for servers' names on their level, and directly below the domain, as earlier versions named them."""
-    above = [f"{host}.{domain}", domain] if host else [domain]
-    return " ".join(f"wss://*.{one}:{port}" for one in above for port in PORTS) if domain else ""
+    """The sources for servers' names: below the servers' domain, and directly below the root, as earlier versions."""
+    parents = [f"{host}.{domain}", domain] if host else [domain]
+    return " ".join(f"wss://*.{parent}:{port}" for parent in parents for port in PORTS) if domain else ""
 
 
 class Platform(Protocol):
-    """All ports, settings and time. A port is created when first used, so that cold starts do not pay for others."""
+    """The ports, the settings and the clock. A port is created when first used, so that cold starts stay short."""
 
     @property
     def settings(self) -> Settings: ...
@@ -291,4 +293,4 @@ class Platform(Protocol):
         """The present time, aware, in UTC."""
 
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
-        """Call all these functions, possibly at the same time; return their results in order. None may raise."""
+        """Call all these functions, possibly at the same time; return their results in order. They must not raise."""

@@ -1,4 +1,4 @@
-"""`update_project_master_list`: adds or replaces a project in the master list, safely if several do so at once."""
+"""`update_project_master_list`: adds or replaces a project in the master list, by compare-and-swap."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from hippodrome.storage.secret import SecretCache
 
 TRIES = 20
 MAX_SIGNED = 5_000  # links in one call
-ALONE = (  # functions ask for a participant's session only in a project with several players
+ALONE = (  # functions look up a participant's session only in a project with several players
     "project.players: the study is registered with players: {players}, and participants who play together would be "
-    "parted; give a study for one participant another project.id"
+    "separated; give a study for one participant another project.id"
 )
 
 
@@ -45,18 +45,18 @@ class NotRegistered(Exception):
 
 
 def register(platform: Platform, registration: object) -> Project:
-    """Check a registration (see `hippodrome.config`) and write it to the master list. Raises `NotRegistered`."""
+    """Check a registration (`hippodrome.config`) and write it to the master list. Raises `NotRegistered`."""
     return _enter(platform, _parse(registration))
 
 
 def _enter(platform: Platform, project: Project) -> Project:
-    """Write a project to the master list if it can run here. Raises `NotRegistered`."""
+    """Write a project to the master list; return the entry. Raises `NotRegistered` if it cannot run here."""
     problems = [*_not_allowed_here(platform, project), *_missing_files(platform, project)]
     if problems:
         raise NotRegistered(problems)
     _set_participant_limit(platform, project)
     keys = SecretCache(platform.documents)
-    keys.get_or_create()  # creates it, if there is none, before anything is written that needs it
+    keys.get_or_create()  # the installation's secret must exist before anything is written that needs it
     for _ in range(TRIES):
         found = platform.documents.get(MASTER_LIST)
         listed = _master_list(found.body) if found else MasterList()
@@ -75,7 +75,7 @@ def _enter(platform: Platform, project: Project) -> Project:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
             continue
-        _set_participant_limit(platform, project)  # counts participants who came meanwhile
+        _set_participant_limit(platform, project)  # counts participants who have come since the first call
         logger.info("registered", extra={"project": project.id, "live": project.live})
         if entry.warm_servers or (before and before.warm_servers):
             _warm_up(platform, entry)
@@ -84,9 +84,9 @@ def _enter(platform: Platform, project: Project) -> Project:
 
 
 def migrate_secrets(platform: Platform) -> int:
-    """Move secrets that an earlier version wrote into the master list to `_secret.json`; return how many.
+    """Move secrets from the master list, where earlier versions wrote them, to `_secret.json`; return their number.
 
-    They stay valid. Raises `NotRegistered`.
+    The secrets stay valid. Raises `NotRegistered`.
     """
     keys = SecretCache(platform.documents)
     for _ in range(TRIES):
@@ -106,7 +106,7 @@ def migrate_secrets(platform: Platform) -> int:
 
 
 def _master_list(body: bytes) -> MasterList:
-    """The master list in a document. Raises `NotRegistered` if there is none in it: it must not be overwritten then."""
+    """Read the master list. Raises `NotRegistered` if it cannot be read, so that it is not overwritten."""
     try:
         return read_list(body)
     except (ValueError, RecursionError) as error:
@@ -116,7 +116,7 @@ def _master_list(body: bytes) -> MasterList:
 
 
 def _warm_up(platform: Platform, project: Project) -> None:
-    """Request the project's warm servers to be started, replaced or drained. If that fails, the sweep does it."""
+    """Request that the project's warm servers be started, replaced or drained. If that fails, the sweep does it."""
     try:
         Pools(platform, ProjectCache(platform)).request_adjustment(project.id)
     except Exception as error:  # noqa: BLE001 - the project is registered
@@ -124,7 +124,7 @@ def _warm_up(platform: Platform, project: Project) -> None:
 
 
 def _set_participant_limit(platform: Platform, project: Project) -> None:
-    """Set the limit of participants; those who came before there was one count, too."""
+    """Set the limit of participants. Participants who came before the study had a limit count as well."""
     if project.max_participants is None:
         return
     folders = (entry.key.split("/") for entry in platform.documents.list(f"{project.id}/users/"))
@@ -140,7 +140,7 @@ def _parse(registration: object) -> Project:
 
 
 def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
-    """Problems of a project that is for another installation, or that asks for what this one does not allow."""
+    """Yield a sentence for each setting that names another installation, or that this installation does not allow."""
     setup, here = project.aws_setup, platform.settings
     if project.subdomain == "userId" and not here.user_id_names:
         yield "project.subdomain is userId, which this installation's parameter ServerNames does not allow; use hash"
@@ -162,49 +162,49 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
 
 
 def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
-    """Problems of step files that the project names and the bucket lacks."""
-    named = [*project.steps, *project.pages_in_game]
+    """Yield a sentence for each step file that the project names and the bucket lacks."""
+    pages = [*project.steps, *project.pages_in_game]
     if project.page_folder == STEPS_FOLDER:
-        there = {entry.key for entry in platform.documents.list(f"{project.id}/{STEPS_FOLDER}/")}
+        uploaded = {entry.key for entry in platform.documents.list(f"{project.id}/{STEPS_FOLDER}/")}
     else:
-        there = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in named})
-    for step in named:
+        uploaded = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in pages})
+    for step in pages:
         section = "project.steps" if step in project.steps else "trial"
         for file in step.files:
-            if project.page_key(file) not in there:
+            if project.page_key(file) not in uploaded:
                 yield f"{section}.{step.key}: {file}.html has not been uploaded"
 
 
-def sign_links(platform: Platform, asked: object) -> list[str]:
-    """The signatures of links for these ids, in their order. Raises `NotRegistered`."""
-    project_id = asked.get("projectId") if isinstance(asked, Mapping) else None
-    users = asked.get("userIds") if isinstance(asked, Mapping) else None
+def sign_links(platform: Platform, request: object) -> list[str]:
+    """Return the signature of the link of each of `userIds` in `request`, in their order. Raises `NotRegistered`."""
+    project_id = request.get("projectId") if isinstance(request, Mapping) else None
+    users = request.get("userIds") if isinstance(request, Mapping) else None
     if not isinstance(users, list) or len(users) > MAX_SIGNED or not all(map(ids.is_user_id, users)):
         raise NotRegistered([f"links: userIds must be a list of at most {MAX_SIGNED} ids"])
     project_cache = ProjectCache(platform, SecretCache(platform.documents))
     project = project_cache.project(project_id) if isinstance(project_id, str) else None
     if project is None:
-        raise NotRegistered(["links: no project of that id is registered"])
+        raise NotRegistered(["links: no project with this projectId is registered"])
     return [ids.link_signature(project.secret, project.id, user) for user in users]
 
 
 def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
-    """Register what HIPPO's `updateProject.py` sends; return `statusCode` and `body`, which it reads.
+    """Register the payload of HIPPO's script `updateProject.py`; return the `statusCode` and `body` that it reads.
 
-    It shows `body` only if the registration failed, so the remarks are in the log, too.
+    The script shows `body` only if the registration failed, so the remarks are logged as well.
     """
-    here = platform.settings
+    settings = platform.settings
     try:
         found = platform.documents.get(MASTER_LIST)
         before = _master_list(found.body).find(hippo_registration.project_id(event) or "") if found else None
         earlier = msgspec.to_builtins(before) if before else {}
         registration, remarks = hippo_registration.registration_of(event, earlier)
-        remarks += hippo_registration.lower_runtime(registration, here.max_runtime)
-        places = {"bucket": here.bucket, "region": here.region, "rootDomain": here.root_domain}
+        remarks += hippo_registration.lower_runtime(registration, settings.max_runtime)
+        places = {"bucket": settings.bucket, "region": settings.region, "rootDomain": settings.root_domain}
         problems = list(hippo_registration.elsewhere(event, places))
-        project, twice = uploaded_pages.located(platform.documents, _parse(registration))
-        if problems or twice:
-            raise NotRegistered([*problems, *twice])
+        project, duplicates = uploaded_pages.located(platform.documents, _parse(registration))
+        if problems or duplicates:
+            raise NotRegistered([*problems, *duplicates])
         _enter(platform, project)
     except NotRegistered as error:
         return {"statusCode": 400, "body": "\n".join([*error.problems, *hippo_registration.renamed(event)])}
@@ -216,8 +216,8 @@ def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """Handle one call of the function; return `{"registered": id, "live": …}` or `{"problems": […]}`.
 
     For `{"links": {"projectId": …, "userIds": […]}}`, return `{"signatures": […]}` of signed links instead, so that
-    researchers need not know the secret. For `{"takeOver": true}`, move secrets out of a master list that an earlier
-    version wrote, and return `{"takenOver": n}`.
+    researchers need not know the secret. For `{"takeOver": true}`, move the secrets that an earlier version wrote into
+    the master list out of it, and return `{"takenOver": n}`. For a payload of HIPPO's script, see `_handle_hippo`.
     """
     if hippo_registration.is_payload(event):
         return _handle_hippo(platform, event)

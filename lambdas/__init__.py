@@ -1,1 +1,1 @@
-"""One file per Lambda function: read the event, call `hippodrome`, shape the reply; nothing else."""
+"""The handlers, one file per Lambda function. Each reads its event, calls `hippodrome` and shapes the reply."""

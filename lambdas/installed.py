@@ -1,4 +1,4 @@
-"""The platform of the functions: AWS, unless the program that runs them has called `use`."""
+"""The platform that the handlers use: AWS, unless the program that runs them has set another one with `use`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _made: dict[Callable[..., Any], Any] = {}
 
 
 def use(platform: Platform | None) -> None:
-    """Set the platform; None stands for AWS, with the settings in the environment."""
+    """Set the platform for all handlers. None stands for AWS, with the settings in the environment variables."""
     global _platform  # noqa: PLW0603 - set nowhere else
     _platform = platform
     _made.clear()
@@ -25,13 +25,13 @@ def platform() -> Platform:
     if _platform is None:
         from hippodrome.aws import AwsPlatform  # noqa: PLC0415 - other platforms do without it
 
-        use(AwsPlatform.from_env(os.environ))
+        use(AwsPlatform(os.environ))
     assert _platform is not None
     return _platform
 
 
 def shared(kind: Callable[[Platform], T]) -> T:
-    """Return the one object of this kind on the platform in use. It keeps its caches between invocations."""
+    """Return `kind(platform())`, made at the first call only, so that the object's caches outlive an invocation."""
     made: T | None = _made.get(kind)
     if made is None:
         made = _made.setdefault(kind, kind(platform()))

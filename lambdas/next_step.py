@@ -1,4 +1,4 @@
-"""HTTP GET and POST: shows the page of the step that is due, stores answers, publishes start and stop messages."""
+"""HTTP GET and POST: shows the page of the due step, stores answers, and publishes start and stop messages."""
 
 from typing import Any
 

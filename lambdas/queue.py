@@ -1,6 +1,6 @@
-"""What the functions behind a queue share: they parse a batch, and report to SQS only the messages that failed.
+"""Parses the batches of functions behind an SQS queue, and reports to SQS only the messages that failed.
 
-The functions behind a topic's queue also take the events of a subscription of the function itself, as HIPPO has it.
+The functions behind a topic's queue also take events that SNS sends to the function itself, as in HIPPO's setup.
 
 `report_failures` writes metrics of failed servers to the log.
 """
@@ -23,7 +23,10 @@ BatchResponse = dict[str, list[dict[str, str]]]
 
 
 def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tuple[str, M]]:
-    """The messages of a batch, with their ids. Others are dropped, and logged without their content."""
+    """Return the messages of a batch that `parse` accepts, each with its message id.
+
+    A record without an id, or for which `parse` returns None, is dropped and logged without its content.
+    """
     found = []
     for record in event.get("Records") or ():
         message_id = _id_of(record)
@@ -36,7 +39,7 @@ def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tup
 
 
 def one_by_one(messages: Sequence[tuple[str, M]], act: Callable[[M], None]) -> list[str]:
-    """Process each message independently; return the ids of those that failed."""
+    """Call `act` on each message; return the ids of the messages for which it raised."""
     failed = []
     for message_id, message in messages:
         try:
@@ -48,26 +51,26 @@ def one_by_one(messages: Sequence[tuple[str, M]], act: Callable[[M], None]) -> l
 
 
 def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], Sequence[M]]) -> list[str]:
-    """Process the batch as a whole; return the ids of the messages that `act` returns, or of all if it raises."""
+    """Call `act` once with all messages; return the ids of the messages that `act` returns, or of all if it raises."""
     if not messages:
         return []
     try:
         again = {id(message) for message in act([message for _, message in messages])}
-    except Exception as error:  # noqa: BLE001 - everything in a batch may be repeated
+    except Exception as error:  # noqa: BLE001 - SQS delivers all of them again; handling a message twice does no harm
         failure("batch failed", error, messages=len(messages))
         return [message_id for message_id, _ in messages]
     return [message_id for message_id, message in messages if id(message) in again]
 
 
 def batch_response(message_ids: Sequence[str]) -> BatchResponse:
-    """The partial batch response, after which SQS delivers these messages again."""
+    """The partial batch response that makes SQS deliver these messages again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
 def response(event: Mapping[str, Any], message_ids: Sequence[str]) -> BatchResponse:
-    """The partial batch response. Raises `RetryLater` if messages of an event of SNS failed.
+    """The partial batch response. Raises `RetryLater` if the event came from SNS and a message failed.
 
-    SNS calls functions asynchronously, so nobody reads what they return. Lambda repeats a call that raises:
+    SNS invokes functions asynchronously, so their return value is lost. Lambda repeats an invocation that raises:
     https://docs.aws.amazon.com/lambda/latest/dg/invocation-async-error-handling.html
     """
     if message_ids and any(isinstance(record, dict) and "Sns" in record for record in event.get("Records") or ()):
@@ -85,7 +88,7 @@ def _id_of(record: Any) -> str | None:
 
 
 def report_failures(services: ServerServices) -> None:
-    """Report the servers that failed since the last call as metrics, if `STACK` names the installation."""
+    """Write metrics of the servers that failed since the last call, if the variable `STACK` names the installation."""
     causes, stack = services.failures(), os.environ.get("STACK")
     if causes and stack:
         from hippodrome import metrics  # noqa: PLC0415 - seldom needed

@@ -1,4 +1,4 @@
-"""Timer, daily: order the servers' certificate anew when it is due, from where it came."""
+"""Daily timer: renews the servers' certificate, when it is due, from the ACME directory that issued it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hippodrome.certificates.rules import location
 from hippodrome.log import failure, logger
 from lambdas import installed
 
-LONGEST = 480.0  # seconds for an order; it usually takes one to two minutes
-MARGIN = 60.0  # seconds for the end: a request under way, the TXT record, the state
+MAX_ORDER_SECONDS = 480.0  # an order usually takes one to two minutes
+MARGIN = 60.0  # seconds after an order to end its last request, remove the TXT record and write the state
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
-    """Scheduled event → what was done. Raises if an order fails: the alarm for errors watches that."""
+    """Scheduled event → the decision and the certificate's expiry. Raises if an order fails; an alarm watches."""
     platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
     domain = platform.settings.servers_domain
-    left = context.get_remaining_time_in_millis() / 1000 if context else LONGEST + MARGIN
+    left = context.get_remaining_time_in_millis() / 1000 if context else MAX_ORDER_SECONDS + MARGIN
     renewal = Renewal(
         platform.documents,
         platform.challenges,
@@ -27,13 +27,13 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
         tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
         note=failure,
     )
-    outcome = renew(renewal, domain, min(LONGEST, left - MARGIN))
+    outcome = renew(renewal, domain, min(MAX_ORDER_SECONDS, left - MARGIN))
     if outcome is None:
         logger.info("no certificate was ever ordered here: nothing to renew")
         return {"certificate": "none"}
-    said = {
+    result = {
         "certificate": "ordered" if outcome.ordered else outcome.decision.verdict.value,
         "notAfter": outcome.stored.not_after.isoformat() if outcome.stored else "",
     }
-    logger.info("certificate: " + outcome.decision.why, extra=said)
-    return said
+    logger.info("certificate: " + outcome.decision.why, extra=result)
+    return result

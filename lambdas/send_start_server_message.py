@@ -1,4 +1,4 @@
-"""HTTP POST: publishes to the start topic."""
+"""HTTP POST or GET: publishes a participant's start message to the start topic."""
 
 from typing import Any
 

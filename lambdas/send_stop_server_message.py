@@ -1,4 +1,4 @@
-"""HTTP POST: publishes to the stop topic, after a delay if one is given."""
+"""HTTP POST or GET: publishes a participant's stop message to the stop topic, after a delay if the request has one."""
 
 from typing import Any
 

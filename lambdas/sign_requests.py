@@ -1,4 +1,4 @@
-"""HTTP POST from a participant's server: returns presigned requests for its own documents."""
+"""HTTP POST from a trial server: returns presigned requests for that server's own documents."""
 
 from typing import Any, cast
 

@@ -1,4 +1,4 @@
-"""Timer: removes resources that no open record owns, and reports what it found."""
+"""Timer: removes resources that no open record owns, sends lost messages again, and reports both as metrics."""
 
 import os
 from dataclasses import asdict
@@ -10,7 +10,7 @@ from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, int]:
-    """Scheduled event → what was removed. Writes metrics to the log if `STACK` names the installation."""
+    """Scheduled event → the counts of a `SweepResult`. Writes metrics to the log if `STACK` names the installation."""
     sweep = Sweep(installed.platform())
     swept = sweep.run()
     if stack := os.environ.get("STACK"):

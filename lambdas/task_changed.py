@@ -1,4 +1,4 @@
-"""ECS Task State Change → queue, in batches: gives running tasks a DNS record; cleans up and replaces ended ones."""
+"""ECS Task State Change → queue: gives running tasks a DNS record; cleans up after ended tasks and replaces servers."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Direct invocation: adds or replaces a project in `project_master_list.json`, signs links."""
+"""Direct invocation: adds or replaces a project in `project_master_list.json`, or signs links."""
 
 from typing import Any
 
@@ -7,5 +7,5 @@ from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """`{"project": registration}` → `{"registered": …}` or `{"problems": […]}`."""
+    """`{"project": registration}` → `{"registered": …}` or `{"problems": […]}`; see `registry.handle`."""
     return registry.handle(installed.platform(), event)

@@ -1,4 +1,4 @@
-"""What the functions behind the HTTP API share: participants never see a traceback."""
+"""Turns events of the HTTP API into requests, and responses into events; an exception becomes a page."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from hippodrome.http import Request, Response
 from hippodrome.log import failure
 
 _NO_STEP = '<input type="hidden" name="hippodrome-step" value="">'
-"""For the button that a front end puts below: it answers no step, and shows the page that is due."""
+"""A front end puts a button below the page. With this field its form answers no step, and gets the due step's page."""
 
 
 def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:
-    """Call `respond` with the request in the event; if it raises, return a page with a sentence and status 500.
+    """Call `respond` with the request in the event. If it raises, return a page of one sentence, with status 500.
 
-    A front end of another site gets 200, since HIPPO's waits for ever after 500 (`participants/page_error.py`).
+    A front end of another site gets status 200 instead, because HIPPO's waits without end after a 500
+    (`participants/page_error.py`).
     """
     request = Request.from_event(event)
     try:

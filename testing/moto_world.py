@@ -108,7 +108,7 @@ class MotoWorld:
         self._bridge()
         self._record()
         self._build()
-        self.platform = AwsPlatform.from_env(self.env)
+        self.platform = AwsPlatform(self.env)
         if self._enforce:
             self.enforce(IamEnforcement.of(self))
         return self

@@ -1,4 +1,4 @@
-"""The ports of `hippodrome.ports` on AWS: S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
+"""Implements the ports of `hippodrome.ports` on S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
 
 Importing this package is cheap: botocore is loaded when the first port is used.
 """

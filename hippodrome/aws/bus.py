@@ -1,4 +1,4 @@
-"""Messages between functions on SNS topics, and delayed ones on `task_changed`'s own SQS queue."""
+"""Sends messages between functions: by SNS topics, and with a delay by the SQS queue of `task_changed`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class SnsBus:
         self._sns().publish(TopicArn=self._need(TOPICS[topic]), Message=json.dumps(dict(message)))
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        """Raises ValueError for a delay that SQS would refuse or shorten silently."""
+        """One SendMessage. Raises ValueError for a delay outside SQS's limits, 0 to `MAX_DELAY` seconds."""
         if not 0 <= seconds <= MAX_DELAY:
-            raise ValueError(f"a message can be held back for 0 to {MAX_DELAY} seconds, not {seconds}")
+            raise ValueError(f"a message can be delayed by 0 to {MAX_DELAY} seconds, not {seconds}")
         self._sqs().send_message(
             QueueUrl=self._need("TASK_QUEUE_URL"), MessageBody=json.dumps(dict(message)), DelaySeconds=seconds
         )

@@ -1,12 +1,12 @@
-"""ACME's DNS-01 challenges in a Route 53 hosted zone.
+"""Publishes ACME's DNS-01 challenges as TXT records in a Route 53 hosted zone.
 
-Facts (Route 53 API Reference and Developer Guide, read November 2026): a TXT value is quoted, at most 255 characters a
-string. UPSERT replaces the whole record. DELETE must name the present values and TTL, else it is refused with
-InvalidChangeBatch. INSYNC means that every name server of the zone answers with the change.
+Facts (Route 53 API Reference and Developer Guide, read November 2026): a TXT value is one or more quoted strings of at
+most 255 characters. UPSERT replaces the whole record. DELETE must name the present values and TTL; otherwise Route 53
+refuses it with InvalidChangeBatch. INSYNC means that every name server of the zone answers with the change.
 
-Needs route53:ChangeResourceRecordSets with UPSERT and DELETE of TXT at `_acme-challenge.<domain>`, and
-route53:GetChange, but no right to list the zone. So values of another program in that record are replaced: if it proves
-the domain in the same minute, it has to start again.
+The caller's role needs route53:ChangeResourceRecordSets with UPSERT and DELETE of TXT at `_acme-challenge.<domain>`,
+and route53:GetChange. It needs no right to list the zone, so an UPSERT also replaces another program's values in that
+record: a program that proves the same domain in the same minute has to begin again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hippodrome.aws import errors
 from hippodrome.certificates.rules import FailureReason, OrderFailed
 
 TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
-POLL_PAUSE = 3.0  # seconds between two calls of GetChange; a change is usually INSYNC within half a minute
+POLL_PAUSE = 3.0  # seconds between two calls of GetChange; a change is usually INSYNC within 30 seconds
 
 
 class Route53Challenges:
@@ -42,18 +42,18 @@ class Route53Challenges:
             if errors.code(error) == "NoSuchHostedZone":
                 raise OrderFailed(FailureReason.DNS, "the hosted zone does not exist any more") from error
             if errors.code(error) == "InvalidChangeBatch":  # such as a CNAME of that name, or a name outside the zone
-                raise OrderFailed(FailureReason.DNS, f"Route 53 does not take a TXT record {name}") from error
+                raise OrderFailed(FailureReason.DNS, f"Route 53 refuses the TXT record {name}") from error
             raise
         while self._client().get_change(Id=change)["ChangeInfo"]["Status"] != "INSYNC":
             if time.monotonic() + POLL_PAUSE > deadline:
-                raise OrderFailed(FailureReason.TIMEOUT, "Route 53's name servers did not take over the record in time")
+                raise OrderFailed(FailureReason.TIMEOUT, "the TXT record did not reach Route 53's name servers in time")
             self._sleep(POLL_PAUSE)
 
     def remove(self, name: str, values: Sequence[str]) -> None:
         try:
             self._change("DELETE", name, values)
         except ClientError as error:
-            # Deleted already, or replaced by another program.
+            # InvalidChangeBatch: the record is deleted already, or another program has replaced its values.
             if errors.code(error) not in {"InvalidChangeBatch", "NoSuchHostedZone"}:
                 raise
 

@@ -1,4 +1,4 @@
-"""DNS records of servers in a Route 53 hosted zone.
+"""Creates, deletes and lists the servers' DNS records in a Route 53 hosted zone.
 
 Facts (Route 53 Developer Guide and API Reference, read November 2026):
 
@@ -7,14 +7,14 @@ Facts (Route 53 Developer Guide and API Reference, read November 2026):
   message names each offender: "[Tried to delete resource record set [name='a.example.org.', type='A'] but it was not
   found]", or "… but the values provided do not match the current values".
 * Route 53 returns names with a final dot, and characters other than letters, digits and `-_.` as octal codes (`\\052`).
-* Concurrent changes of a zone are refused with PriorRequestNotComplete. The account has 10 calls/s (burst 50) and, as
-  of 2026, 100 changes/s (burst 1,500), an UPSERT counting twice ("Throttling for Amazon Route 53 API requests").
-  Refused calls are retried for a while. A batch larger than the burst would never be accepted.
+* Concurrent changes of a zone are refused with PriorRequestNotComplete. The account may make 10 calls/s (burst 50) and,
+  as of 2026, 100 changes/s (burst 1,500), an UPSERT counting twice ("Throttling for Amazon Route 53 API requests").
+  `aws/retry.py` repeats refused calls for up to 30 seconds. A batch larger than the burst would never be accepted.
 * An UPSERT that cannot be applied refuses the whole batch too, with InvalidChangeBatch or InvalidInput: a label of more
   than 63 bytes ("FATAL problem: DomainLabelTooLong (Domain label is too long) encountered with '…'", external-dns
   2839), or a name that has a CNAME ("RRSet of type A with DNS name … is not permitted because a conflicting RRSet of
   type CNAME with the same DNS name already exists", external-dns 1517). Such a batch is halved until only those remain.
-* A zone that was deleted (NoSuchHostedZone) has no records, so removals succeed and servers can be stopped.
+* A zone that was deleted (NoSuchHostedZone) has no records. Removals succeed then, so that servers can be stopped.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ _OCTAL = re.compile(r"\\([0-7]{3})")
 
 
 class Route53Dns:
-    """Implements `hippodrome.ports.Dns`. A change's id is Route 53's; a large change has several, with commas."""
+    """Implements `hippodrome.ports.Dns`. A change's id is Route 53's; with several batches, theirs joined by commas."""
 
     def __init__(self, client: Callable[[], Any], need: Callable[[str], str], host: str = "") -> None:
-        """`host`: the level below `ROOT_DOMAIN` of the servers' names."""
+        """Use this client. `need` returns an environment variable. Servers' names lie in `{host}.{ROOT_DOMAIN}`."""
         self._client = client
         self._need = need
         self._host = host
@@ -56,8 +56,8 @@ class Route53Dns:
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         """One ChangeResourceRecordSets per 400 records. A record that is both added and removed is added.
 
-        If a removed record is gone or has another value by now, the batch is sent again without it. The same happens
-        for a refused addition, which `RefusedDnsRecords` names. Returns "" if nothing remained to change.
+        If a record to remove does not exist, or has another value, the batch is sent again without it. A refused
+        addition is left out as well, and `RefusedDnsRecords` names it. Returns "" if nothing was left to change.
         """
         added = {record.name: record for record in add}
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
@@ -84,9 +84,10 @@ class Route53Dns:
             raise
 
     def list(self) -> Iterator[DnsRecord]:
-        """The A records of the form that `change` creates, on the servers' level. 300 records of the zone a request.
+        """Yield the A records that `change` may have created: of its form, and below the domain of servers' names.
 
-        Includes those directly below `ROOT_DOMAIN`, where earlier versions created them.
+        Includes records directly below `ROOT_DOMAIN`, where earlier versions created them. One request for each 300
+        records of the zone.
         """
         domain = self._need("ROOT_DOMAIN").strip(".").lower()
         parents = {domain, f"{self._host}.{domain}"}
@@ -111,7 +112,7 @@ class Route53Dns:
                 raise
 
     def _change_batch(self, changes: _Changes, refused: _Refused) -> str:
-        """Make these changes, without removals of deleted records; refused additions are appended to `refused`."""
+        """Make these changes; return the change's id, or "" if none was left. Appends refused names to `refused`."""
         while changes:
             try:
                 return self._send(changes)
@@ -120,14 +121,14 @@ class Route53Dns:
                     return ""
                 if errors.code(error) not in _REFUSALS:
                     raise
-                left = _without_deleted(changes, _error_text(error))
-                if len(left) == len(changes):
+                remaining = _without_deleted(changes, _error_text(error))
+                if len(remaining) == len(changes):
                     return self._change_halves(changes, refused, error)
-                changes = left
+                changes = remaining
         return ""
 
     def _change_halves(self, changes: _Changes, refused: _Refused, error: ClientError) -> str:
-        """Make each half on its own, down to the single change that fails: the message does not say which it is."""
+        """Send each half on its own, down to the single refused change: the error does not say which one it is."""
         if len(changes) > 1:
             half = len(changes) // 2
             made = [self._change_batch(part, refused) for part in (changes[:half], changes[half:])]
@@ -166,12 +167,12 @@ def _change(action: str, record: DnsRecord) -> dict[str, Any]:
 
 
 def _without_deleted(changes: _Changes, text: str) -> _Changes:
-    """The changes without the removals of records that are deleted already, as `text` says."""
-    gone: set[str] = set()
+    """The changes without the removals of records that do not exist any more, according to Route 53's error text."""
+    deleted: set[str] = set()
     for sentence in re.split(r"(?=Tried to )", text):
         if sentence.startswith("Tried to delete") and _ALREADY_DELETED.search(sentence):
-            gone.update(_normalised(name) for name in _NAMED.findall(sentence))
-    return [c for c in changes if c["Action"] != "DELETE" or _normalised(c["ResourceRecordSet"]["Name"]) not in gone]
+            deleted.update(_normalised(name) for name in _NAMED.findall(sentence))
+    return [c for c in changes if c["Action"] != "DELETE" or _normalised(c["ResourceRecordSet"]["Name"]) not in deleted]
 
 
 def _error_text(error: ClientError) -> str:

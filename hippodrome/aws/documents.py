@@ -1,9 +1,9 @@
-"""Documents on S3, with its conditional writes.
+"""Reads and writes documents in an S3 bucket, with S3's conditional writes.
 
-Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): a failed
-condition is 412; a write concurrent with another of the same key is 409 ConditionalRequestConflict and wrote nothing;
-`If-Match` on a deleted key is 404. Reading a missing key is 404 only for callers with `s3:ListBucket`; without that
-permission it is 403, which is raised unchanged.
+Facts (S3 User Guide, "How to prevent object overwrites with conditional writes", read November 2026): S3 answers 412 if
+the condition fails, 409 ConditionalRequestConflict if another write of the same key is under way (this one wrote
+nothing then), and 404 to `If-Match` on a deleted key. A GET of a missing key gets 404 only if the caller has
+`s3:ListBucket`. Otherwise it gets 403, which is raised unchanged.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.ports import Conflict, Document, Entry
 
-MAX_WRITES = 4  # attempts at a write that is concurrent with others
+MAX_WRITES = 4  # attempts at a write that S3 answers with 409
 PAUSE = 0.05  # seconds; doubled after each 409, half of it random
 
 CONTENT_TYPES = {
@@ -47,15 +47,15 @@ CONTENT_TYPES = {
 
 
 def content_type(key: str) -> str:
-    """The Content-Type of a document, by the suffix of its key."""
+    """The Content-Type of a document, from the suffix of its key; `application/octet-stream` for other suffixes."""
     return CONTENT_TYPES.get(key.rpartition("/")[2].rpartition(".")[2].lower(), "application/octet-stream")
 
 
 class S3Documents:
     """Implements `hippodrome.ports.Documents` in one bucket. ETags are S3's, quotation marks included.
 
-    After a lost reply botocore sends a write again, and S3 may then answer 412 to the very writer that succeeded. That
-    is a `Conflict` here too: the caller must read the document again before it concludes that another writer won.
+    If a reply is lost, botocore sends the write again, and S3 may answer 412 although the first write succeeded. This
+    raises `Conflict` too, so the caller must read the document before it concludes that another writer won.
     """
 
     def __init__(self, client: Callable[[], Any], bucket: str) -> None:
@@ -63,7 +63,7 @@ class S3Documents:
         self.bucket = bucket
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        """The document, or None; `known` itself if it has not changed (304, without a body)."""
+        """One GetObject. Return the document; None if it is missing; `known` itself if it has not changed (304)."""
         condition = {"IfNoneMatch": known.etag} if known else {}
         try:
             found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
@@ -85,7 +85,7 @@ class S3Documents:
         self._put(key, body, {})
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """One request for each 1,000 keys, sent when the keys before were taken."""
+        """One ListObjectsV2 for each 1,000 keys, sent when the caller has taken the keys before."""
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
         for page in pages:
             for line in page.get("Contents", ()):

@@ -1,4 +1,4 @@
-"""The parts of a botocore error."""
+"""Reads the code, the message and the HTTP status of a botocore error."""
 
 from __future__ import annotations
 

@@ -38,26 +38,22 @@ T = TypeVar("T")
 
 
 class AwsPlatform:
-    """Implements `hippodrome.ports.Platform`. `env` holds the environment variables of the functions.
+    """Implements `hippodrome.ports.Platform`.
 
     One client per service is created when first needed; several threads may use it. No call takes longer than
     `ATTEMPTS` times the connect and read timeouts, plus the backoff between: 24 s, for ECS and EC2 39 s.
     """
 
     def __init__(self, env: Mapping[str, str], session: Any = None, client_lock: threading.Lock | None = None) -> None:
-        """`session`: a botocore session with the caller's credentials; by default those of the environment.
+        """Use the settings in `env`, the functions' environment variables, each of which is read when it is needed.
 
-        `client_lock` is held while a client is created. Pass one to share a session with other creators of clients.
+        `session`: a botocore session with the caller's credentials; by default those of the environment.
+        `client_lock` is held while a client is created. Pass one if other code creates clients of the same session.
         """
         self._env = env
         self._given_session = session
         self._clients: dict[str, Any] = {}
         self._client_lock = client_lock or threading.Lock()
-
-    @classmethod
-    def from_env(cls, env: Mapping[str, str]) -> AwsPlatform:
-        """The platform for these environment variables (`os.environ` in a function), which are read when needed."""
-        return cls(env)
 
     @cached_property
     def settings(self) -> Settings:
@@ -72,7 +68,7 @@ class AwsPlatform:
 
     @cached_property
     def signer(self) -> S3Signer:
-        """Presigned requests, for `sign_requests`. No port, since only AWS has them. Needs `BUCKET`."""
+        """The signer of `sign_requests`. It is no port: on one machine nothing is signed. Needs `BUCKET`."""
         from hippodrome.aws.signer import S3Signer
 
         def credentials() -> Any:
@@ -92,7 +88,7 @@ class AwsPlatform:
 
     @cached_property
     def dns(self) -> Route53Dns:
-        """Needs `HOSTED_ZONE_ID`, and `ROOT_DOMAIN` (with `SERVERS_HOST`) to list; `browser_host` needs none."""
+        """The DNS records. Needs `HOSTED_ZONE_ID`; to list them, `ROOT_DOMAIN` too. `browser_host` needs none."""
         from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
@@ -107,14 +103,14 @@ class AwsPlatform:
 
     @cached_property
     def bus(self) -> SnsBus:
-        """The topics. Needs the ARN of the topic it publishes to, and `TASK_QUEUE_URL` for `send_delayed`."""
+        """The messages. Needs the ARN of the topic to publish to; `TASK_QUEUE_URL` for `send_delayed`."""
         from hippodrome.aws.bus import SnsBus
 
         return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
 
     @cached_property
     def challenges(self) -> Route53Challenges:
-        """Where a certificate's DNS-01 challenges are published. No port, since only AWS has them."""
+        """The TXT records of DNS-01 challenges. It is no port: one machine orders no certificate."""
         from hippodrome.aws.challenges import Route53Challenges
 
         return Route53Challenges(lambda: self._client("route53"), self._needs("challenges"))
@@ -123,7 +119,7 @@ class AwsPlatform:
         return datetime.now(UTC)
 
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
-        """Uses at most `MAX_THREADS` threads, since the calls of a batch mostly wait for the network."""
+        """Call the functions on up to `MAX_THREADS` threads: the calls of a batch mostly wait for the network."""
         if len(acts) < 2:
             return [act() for act in acts]
         from concurrent.futures import ThreadPoolExecutor
@@ -133,7 +129,7 @@ class AwsPlatform:
             return [one.result() for one in [pool.submit(copy_context().run, act) for act in acts]]
 
     def _needs(self, port: str) -> Callable[[str], str]:
-        """A function that reads variables for that port. It raises RuntimeError, naming both, if one is missing."""
+        """Return a function that reads a variable for this port. It raises RuntimeError if the variable is missing."""
 
         def need(variable: str) -> str:
             value = self._env.get(variable, "").strip()

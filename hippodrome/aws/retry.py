@@ -1,9 +1,9 @@
-"""Retries for calls that AWS refuses while it is busy with another change of ours, or whose response is cut off.
+"""Repeats calls that AWS refuses while it is busy with another change, or whose response is cut off.
 
 Route 53 refuses concurrent changes of a hosted zone with PriorRequestNotComplete; its API Reference asks to retry "in
-intervals of increasing duration". The queue would deliver the message again too, but only after its visibility timeout,
-and a participant waits for that DNS record. The retries end well before the function's timeout of 60 seconds, so that
-the function can still report what it has not done.
+intervals of increasing duration". The queue would deliver the message again as well, but only after its visibility
+timeout, and a participant waits for that DNS record. The retries end well before the function's timeout of 60 seconds,
+so that the function can still report the messages that it has not handled.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from hippodrome.ports import ServiceBusy
 
 T = TypeVar("T")
 MAX_TRIES = 20
-FIRST, LONGEST = 0.5, 4.0  # seconds; each wait is a random part of the interval
-MAX_SECONDS = 30.0  # the tries included
+FIRST, LONGEST = 0.5, 4.0  # seconds: the interval after the first try, and the longest; a wait is a random part of it
+MAX_SECONDS = 30.0  # of all tries and waits together
 
 
 def retry_while_busy(
@@ -28,7 +28,7 @@ def retry_while_busy(
     chance: Callable[[], float] = random.random,
     clock: Callable[[], float] = time.monotonic,
 ) -> T:
-    """Return the result of `call`, repeating it while `busy` accepts its exception.
+    """Return the result of `call`; repeat it as long as it raises an exception for which `busy` returns True.
 
     Raises `ServiceBusy` after `MAX_TRIES` or `MAX_SECONDS`, and any other exception at once.
     """

@@ -1,9 +1,9 @@
-"""Presigned requests of S3, by Signature Version 4.
+"""Makes presigned requests of S3 with Signature Version 4.
 
 Facts. A presigned request has the rights of its signer, and expires at the latest with the signer's credentials (S3
 User Guide, "Download and upload objects with presigned URLs", read November 2026). The sender must send every signed
 header with exactly the signed value. `generate_presigned_url` uses Signature Version 2 by default, which silently
-leaves out conditions such as `If-None-Match` (boto3 issue 4367), so nothing here depends on the client's defaults.
+leaves out conditions such as `If-None-Match` (boto3 issue 4367), so this module signs requests itself.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from hippodrome.servers.signing import Presigned
 
 
 class S3Signer:
-    """Implements `hippodrome.servers.signing.Signer` for the documents of one bucket. Makes no call."""
+    """Implements `hippodrome.servers.signing.Signer` for the documents of one bucket. Makes no AWS call."""
 
     def __init__(self, client: Callable[[], Any], credentials: Callable[[], Any], bucket: str) -> None:
-        """`credentials` returns the present ones, frozen: those of a role change while a function lives."""
+        """`credentials` returns the present frozen credentials: a role's change while its function lives."""
         self._client = client
         self._credentials = credentials
         self._bucket = bucket
@@ -32,7 +32,7 @@ class S3Signer:
         return self._signed("GET", key, {}, seconds)
 
     def presign_put(self, key: str, size: int, seconds: int) -> Presigned:
-        """Condition and length are signed too: the request overwrites nothing and carries exactly `size` bytes."""
+        """Sign the condition and the length too: the request overwrites nothing and carries exactly `size` bytes."""
         headers = {"Content-Length": str(size), "Content-Type": content_type(key), "If-None-Match": "*"}
         return self._signed("PUT", key, headers, seconds)
 
@@ -43,7 +43,7 @@ class S3Signer:
         return Presigned(method, request.url, headers)
 
     def _url(self, endpoint: str, key: str) -> str:
-        """The URL: the bucket is part of the host on AWS, and of the path on emulators."""
+        """The URL of the document: the bucket is part of the host on AWS, and of the path on emulators."""
         parts = urlsplit(endpoint)
         path = quote(key, safe="/~")
         if (parts.hostname or "").endswith((".amazonaws.com", ".amazonaws.com.cn")) and "." not in self._bucket:

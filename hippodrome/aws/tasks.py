@@ -1,9 +1,9 @@
-"""Servers as ECS tasks on Fargate, and their public addresses from EC2.
+"""Runs servers as ECS tasks on Fargate, and reads their public addresses from EC2.
 
 Facts (ECS API Reference and Developer Guide, read November 2026):
 
-* A `clientToken` makes RunTask repeatable within a cluster for 24 hours at most. With other parameters it is a
-  ConflictException that names the tasks it already ran.
+* A `clientToken` makes RunTask repeatable within a cluster for 24 hours at most. A call with the same token and other
+  parameters is a ConflictException that names the tasks of the first call.
 * `startedBy` must be the only filter of ListTasks.
 * The overrides may have 8,192 characters, including those of the JSON syntax.
 * A capacity provider's `weight` is 0 by default, and one with 0 places no tasks.
@@ -36,8 +36,8 @@ CONTAINER = "trial"  # the name of the container in the task definition
 MAX_OVERRIDES = 8192  # characters
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
 NO_CONTAINER_INSIGHTS = [{"name": "containerInsights", "value": "disabled"}]
-"""Overrides the account's setting (API Reference, ClusterSetting): Container Insights is billed per metric, and leaves
-behind a log group for each cluster."""
+"""The setting of participants' own clusters. It overrides the account's (API Reference, ClusterSetting): Container
+Insights is billed per metric, and leaves behind a log group for each cluster."""
 
 _NO_CAPACITY = re.compile(
     r"capacity is unavailable|insufficient capacity|(reached the|above your) limit|RESOURCE:|internal error",
@@ -102,16 +102,16 @@ class EcsTasks:
         try:
             self._ecs().stop_task(cluster=cluster, task=task, reason=reason[:255])
         except ClientError as error:
-            gone = errors.code(error) in {"InvalidParameterException", "ClientException"}
+            refused = errors.code(error) in {"InvalidParameterException", "ClientException"}
             if errors.code(error) != "ClusterNotFoundException" and not (
-                gone and _ALREADY_STOPPED.search(errors.message(error))
+                refused and _ALREADY_STOPPED.search(errors.message(error))
             ):
                 raise
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        """One DescribeNetworkInterfaces, and another one without the missing ids if some interfaces do not exist.
+        """One DescribeNetworkInterfaces. If some interfaces do not exist, another call without their ids.
 
-        A filter would accept missing ids, but for it EC2 pages through all interfaces of the account.
+        A filter would accept missing ids, but with a filter EC2 pages through all interfaces of the account.
         """
         wanted = sorted(set(interfaces))
         while wanted:
@@ -121,10 +121,10 @@ class EcsTasks:
                 if errors.code(error) != "InvalidNetworkInterfaceID.NotFound":
                     raise
                 missing = set(_INTERFACE.findall(errors.message(error)))
-                left = [interface for interface in wanted if interface not in missing]
-                if len(left) == len(wanted):
+                existing = [interface for interface in wanted if interface not in missing]
+                if len(existing) == len(wanted):
                     raise  # no id in the message is one of ours
-                wanted = left
+                wanted = existing
             else:
                 public = ((i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in found)
                 return {interface: Address(host) for interface, host in public if host}
@@ -141,7 +141,7 @@ class EcsTasks:
         return str(found[0]) if found else None
 
     def list(self) -> Iterator[RunningTask]:
-        """Tasks of the installation's cluster and of participants' own clusters, without those told to stop."""
+        """Yield the tasks in the installation's cluster and in participants' own, except those told to stop."""
         for cluster in itertools.chain([self._need("CLUSTER")], self.clusters()):
             yield from self._list(cluster)
 
@@ -149,7 +149,7 @@ class EcsTasks:
         self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS, settings=NO_CONTAINER_INSIGHTS)
 
     def delete_cluster(self, name: str) -> None:
-        """Raises ECS's ClusterContainsTasksException or UpdateInProgressException while a task ends in it."""
+        """One DeleteCluster. Raises ClusterContainsTasksException or UpdateInProgressException while a task ends."""
         try:
             self._ecs().delete_cluster(cluster=name)
         except ClientError as error:
@@ -157,7 +157,7 @@ class EcsTasks:
                 raise
 
     def clusters(self) -> Iterator[str]:
-        """Clusters whose name is a server's name."""
+        """Yield the clusters of the account whose names are names of servers."""
         for page in self._ecs().get_paginator("list_clusters").paginate():
             for arn in page["clusterArns"]:
                 name = str(arn).rpartition("/")[2]
@@ -165,7 +165,7 @@ class EcsTasks:
                     yield name
 
     def _overrides(self, request: TaskRequest) -> dict[str, Any]:
-        told = {
+        variables = {
             **request.environment,
             environment.STORE: self._need("SIGN_URL"),
             environment.HOST: "0.0.0.0",  # noqa: S104 - browsers connect to the trial
@@ -173,7 +173,7 @@ class EcsTasks:
         }
         container = {
             "name": CONTAINER,
-            "environment": [{"name": name, "value": value} for name, value in sorted(told.items())],
+            "environment": [{"name": name, "value": value} for name, value in sorted(variables.items())],
         }
         overrides = {
             "cpu": str(round(request.cpu * 1024)),
@@ -183,22 +183,22 @@ class EcsTasks:
         length = len(json.dumps(overrides))
         if length > MAX_OVERRIDES:
             raise Refused(
-                f"what the server should be told takes {length} characters, and ECS allows {MAX_OVERRIDES}; "
+                f"the server's environment takes {length} characters, and ECS allows {MAX_OVERRIDES}; "
                 "shorten the trial's settings in config.yml"
             )
         return overrides
 
     def draining(self, *clusters: str) -> Iterator[RunningTask]:
-        """Tasks of servers in these clusters that were told to stop and have not ended: they may still store data."""
+        """Yield the servers' tasks in these clusters that were told to stop and have not ended: they may store data."""
         for cluster in clusters:
             yield from self._list(cluster, "STOPPED")
 
     def count(self) -> int:
-        """How many tasks live in our clusters. Uses ListTasks alone: DescribeTasks would also return their secrets."""
+        """How many tasks live in our clusters. ListTasks alone: DescribeTasks would also return the tasks' secrets."""
         return sum(len(self.arns(cluster)) for cluster in [self._need("CLUSTER"), *self.clusters()])
 
     def arns(self, cluster: str) -> Sequence[str]:
-        """The ids of all living tasks in a cluster, ours or not; none if the cluster does not exist."""
+        """The ARNs of all living tasks in a cluster, servers or not; none if the cluster does not exist."""
         return [arn for page in self._pages(cluster, "RUNNING") for arn in page]
 
     def _list(self, cluster: str, desired: str = "RUNNING") -> Iterator[RunningTask]:
@@ -210,7 +210,7 @@ class EcsTasks:
                     raise
 
     def _pages(self, cluster: str, desired: str) -> Iterator[Sequence[str]]:
-        """Pages of at most 100 task ids; none if the cluster was deleted since it was listed."""
+        """Yield pages of at most 100 task ARNs; none if the cluster was deleted after it was listed."""
         try:
             for page in self._ecs().get_paginator("list_tasks").paginate(cluster=cluster, desiredStatus=desired):
                 yield page["taskArns"]
@@ -220,7 +220,7 @@ class EcsTasks:
 
 
 def client_token(request: TaskRequest) -> str:
-    """64 characters, the same for the same server and kind: a repeated RunTask returns the task of the first."""
+    """The clientToken, 64 hex digits, the same for one server and kind: a repeated RunTask returns the first task."""
     kind = "FARGATE_SPOT" if request.spot else "FARGATE"
     return hashlib.sha256(f"{request.name}\0{kind}\0{request.nonce}".encode()).hexdigest()
 
@@ -239,19 +239,18 @@ def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[Running
 
 def _run_error(error: ClientError, request: TaskRequest) -> Exception:
     """The port's error for a failed RunTask; the error itself if the caller can only retry later."""
-    same: Exception = error
     name, text = errors.code(error), errors.message(error)
     if _TRANSIENT.search(text) or name not in _REFUSALS:
-        return same
+        return error
     if _NO_CAPACITY.search(text):
         return NoCapacity(text)
     settling = name == "ClusterNotFoundException" or "capacity provider" in text.lower()
     if settling and ids.parse_server_name(request.cluster):
-        return same  # a participant's own cluster, created a moment ago
+        return error  # a participant's own cluster, created a moment ago
     return Refused(f"{name}: {text}")
 
 
 def _failures_error(reasons: Sequence[str]) -> Exception:
-    """The port's error for a RunTask that ran nothing and raised nothing."""
+    """The port's error for a RunTask that succeeded and yet ran no task."""
     text = "; ".join(reasons) or "RunTask started no task and gave no reason"
     return NoCapacity(text) if not reasons or _NO_CAPACITY.search(text) or _TRANSIENT.search(text) else Refused(text)

@@ -1,9 +1,9 @@
-"""One-time timers on EventBridge Scheduler, all in one schedule group.
+"""Sets one-time timers on EventBridge Scheduler, all in one schedule group.
 
 Facts (EventBridge Scheduler User Guide and API Reference, read November 2026). `at(yyyy-mm-ddThh:mm:ss)` is UTC unless
 a time zone is given. A schedule fires within the minute that begins at its time; `ActionAfterCompletion=DELETE` deletes
-it then. Names have 1 to 64 of `[0-9a-zA-Z-_.]`. No page documents a time in the past, and it was seen refused
-(DefangLabs/pulumi-defang, pull request 425), so it becomes `MIN_DELAY` from now.
+it then. A name has 1 to 64 characters of `[0-9a-zA-Z-_.]`. No page documents what a time in the past does, and
+Scheduler has refused one (DefangLabs/pulumi-defang, pull request 425), so such a time becomes `MIN_DELAY` from now.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hippodrome.aws import errors
 from hippodrome.ports import Message
 
 MIN_DELAY = timedelta(seconds=20)  # long enough for the request to arrive before that time
-MAX_TRIES = 3  # of create and update: the timer may be created or deleted between the two
+MAX_TRIES = 3  # of both calls together: another function may create or delete the timer between the two
 
 
 class SchedulerTimers:
@@ -31,7 +31,7 @@ class SchedulerTimers:
         self._now = now
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """One CreateSchedule, and an UpdateSchedule if the name exists. Raises ValueError if `at` has no time zone."""
+        """One CreateSchedule; an UpdateSchedule too if the name exists. Raises ValueError if `at` has no time zone."""
         if at.tzinfo is None:
             raise ValueError("a timer's time needs a time zone")
         schedule = self._schedule(name, max(at, self._now() + MIN_DELAY), message)
@@ -59,7 +59,7 @@ class SchedulerTimers:
                 raise
 
     def list(self) -> Iterator[str]:
-        """One request for each 100 timers."""
+        """One ListSchedules for each 100 timers."""
         pages = self._client().get_paginator("list_schedules").paginate(GroupName=self._need("SCHEDULE_GROUP"))
         for page in pages:
             for schedule in page["Schedules"]:

@@ -1,7 +1,7 @@
-"""One order of a certificate at an ACME certificate authority (RFC 8555), by DNS-01, with the library `acme`.
+"""Orders one certificate at an ACME certificate authority (CA, RFC 8555) by DNS-01, with the library `acme`.
 
-This module neither stores anything nor decides whether to order; see `renewal.py`. Importing it loads `acme` and
-`cryptography` (0.2 s and more), so it is imported only when needed.
+This module neither stores anything nor decides whether to order; `renewal.py` does both. Importing it loads `acme` and
+`cryptography` (0.2 s and more), so other modules import it only when they need it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from josepy.jwk import JWKEC
 from hippodrome.certificates.rules import FailureReason, OrderFailed, OrderStage, StoredCertificate, names_of
 
 REQUEST_SECONDS = 20  # for one response of the CA
-NONCE_ROUNDS = 4  # rounds of two attempts if the CA refuses a nonce; each refusal brings a new one
+NONCE_ROUNDS = 4  # rounds of two attempts if the CA refuses a nonce; each refusal brings a new nonce
 MAX_WAIT = timedelta(days=8)  # the longest Retry-After accepted: Let's Encrypt's windows have 7 days
-DEFAULT_WAIT = timedelta(hours=1)  # if a CA is rate limited and sends no Retry-After
+DEFAULT_WAIT = timedelta(hours=1)  # if a CA refuses with `rateLimited` and sends no Retry-After
 
 _RETRY_AFTER = re.compile(r"retry after (\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)", re.IGNORECASE)
 _LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
@@ -43,7 +43,7 @@ _ORIGIN = "Hippodrome: ordered at "
 
 @dataclass(frozen=True)
 class Issued:
-    """A new certificate: its private key and chain (PEM), and its contents."""
+    """A new certificate: its private key and its chain (PEM), and what its first certificate says."""
 
     key: str = field(repr=False)
     chain: str
@@ -57,13 +57,13 @@ class Issued:
 
 @dataclass(frozen=True)
 class OrderRequest:
-    """What to order, where, and with which account."""
+    """One order: the certificate's domain, the ACME directory, and the account."""
 
     directory: str
     domain: str  # the certificate is for its wildcard, `*.domain`
     account: Mapping[str, Any] = field(repr=False)  # the JWK of the account key
     email: str = ""
-    trusted: str = ""  # root certificates (PEM) for the directory's own HTTPS; "" for the public ones
+    trusted: str = ""  # the root certificates (PEM) to trust at the directory's HTTPS address; "": the public ones
     seconds: float = 300.0  # for the whole order
 
 
@@ -83,8 +83,9 @@ def order(
 ) -> Issued:
     """Place the order, prove control of the domain, fetch the certificate and verify it.
 
-    `publish` gets the values of the TXT record, and the seconds within which they must be visible. The caller removes
-    them afterwards in any case. Raises OrderFailed, and what `publish` raises.
+    Calls `tell` at each stage, and `publish` with the values of the TXT record and the seconds within which they must
+    be visible. The caller must remove these values afterwards, also if the order fails. Raises OrderFailed, and the
+    exceptions of `publish`.
     """
     deadline = time.monotonic() + request.seconds
     names = names_of(request.domain)
@@ -117,7 +118,7 @@ def order(
 
 
 def read_stored(privkey: bytes) -> StoredCertificate | None:
-    """The certificate in `privkey.pem`; None if we did not order it. A damaged one has no names and has expired."""
+    """The certificate in `privkey.pem`; None if we did not order it. See `read_or_expired` for a damaged one."""
     origin, _, rest = privkey.partition(b"\n")
     directory = origin.decode(errors="replace").strip()
     if not directory.startswith(_ORIGIN):
@@ -139,12 +140,12 @@ def chain_of(privkey: bytes) -> bytes:
 
 
 def read_chain(pem: bytes, directory: str = "") -> StoredCertificate:
-    """The contents of the first certificate in this PEM. Raises OrderFailed (WRONG) if there is none."""
+    """Read the first certificate in this PEM. Raises OrderFailed (WRONG) if there is none."""
     try:
         first = x509.load_pem_x509_certificate(pem)
         names = first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (ValueError, x509.ExtensionNotFound) as error:
-        raise OrderFailed(FailureReason.WRONG, "what should be a certificate is none that can be read") from error
+        raise OrderFailed(FailureReason.WRONG, "the certificate cannot be read") from error
     return StoredCertificate(
         names=tuple(sorted(names.get_values_for_type(x509.DNSName))),
         serial=f"{first.serial_number:x}",
@@ -158,7 +159,7 @@ def read_chain(pem: bytes, directory: str = "") -> StoredCertificate:
 
 
 class _Network(client.ClientNetwork):
-    """`acme` retries only once after a refused nonce; a CA may refuse several in a row."""
+    """Retries more often after a refused nonce than `acme`, which does so once: a CA may refuse several in a row."""
 
     def post(self, *args: Any, **kwargs: Any) -> requests.Response:
         for _ in range(NONCE_ROUNDS - 1):
@@ -172,7 +173,7 @@ class _Network(client.ClientNetwork):
 
 @contextmanager
 def _network(request: OrderRequest) -> Iterator[tuple[_Network, dict[str, datetime]]]:
-    """The connection, and a dict with the time of the last Retry-After, which `acme` does not expose."""
+    """The connection, and a dict whose `until` is the time of the last Retry-After, which `acme` does not expose."""
     retry_after: dict[str, datetime] = {}
 
     def note(response: requests.Response, *_: Any, **__: Any) -> None:
@@ -200,11 +201,11 @@ def _network(request: OrderRequest) -> Iterator[tuple[_Network, dict[str, dateti
 
 
 def _authority(request: OrderRequest, network: _Network) -> client.ClientV2:
-    """The CA, with our account: created now, or found by its key."""
+    """The client of the CA, with our account: opened now, or found by its key."""
     authority = client.ClientV2(client.ClientV2.get_directory(request.directory, network), network)
     if authority.external_account_required():
         raise OrderFailed(
-            FailureReason.REFUSED, "it wants an account that was opened elsewhere (external account binding)"
+            FailureReason.REFUSED, "it only takes accounts that were opened on its website (external account binding)"
         )
     wanted = messages.NewRegistration.from_data(email=request.email or None, terms_of_service_agreed=True)
     try:
@@ -221,7 +222,7 @@ def _pending_challenges(ordered: messages.OrderResource, domain: str) -> list[me
     """The challenges to answer; none if the CA still accepts an earlier proof."""
     pending = [one for one in ordered.authorizations if one.body.status != messages.STATUS_VALID]
     if any(one.body.identifier.value != domain for one in pending):
-        raise OrderFailed(FailureReason.BROKEN, "it wants a proof for another name than was ordered")
+        raise OrderFailed(FailureReason.BROKEN, "it wants a proof for another name than the one ordered")
     return [_dns01(one) for one in pending]
 
 
@@ -234,7 +235,7 @@ def _dns01(authorization: messages.AuthorizationResource) -> messages.ChallengeB
 
 
 def _acme_deadline(deadline: float) -> datetime:
-    """The deadline in the form of `acme`: local time without a time zone."""
+    """This deadline, a `time.monotonic` value, as `acme` wants it: local time without a time zone."""
     return datetime.now() + timedelta(seconds=deadline - time.monotonic())
 
 
@@ -243,16 +244,16 @@ def _verify(issued: Issued, names: Sequence[str]) -> None:
     key = serialization.load_pem_private_key(issued.key.encode(), None)
     chain = x509.load_pem_x509_certificates(issued.chain.encode())
     if chain[0].public_key() != key.public_key():
-        raise OrderFailed(FailureReason.WRONG, "the certificate that came is for another key")
+        raise OrderFailed(FailureReason.WRONG, "the new certificate is for another key")
     if list(issued.stored.names) != sorted(names):
-        raise OrderFailed(FailureReason.WRONG, f"the certificate that came is for {', '.join(issued.stored.names)}")
+        raise OrderFailed(FailureReason.WRONG, f"the new certificate is for {', '.join(issued.stored.names)}")
     if issued.stored.not_after <= datetime.now(UTC):
-        raise OrderFailed(FailureReason.WRONG, "the certificate that came has expired")
+        raise OrderFailed(FailureReason.WRONG, "the new certificate has expired")
     for below, above in itertools.pairwise(chain):
         try:
             below.verify_directly_issued_by(above)
         except (ValueError, TypeError, InvalidSignature) as error:
-            raise OrderFailed(FailureReason.WRONG, "the chain of the certificate that came does not hold") from error
+            raise OrderFailed(FailureReason.WRONG, "the chain of the new certificate is not valid") from error
 
 
 # ---- errors
@@ -270,12 +271,12 @@ def _errors_translated(retry_after: Mapping[str, datetime]) -> Iterator[None]:
     except errors.ValidationError as error:
         raise _invalid(error, retry_after) from error
     except errors.TimeoutError as error:
-        raise OrderFailed(FailureReason.TIMEOUT, "it did not come to an end in time") from error
+        raise OrderFailed(FailureReason.TIMEOUT, "it did not finish in time") from error
     except requests.exceptions.JSONDecodeError as error:
-        raise OrderFailed(FailureReason.BROKEN, "it answers with something that is no JSON") from error
+        raise OrderFailed(FailureReason.BROKEN, "its answer is not JSON") from error
     except requests.exceptions.SSLError as error:
         raise OrderFailed(
-            FailureReason.UNREACHABLE, "the certificate of its own address is not trusted here"
+            FailureReason.UNREACHABLE, "the certificate of its own HTTPS address is not trusted here"
         ) from error
     except requests.exceptions.RequestException as error:
         raise OrderFailed(FailureReason.UNREACHABLE, f"it cannot be reached ({type(error).__name__})") from error
@@ -284,7 +285,7 @@ def _errors_translated(retry_after: Mapping[str, datetime]) -> Iterator[None]:
         if isinstance(answer, requests.Response) and answer.status_code >= 500:
             raise OrderFailed(FailureReason.UNREACHABLE, f"it answers HTTP {answer.status_code}") from error
         raise OrderFailed(
-            FailureReason.BROKEN, f"it answers otherwise than expected ({type(error).__name__})"
+            FailureReason.BROKEN, f"its answer is not the expected one ({type(error).__name__})"
         ) from error
 
 
@@ -317,9 +318,9 @@ def _invalid(error: errors.ValidationError, retry_after: Mapping[str, datetime])
 
 def _text(error: messages.Error) -> str:
     """The CA's message in one line, without control characters, since it may be printed in a terminal."""
-    said = [error.detail or error.title or str(error.typ or "no reason given")]
-    said += [problem.detail for problem in error.subproblems or () if problem.detail]
-    return " ".join("".join(c if c.isprintable() else " " for c in " ".join(said)).split())[:1000]
+    sentences = [error.detail or error.title or str(error.typ or "no reason given")]
+    sentences += [problem.detail for problem in error.subproblems or () if problem.detail]
+    return " ".join("".join(c if c.isprintable() else " " for c in " ".join(sentences)).split())[:1000]
 
 
 def _parse_retry_after(header: str) -> datetime | None:

@@ -1,8 +1,8 @@
-"""Orders a certificate and stores it where the servers read it: the decisions of `rules.py`, carried out on the ports.
+"""Orders a certificate if `rules.py` decides so, and stores it where the servers read it.
 
 A run first claims the order in `certificate.json`, by compare-and-swap, so two runs never order at the same time. If a
 run is killed, its claim expires after `rules.CLAIM`. One conditional write of `privkey.pem` replaces the certificate.
-All other documents follow from that one; if a run is interrupted, the next one repairs them.
+All other documents are derived from `privkey.pem`; if a run is interrupted, the next run repairs them.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from hippodrome.ports import Conflict, Document, Documents
 if TYPE_CHECKING:
     from hippodrome.certificates.order import Issued
 
-MAX_TRIES = 10  # at writing a document that other runs write too
+MAX_TRIES = 10  # for a conditional write of a document that other runs may write at the same time
 
 
 class Challenges(Protocol):
-    """Where TXT records are published."""
+    """Publishes and removes the TXT records of DNS-01 challenges."""
 
     def put(self, name: str, values: Sequence[str], seconds: float) -> None:
         """Set the values of the TXT record `name`; return once every name server of the zone has them.
 
-        Raises OrderFailed (DNS, or TIMEOUT after so many seconds), and the library's own errors.
+        Raises OrderFailed (DNS, or TIMEOUT after `seconds`), and the library's own errors.
         """
 
     def remove(self, name: str, values: Sequence[str]) -> None:
-        """Remove the record if these are its values."""
+        """Remove the record if it has exactly these values."""
 
 
 @dataclass(frozen=True)
 class RenewalRequest:
-    """The certificate to have: for which domain, from which ACME directory."""
+    """The certificate that should be stored: its domain and its ACME directory."""
 
     domain: str
     directory: str
     email: str = ""  # sent to the CA, not stored
-    trusted: str = ""
-    force: bool = False
-    seconds: float = 300.0
+    trusted: str = ""  # as in `order.OrderRequest`
+    force: bool = False  # as in `rules.decide`
+    seconds: float = 300.0  # for the whole order
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,10 @@ class RenewalOutcome:
 
 
 class Renewal:
-    """Renews the certificate at one location. Calls `tell` at each stage, and `note` with errors that stop nothing."""
+    """Renews the certificate at one location.
+
+    Calls `tell` at each stage of an order, and `note` with a text and each error that does not end the run.
+    """
 
     def __init__(
         self,
@@ -95,13 +98,13 @@ class Renewal:
         self._published: list[str] = []
 
     def read(self) -> tuple[CertificateRecord, StoredCertificate | None]:
-        """The state and the stored certificate. Changes nothing."""
+        """Return the record in `certificate.json` and the stored certificate. Changes nothing."""
         return self._state()[0], self._stored()[0]
 
     def last_directory(self) -> str:
         """The ACME directory of the present or last certificate; "" if none was ever ordered.
 
-        If there never was one at this location, that of the certificate that earlier versions kept.
+        If this location never had a certificate, the directory of the one at `FORMER`.
         """
         state, stored = self.read()
         found = stored.directory if stored else state.directory
@@ -110,19 +113,19 @@ class Renewal:
         return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).last_directory()
 
     def last_roots(self, directory: str) -> str:
-        """The root certificates (PEM) last used for this directory's own HTTPS; "" for the public ones."""
+        """The root certificates (PEM) last trusted at this directory's HTTPS address; "" for the public ones."""
         state = self.read()[0]
         if not state.directory and self._location != FORMER:
             state = Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).read()[0]
         return state.trusted if state.directory == directory else ""
 
     def decide(self, wanted: RenewalRequest) -> Decision:
-        """What `obtain` would do now."""
+        """Return what `obtain` would decide now."""
         state, stored = self.read()
         return self._decide(state, stored, wanted)
 
     def obtain(self, wanted: RenewalRequest) -> RenewalOutcome:
-        """Order if it is due. Raises OrderFailed and what the ports raise; the present certificate stays then."""
+        """Order the certificate if it is due. If this raises OrderFailed or a port's error, the present one stays."""
         token = secrets.token_hex(8)
         decision, before, stored = self._decide_and_claim(wanted, token)
         if decision.verdict is not Verdict.ORDER:
@@ -150,7 +153,7 @@ class Renewal:
             return CertificateRecord(), None
         try:
             return from_json(found.body, CertificateRecord), found
-        except ValueError as error:  # edited by hand; the certificate itself has what matters
+        except ValueError as error:  # edited by hand; the certificate itself has the names and the dates
             self._note(f"{self._location.state} cannot be read and is written anew", error)
             return CertificateRecord(), found
 
@@ -161,7 +164,7 @@ class Renewal:
             self._documents.replace(key, body, known.etag)
 
     def _change(self, change: Callable[[CertificateRecord], CertificateRecord | None]) -> bool:
-        """Apply `change` to the state and write it, also beside other writers; False if `change` returned None."""
+        """Apply `change` to the state and write it, again after each conflict; False if `change` returned None."""
         for _ in range(MAX_TRIES):
             state, known = self._state()
             wanted = change(state)
@@ -177,7 +180,7 @@ class Renewal:
     def _decide_and_claim(
         self, wanted: RenewalRequest, token: str
     ) -> tuple[Decision, Document | None, StoredCertificate | None]:
-        """Decide, and claim the order if there is one. Also returns the present `privkey.pem` and certificate."""
+        """Decide, and claim the order if one is due. Also return the present `privkey.pem` and its certificate."""
         for _ in range(MAX_TRIES):
             state, known = self._state()
             stored, before = self._stored()
@@ -198,7 +201,7 @@ class Renewal:
         return rules.decide(state, stored, wanted.directory, names, now=self._now(), force=wanted.force)
 
     def _record_result(self, token: str, change: Callable[[CertificateRecord], CertificateRecord]) -> None:
-        """Record how our order ended, unless another run has taken over. If that fails, the next run repairs it."""
+        """Record how our order ended, unless another run has claimed it. If that fails, the next run repairs it."""
         try:
             self._change(lambda state: change(state) if state.claim == token else None)
         except Exception as error:  # noqa: BLE001 - the certificate matters more than its state
@@ -217,7 +220,7 @@ class Renewal:
     # ---- the order
 
     def _order(self, wanted: RenewalRequest, token: str) -> Issued:
-        from hippodrome.certificates import order  # noqa: PLC0415 - see there
+        from hippodrome.certificates import order  # noqa: PLC0415 - its import is slow, see there
 
         def publish(values: list[str], seconds: float) -> None:
             if not self._change(lambda state: rules.with_challenges(state, values) if state.claim == token else None):
@@ -261,7 +264,7 @@ class Renewal:
         try:
             self._challenges.remove(txt_name(domain), values)
             self._change(lambda state: rules.without_challenges(state, values))
-        except Exception as error:  # noqa: BLE001 - an old TXT record does no harm, a lost certificate would
+        except Exception as error:  # noqa: BLE001 - an old TXT record does no harm; a lost certificate would
             self._note("the challenge's TXT record could not be removed", error)
 
     # ---- the certificate
@@ -306,7 +309,7 @@ class Renewal:
         raise Conflict(self._location.fullchain)
 
     def _repair(self, stored: StoredCertificate, wanted: RenewalRequest) -> None:
-        """Do what a killed run has left undone."""
+        """Finish what a killed run left undone: the chain, the state, the challenges."""
         self._copy_chain()
         state = self._state()[0]
         if state.serial != stored.serial:
@@ -317,7 +320,7 @@ class Renewal:
 
 
 def renew(renewal: Renewal, domain: str, seconds: float) -> RenewalOutcome | None:
-    """Renew the certificate from its present directory, as the timer does. None if none was ever ordered."""
+    """Renew the certificate from its present ACME directory, for the daily timer. None if none was ever ordered."""
     directory = renewal.last_directory()
     if not directory:
         return None
@@ -328,5 +331,5 @@ def renew(renewal: Renewal, domain: str, seconds: float) -> RenewalOutcome | Non
 def _read_keys(body: bytes) -> dict[str, dict[str, Any]]:
     found = json.loads(body)
     if not isinstance(found, dict):
-        raise ValueError(f"{ACCOUNT} is not what it should be")
+        raise ValueError(f"{ACCOUNT} is not a JSON object")
     return found

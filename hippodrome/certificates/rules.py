@@ -1,28 +1,28 @@
-"""The servers' TLS certificate: where it is stored, and when to order a new one. Pure.
+"""Decides where the servers' TLS certificate is stored, and when to order a new one. Pure.
 
-One certificate for `*.<the servers' domain>`, ordered by ACME (RFC 8555) with a DNS-01 challenge. It is stored under
-`SSL/<the servers' domain>/`, so that every server reads a certificate for its own name, also while an installation
-moves from one domain to another:
+All servers show one certificate for `*.<the servers' domain>`, ordered by ACME (RFC 8555) with a DNS-01 challenge. It
+is stored under `SSL/<the servers' domain>/`, so that every server reads a certificate for its own name, also while an
+installation moves from one domain to another:
 
 * `privkey.pem`: a line that names the certificate's ACME directory, the private key, and its chain. Writing this one
   document replaces the old certificate, so no reader ever sees a key without its chain.
 * `fullchain.pem`: a copy of the chain, where HIPPO's `ssl` section and other readers expect it.
-* `certificate.json`: `CertificateRecord`, what was ordered and when.
+* `certificate.json`: a `CertificateRecord`, which says what was ordered and when.
 
 `SSL/account.json` has the keys of our accounts, one for each ACME directory. Earlier versions kept a certificate for
-`*.<root domain>` in `SSL/` itself (`FORMER`); servers that they named still read it.
+`*.<root domain>` in `SSL/` itself (`FORMER`). Servers with names directly below the root domain read that one.
 
-A `privkey.pem` without that first line was put there by the administrator: it is left alone.
+If `privkey.pem` lacks that first line, the administrator has put it there, and no order replaces it.
 
 Facts of Let's Encrypt (its pages "Integration Guide", 23 June 2025, "Rate Limits", 12 June 2025, "Profiles",
 8 September 2026, and "Decreasing Certificate Lifetimes to 45 Days", 2 December 2025; read November 2026):
 
-* Renew with a third of the lifetime left, below 10 days of lifetime with half of it. The default profile gives 90 days,
-  64 from 10 February 2027, 45 from 16 February 2028; the profile `shortlived` gives 160 hours.
+* Renew a certificate when a third of its lifetime is left; when half of it is left, if the lifetime is below 10 days.
+  The default profile gives 90 days, 64 from 10 February 2027, 45 from 16 February 2028; `shortlived` gives 160 hours.
 * After failures wait 1, 10, 100 minutes, then a day; the administrator may retry earlier.
 * Limits: 5 failed validations per name and account an hour (one more every 12 minutes), 5 certificates for the same
   names in 7 days (one more every 34 hours), 10 new accounts per address in 3 hours. A request over a limit is refused
-  with a Retry-After. Staging has the same limits with larger numbers.
+  with a Retry-After. The staging directory has the same limits with larger numbers.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ STAGING = "https://acme-staging-v02.api.letsencrypt.org/directory"
 
 RENEW_BEFORE = timedelta(days=30)
 SHORT_LIVED = timedelta(days=10)
-CLAIM = timedelta(minutes=15)  # the longest order: the longest timeout of a Lambda function
-# The last one is less than a day, so that a daily timer tries every day, and not every other day.
+CLAIM = timedelta(minutes=15)  # how long a claim counts: no order takes longer than the longest timeout in Lambda
+# The wait after 1, 2, 3 and more failed orders. The last one is less than a day, so that a daily timer tries every day.
 BACKOFF = (timedelta(minutes=1), timedelta(minutes=10), timedelta(minutes=100), timedelta(hours=20))
 HOUR = timedelta(hours=1)
 MAX_VALIDATIONS_PER_HOUR = 4  # one less than Let's Encrypt allows
-MAX_FAILURES = 10
+MAX_FAILURES = 10  # failed orders that are stored
 MAX_TEXT = 1000  # characters of a CA's message that are stored
 
 
@@ -62,8 +62,8 @@ class Location(NamedTuple):
 
 
 FORMER = Location("SSL/fullchain.pem", "SSL/privkey.pem", "SSL/certificate.json")
-"""Where earlier versions kept the certificate of `*.<root domain>`. An `ssl` section that names these keys means the
-installation's certificate."""
+"""Where earlier versions kept the certificate of `*.<root domain>`. If a project's `ssl` section names these keys, it
+means the installation's certificate."""
 
 
 def location(domain: str, root_domain: str) -> Location:
@@ -74,7 +74,7 @@ def location(domain: str, root_domain: str) -> Location:
 
 
 class OrderStage(StrEnum):
-    """How far an order is, as shown to the administrator."""
+    """The stages of an order, worded for the administrator."""
 
     ACCOUNT = "opening the account"
     ORDER = "placing the order"
@@ -93,14 +93,14 @@ class FailureReason(StrEnum):
     DNS = "dns"  # the TXT record could not be published
     REFUSED = "refused"  # the CA refuses, and says why
     UNREACHABLE = "unreachable"  # the CA did not answer, or is busy
-    TIMEOUT = "timeout"  # it took too long
+    TIMEOUT = "timeout"  # the order took too long
     WRONG = "wrong"  # the certificate received is not the one ordered
     OVERTAKEN = "overtaken"  # another run has stored a certificate meanwhile
     BROKEN = "broken"  # anything else
 
 
 class OrderFailed(Exception):
-    """The order failed, and the certificate in use stays. `until`: the CA asks not to retry before."""
+    """The order failed, and the certificate in use stays. `until`: the CA asks for no retry before this time."""
 
     def __init__(self, reason: FailureReason, text: str, until: datetime | None = None) -> None:
         super().__init__(text)
@@ -112,7 +112,7 @@ UtcDatetime = Annotated[datetime, msgspec.Meta(tz=True)]
 
 
 class FailedOrder(Record, frozen=True):
-    """One order that failed."""
+    """An order that failed: when, at which ACME directory, the `FailureReason`, and its text."""
 
     at: UtcDatetime
     directory: str
@@ -122,7 +122,7 @@ class FailedOrder(Record, frozen=True):
 
 
 class CertificateRecord(Record, frozen=True):
-    """`certificate.json`: the certificate ordered last ("" and None if none was), and what happened since."""
+    """`certificate.json`: the certificate ordered last ("" and None if none was), and the failed orders since then."""
 
     schema: int = 1
     directory: str = ""
@@ -131,7 +131,7 @@ class CertificateRecord(Record, frozen=True):
     not_before: UtcDatetime | None = None
     not_after: UtcDatetime | None = None
     ordered: UtcDatetime | None = None
-    trusted: str = ""  # the root certificates (PEM) of a directory that is not public
+    trusted: str = ""  # the root certificates (PEM) to trust at the directory's HTTPS address; "": the public ones
     failures: tuple[FailedOrder, ...] = ()  # since the last success, oldest first
     claim: str = ""  # the token of the run that is ordering now
     claimed: UtcDatetime | None = None
@@ -140,7 +140,7 @@ class CertificateRecord(Record, frozen=True):
 
 @dataclass(frozen=True)
 class StoredCertificate:
-    """The certificate in the bucket."""
+    """The names and dates of the certificate in the bucket."""
 
     names: tuple[str, ...]
     serial: str
@@ -149,12 +149,12 @@ class StoredCertificate:
     directory: str = ""  # the ACME directory that issued it; "" if the administrator put it there
 
     def days_left(self, now: datetime) -> int:
-        """Whole days until it expires; negative afterwards."""
+        """Whole days until the certificate expires; negative afterwards."""
         return (self.not_after - now) // timedelta(days=1)
 
 
 class Verdict(StrEnum):
-    """Whether to order, and if not, why."""
+    """Whether to order; if not, why not."""
 
     FRESH = "fresh"
     ORDER = "order"
@@ -165,7 +165,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether to order, the reason in words, and when this may change."""
+    """Whether to order, the reason in words, and the time at which this may change."""
 
     verdict: Verdict
     why: str
@@ -173,12 +173,12 @@ class Decision:
 
 
 def names_of(domain: str) -> tuple[str, ...]:
-    """The names on the certificate for servers directly below this domain."""
+    """The names on the certificate: the wildcard for servers directly below this domain."""
     return (f"*.{domain}",)
 
 
 def renew_at(not_before: datetime, not_after: datetime) -> datetime:
-    """When to renew: with 30 days left, or with a third of its lifetime if that is less; with half if short-lived."""
+    """The time to renew: 30 days before it expires, or a third of its lifetime if that is less; half if short-lived."""
     lifetime = not_after - not_before
     left = lifetime / 2 if lifetime < SHORT_LIVED else min(RENEW_BEFORE, lifetime / 3)
     return not_after - left
@@ -193,10 +193,11 @@ def decide(
     now: datetime,
     force: bool = False,
 ) -> Decision:
-    """Whether to order these names at this directory now.
+    """Decide whether to order a certificate for these names at this directory now.
 
-    `force` orders even if the certificate is fresh or not ours, or another run holds a claim, and does not wait after
-    failures. It still obeys a wait that the CA asked for, and the hourly limit of failed validations.
+    With `force` the answer is yes even if the certificate is fresh or not ours, another run holds a claim, or an order
+    failed a moment ago. It is still no until the time that the CA asked for, and beyond the hourly limit of failed
+    validations.
     """
     by_certificate = _decide_by_certificate(stored, directory, names, now)
     if by_certificate.verdict is not Verdict.ORDER and not force:
@@ -216,11 +217,11 @@ def _decide_by_certificate(
     if stored is None:
         return Decision(Verdict.ORDER, "there is no certificate yet")
     if not stored.directory:
-        return Decision(Verdict.FOREIGN, "the certificate there was put there by hand")
+        return Decision(Verdict.FOREIGN, "the certificate was put there by hand")
     if sorted(stored.names) != sorted(names):
-        return Decision(Verdict.ORDER, f"the certificate there is for {', '.join(stored.names) or 'no name'}")
+        return Decision(Verdict.ORDER, f"the present certificate is for {', '.join(stored.names) or 'no name'}")
     if stored.directory != directory:
-        return Decision(Verdict.ORDER, "the certificate there comes from elsewhere")
+        return Decision(Verdict.ORDER, "the present certificate is from another certificate authority")
     at = renew_at(stored.not_before, stored.not_after)
     if now >= stored.not_after:
         return Decision(Verdict.ORDER, "the certificate has expired")
@@ -249,33 +250,33 @@ def _wait_after_failures(
 
 
 def claimed(state: CertificateRecord, token: str, now: datetime) -> CertificateRecord:
-    """The run with this token is ordering."""
+    """The state with a claim of the run that has this token and is ordering now."""
     return msgspec.structs.replace(state, claim=token, claimed=now)
 
 
 def with_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """Write down values before they are published. If this run is interrupted, a later one removes them."""
+    """The state with values that will be published in DNS. If this run is interrupted, a later run removes them."""
     return msgspec.structs.replace(state, challenges=tuple(values))
 
 
 def without_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """These values are removed from DNS."""
+    """The state without these values, which are removed from DNS; unchanged if it has other values."""
     return msgspec.structs.replace(state, challenges=()) if state.challenges == tuple(values) else state
 
 
 def unclaimed(state: CertificateRecord) -> CertificateRecord:
-    """The run was interrupted (Ctrl-C) and has no result: another run may order."""
+    """The state without a claim, after a run that was interrupted (Ctrl-C): another run may order."""
     return msgspec.structs.replace(state, claim="", claimed=None)
 
 
 def failed(state: CertificateRecord, failure: FailedOrder) -> CertificateRecord:
-    """The order failed."""
+    """The state after a failed order, without its claim."""
     kept = (*state.failures, msgspec.structs.replace(failure, text=failure.text[:MAX_TEXT]))[-MAX_FAILURES:]
     return msgspec.structs.replace(unclaimed(state), failures=kept)
 
 
 def succeeded(state: CertificateRecord, stored: StoredCertificate, trusted: str, now: datetime) -> CertificateRecord:
-    """The order succeeded: this certificate is stored."""
+    """The state after a successful order: this certificate is stored, and the failures before it are forgotten."""
     return msgspec.structs.replace(
         unclaimed(state),
         directory=stored.directory,

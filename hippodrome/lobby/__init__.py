@@ -1,1 +1,1 @@
-"""Where participants who play together wait for each other, and who plays with whom (`project.players`)."""
+"""The lobby: participants who play together (`project.players`) wait for each other, and are matched."""

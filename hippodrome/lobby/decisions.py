@@ -1,9 +1,9 @@
-"""What is decided of a project's lobby: the one document, and the records in it. Pure: no clock, no I/O.
+"""The document of decisions: one per project's lobby, with the records in it. Pure: no clock, no I/O.
 
 `_lobbies/{projectId}.json` is changed by compare-and-swap alone. A participant stands in it at most once: as a member
-of a session that is *proposed*, or of one that is *formed* (decided for good), or as *unmatched*. So whatever several
-functions decide at once from listings of different age, no participant gets into two sessions. What is formed leaves
-the document only when the documents that say so have been written (`store.py`).
+of a session that is *proposed*, or of one that is *formed* (decided for good), or as *unmatched*. So no participant
+gets into two sessions, even if several functions decide at once from listings of different age. A formed session
+leaves the document only after its own document and its members' memberships have been written (`store.py`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from hippodrome.model.records import Record
 LOBBIES = "_lobbies/"
 
 
-class Ahead(Record, frozen=True):
-    """A session without members, whose server was started ahead. `by`: the label of the participant it was asked for.
+class OpenSession(Record, frozen=True):
+    """A session without members, whose server was started ahead.
 
-    `players`: for how many participants; its server runs the trial of that registration. 0 in documents of earlier
-    versions, which do not say it.
+    `asked`: when its server was requested. `by`: the label of the participant for whom it was requested; "" if the
+    sweep requested it, or the participant is erased. `players`: for how many participants it is; its server runs the
+    registration for that number. 0 in documents of earlier versions.
     """
 
     id: str
@@ -31,22 +32,22 @@ class Ahead(Record, frozen=True):
     players: int = 0
 
     def is_usable(self, players: int, now: datetime, open_for: timedelta) -> bool:
-        """Whether a session of so many players may get its server now."""
+        """Whether a session of `players` may get its server now. It is kept open for `open_for` after its request."""
         return now - self.asked < open_for and self.players in (0, players)
 
 
 class Proposal(Record, frozen=True):
-    """A session that may be formed, by its members' labels, in the order in which they came.
+    """A session that may be formed. `labels` are its members', in the order in which they came to the lobby.
 
-    `ahead` is its server, if one was started ahead.
-    `id` is the proposal's own, under which its members confirm: another proposal may get the same server later.
-    `players` is what the project said then; 0 in documents of earlier versions.
+    `id` is the proposal's own, under which its members confirm. `ahead`: the open session whose server it gets, if
+    there is one; if this proposal falls apart, another one may get it. `players`: the project's number when it was
+    proposed; 0 in documents of earlier versions.
     """
 
     id: str
     labels: tuple[str, ...]
     at: datetime
-    ahead: Ahead | None = None
+    ahead: OpenSession | None = None
     players: int = 0
 
     @property
@@ -56,7 +57,7 @@ class Proposal(Record, frozen=True):
 
 
 class Matched(Record, frozen=True):
-    """A matched participant: a member of a formed session. `waited`: seconds in the lobby."""
+    """A member of a formed session. `waited`: the seconds that the participant spent in the lobby."""
 
     label: str
     user_id: str
@@ -65,18 +66,18 @@ class Matched(Record, frozen=True):
 
 
 class Formed(Record, frozen=True):
-    """A session whose members are decided. Seats are counted in the order of `members`.
+    """A session whose members are decided. The order of `members` is that of their seats.
 
-    `ahead`: its server was started ahead. As long as that is not ready, it stands in `waits_for`, and the session may
-    get another one instead (`with_ready_servers`). Without `waits_for` the session has its id, and so its server, for
-    good.
+    `ahead`: whether its server was started ahead. `waits_for`: the open session whose server it waits for, until that
+    server or another one is ready (`with_ready_servers`). Once `waits_for` is None, the session has its id, and so its
+    server, for good.
     """
 
     id: str
     members: tuple[Matched, ...]
     at: datetime
     ahead: bool = False
-    waits_for: Ahead | None = None
+    waits_for: OpenSession | None = None
     players: int = 0  # with the empty places; 0 in documents of earlier versions
 
     @property
@@ -86,7 +87,7 @@ class Formed(Record, frozen=True):
 
 
 class Unmatched(Record, frozen=True):
-    """A participant whose patience was over. `waited`: seconds in the lobby."""
+    """A participant who was not matched within `patience`. `waited`: the seconds that they spent in the lobby."""
 
     label: str
     user_id: str
@@ -96,17 +97,19 @@ class Unmatched(Record, frozen=True):
 
 
 class Decisions(Record, frozen=True):
-    """The document. `version` counts its versions. `renewed`: when it was made anew, because it could not be read.
+    """The document of decisions.
 
-    Then sessions may be half written of which the document says nothing any more. Until they are finished nobody is
-    proposed, or unmatched.
+    `renewed`: when the document was made anew, because it could not be read. Then some sessions may be half written,
+    and the document does not name them. Until the sweep has finished them, no session is proposed, and no participant
+    becomes unmatched.
 
-    The count makes each version's bytes unique, and so its ETag, which S3 makes of the content (S3 API Reference,
-    "Object"): a function that read an earlier version with otherwise the same content cannot overwrite a later one.
+    `version` counts the document's versions. It makes each version's bytes unique, and so its ETag, which S3 makes of
+    the content (S3 API Reference, "Object"). So a function that has read an earlier version cannot overwrite a later
+    one whose other content is the same.
     """
 
     version: int = 0
-    open: tuple[Ahead, ...] = ()
+    open: tuple[OpenSession, ...] = ()
     proposed: tuple[Proposal, ...] = ()
     formed: tuple[Formed, ...] = ()
     unmatched: tuple[Unmatched, ...] = ()
@@ -127,40 +130,40 @@ class Decisions(Record, frozen=True):
         return frozenset(member.label for each in self.formed for member in each.members)
 
     def proposal_of(self, label: str) -> Proposal | None:
-        """The proposed session of this participant."""
+        """The proposal with this participant; None if there is none."""
         return next((each for each in self.proposed if label in each.labels), None)
 
     def formed_of(self, label: str) -> Formed | None:
-        """The formed session of this participant."""
+        """The formed session with this participant; None if there is none."""
         return next((each for each in self.formed if any(member.label == label for member in each.members)), None)
 
     def unmatched_of(self, label: str) -> Unmatched | None:
-        """The decision that this participant is unmatched; None if there is none."""
+        """The decision that this participant is unmatched; None if they are not."""
         return next((each for each in self.unmatched if each.label == label), None)
 
     def is_decided(self, label: str) -> bool:
-        """Whether it is decided for good that they are unmatched, or play in a session that has its server."""
-        return self.of(label) != Decisions()
+        """Whether the participant is unmatched, or a member of a session that has its server for good."""
+        return self.decided_for(label) != Decisions()
 
-    def of(self, label: str) -> Decisions:
-        """The part of the document that is decided for good about this participant."""
+    def decided_for(self, label: str) -> Decisions:
+        """The part of the document that is decided for good about this participant; empty if nothing is."""
         formed, unmatched = self.formed_of(label), self.unmatched_of(label)
         has_server = formed is not None and formed.waits_for is None
         return Decisions(formed=(formed,) if formed and has_server else (), unmatched=(unmatched,) if unmatched else ())
 
     def without_server(self) -> list[Formed]:
-        """The sessions that wait until a server is ready, in the order in which they were formed."""
+        """The formed sessions that wait for a server, in the order in which they were formed."""
         return sorted((each for each in self.formed if each.waits_for), key=lambda each: each.at)
 
     def for_good(self) -> Decisions:
-        """The part of the document that is decided for good."""
+        """The part of the document that is decided for good: sessions with their server, and unmatched participants."""
         has_server = tuple(each for each in self.formed if each.waits_for is None)
         return Decisions(formed=has_server, unmatched=self.unmatched)
 
     def session_ids(self) -> frozenset[str]:
-        """The ids of all sessions in the document, each of which may have a server."""
-        begun = (each.session_id for each in self.proposed if each.ahead)
-        return frozenset([*(each.id for each in self.open), *begun, *(each.id for each in self.formed)])
+        """The ids of all sessions in the document that may have a server."""
+        proposed = (each.session_id for each in self.proposed if each.ahead)
+        return frozenset([*(each.id for each in self.open), *proposed, *(each.id for each in self.formed)])
 
 
 def key(project_id: str) -> str:
@@ -173,6 +176,6 @@ def next_version(before: Decisions, after: Decisions) -> Decisions:
     return before if after == before else msgspec.structs.replace(after, version=before.version + 1)
 
 
-def by_age(sessions: Iterable[Ahead]) -> tuple[Ahead, ...]:
-    """Open sessions in the order in which their servers were asked for: the first is used first."""
+def by_age(sessions: Iterable[OpenSession]) -> tuple[OpenSession, ...]:
+    """These open sessions in the order in which their servers were requested. The first is used first."""
     return tuple(sorted(sessions, key=lambda each: (each.asked, each.id)))

@@ -1,14 +1,14 @@
-"""What participants leave in the lobby's folder: who waits, who has confirmed, who is under way. Pure.
+"""The entries in the lobby's folder: their keys, and what a listing of them says. Pure.
 
-    _lobby/{projectId}/{label}.{joined}.{trait}   waits; joined: when they came, in ms; its LastModified: when last seen
-    _lobby/{projectId}/{label}.yes.{proposal id}  has asked again since this session was proposed
-    _lobby/{projectId}/{label}.left.{joined}      has closed the page
-    _lobby/{projectId}/{label}.way                is on their way to the game
-    _lobby/{projectId}/{session id}.done          all that follows from the decision on this session is written
-    _lobby/{projectId}/{label}.done               the same, of an unmatched participant
+    _lobby/{projectId}/{label}.{joined}.{trait}   the participant waits since `joined` (ms); LastModified: last request
+    _lobby/{projectId}/{label}.yes.{proposal id}  the participant has confirmed this proposal, by another request
+    _lobby/{projectId}/{label}.left.{joined}      the participant has closed the page
+    _lobby/{projectId}/{label}.way                the participant is under way to the game
+    _lobby/{projectId}/{session id}.done          all documents that follow from this formed session are written
+    _lobby/{projectId}/{label}.done               the same for an unmatched participant
 
-Every time is the platform's: no clock of a browser is read. S3 cuts LastModified to whole seconds, so a participant may
-seem to have been seen up to a second earlier than they were.
+Every time is the platform's: no clock of a browser is read. S3 cuts LastModified to whole seconds, so a request may
+seem to be up to a second older than it is.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from protocol.session import is_session_id
 
 FOLDER = "_lobby/"
 PRESENT = timedelta(seconds=10)
-"""A participant who has asked since then is there. The page asks every two seconds."""
+"""A participant counts as present for so long after a request. The lobby's page sends one every two seconds."""
 REMEMBERED = timedelta(seconds=30)
-"""A participant who has asked since then keeps the time at which they came; later they begin anew."""
+"""For so long after a request a participant keeps the time at which they came; later their waiting begins anew."""
 DELETED = timedelta(seconds=60)
-"""Older entries are deleted: well after `REMEMBERED`, so that no request on its way still writes to one."""
-NO_TRAIT = "-"
+"""Entries of this age are deleted: well after `REMEMBERED`, so that no request under way still writes one of them."""
+NO_TRAIT = "-"  # the trait of all participants, if `matching` needs none
 _DONE = re.compile(r"(s[a-z2-7]{20}|s\.[0-9a-f]{20})\.done")
 _NAME = re.compile(r"(s[a-z2-7]{20})\.(?:(way)|(yes|left)\.(.+)|([0-9]{13})\.(-|[0-9a-f]{10}))")
 
 
 class WaitingDocument(Record, frozen=True, omit_defaults=False):
-    """What stands in the document of a participant who waits."""
+    """The content of the entry of a participant who waits."""
 
     user_id: str
     group: int | None = None
@@ -46,7 +46,7 @@ class WaitingDocument(Record, frozen=True, omit_defaults=False):
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A participant who waits. `joined` is in ms, as in the key; `seen` is when they last asked."""
+    """A participant who waits. `joined`: when they came, in ms as in the key; `seen`: their last request."""
 
     label: str
     joined: int
@@ -55,17 +55,17 @@ class Waiting:
 
     @property
     def order(self) -> tuple[int, str]:
-        """The order in which participants are matched: who came first is matched first."""
+        """The sort key of matching: the participant who came first is matched first."""
         return self.joined, self.label
 
     def is_present(self, now: datetime) -> bool:
-        """Whether they have asked lately."""
+        """Whether the participant's last request is younger than `PRESENT`."""
         return now - self.seen < PRESENT
 
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """A participant who has closed the page. `joined` is when they had come."""
+    """A participant has closed the page, `at` this time. `joined`: when they had come, in ms."""
 
     joined: int
     at: datetime
@@ -79,23 +79,23 @@ class Entries:
     confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # labels, by the proposal's id
     left: Mapping[str, Departure] = field(default_factory=dict)  # by label
     under_way: frozenset[str] = frozenset()
-    done: frozenset[str] = frozenset()  # ids of sessions, and labels of the unmatched
-    keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # of all entries, by label
-    outdated: tuple[str, ...] = ()  # keys to delete
+    done: frozenset[str] = frozenset()  # ids of sessions, and labels of unmatched participants
+    keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # of all entries of participants, by label
+    outdated: tuple[str, ...] = ()  # the keys of old entries, which may be deleted
 
     def with_waiting(self, one: Waiting) -> Entries:
-        """The listing with this participant, who is there now."""
+        """The listing with this participant, who waits now."""
         left = {label: each for label, each in self.left.items() if label != one.label}
         return replace(self, waiting={**self.waiting, one.label: one}, left=left)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
-        """The listing with this confirmation, which was just written."""
+        """The listing with this confirmation, which has just been written."""
         labels = self.confirmed.get(proposal_id, frozenset()) | {label}
         return replace(self, confirmed={**self.confirmed, proposal_id: labels})
 
 
 def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta) -> Entries:
-    """Read a listing of `folder(project_id)`. `way`: for how long a participant counts as under way."""
+    """Read a listing of `folder(project_id)`. A participant counts as under way for so long as `way` says."""
     prefix = folder(project_id)
     waiting: dict[str, Waiting] = {}
     confirmed: dict[str, set[str]] = {}
@@ -139,7 +139,7 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
 
 
 def _earlier(one: Waiting, other: Waiting) -> Waiting:
-    """The same participant, who opened two pages at once: they came with the first and were seen in either."""
+    """One entry of two of a participant who opened two pages at once: the earlier `joined`, and the later `seen`."""
     first = min(one, other, key=lambda each: each.joined)
     return replace(first, seen=max(one.seen, other.seen))
 
@@ -150,47 +150,47 @@ def folder(project_id: str) -> str:
 
 
 def prefix_of(project_id: str, label: str) -> str:
-    """How the keys of all entries of a participant begin."""
+    """The prefix of the keys of all entries of a participant."""
     return f"{folder(project_id)}{label}."
 
 
 def waiting_key(project_id: str, one: Waiting) -> str:
-    """The key of a participant who waits."""
+    """The key of the entry of a participant who waits."""
     return f"{prefix_of(project_id, one.label)}{one.joined:013}.{one.trait}"
 
 
 def confirmation_key(project_id: str, label: str, proposal_id: str) -> str:
-    """The key of a confirmation."""
+    """The key of a participant's confirmation of a proposal."""
     return f"{prefix_of(project_id, label)}yes.{proposal_id}"
 
 
 def departure_key(project_id: str, label: str, joined: int) -> str:
-    """The key that says that a participant has closed the page."""
+    """The key of the entry which says that a participant has closed the page."""
     return f"{prefix_of(project_id, label)}left.{joined:013}"
 
 
 def way_key(project_id: str, label: str) -> str:
-    """The key of a participant who is on their way."""
+    """The key of the entry which says that a participant is under way."""
     return f"{prefix_of(project_id, label)}way"
 
 
 def done_key(project_id: str, decided: str) -> str:
-    """The key that says that all is written of this session, by id, or of this unmatched participant, by label."""
+    """The key of the mark that a decision is carried out: `decided` is a session's id, or an unmatched one's label."""
     return f"{folder(project_id)}{decided}.done"
 
 
 def milliseconds(now: datetime) -> int:
-    """A time as keys have it: milliseconds since 1970."""
+    """A time as it stands in keys: milliseconds since 1970."""
     return int(now.timestamp() * 1000)
 
 
 def seconds_since(joined: int, now: datetime) -> float:
-    """Seconds since a participant came; not below 0, however far clocks are apart."""
+    """Seconds since `joined`, in ms; 0 if another machine's clock makes it negative."""
     return max(0, milliseconds(now) - joined) / 1000
 
 
 def read_body(body: bytes) -> WaitingDocument | None:
-    """Read the document of a participant who waits; None if it cannot be read."""
+    """Read the content of the entry of a participant who waits; None if it cannot be read."""
     try:
         found = from_json(body, WaitingDocument)
     except (msgspec.DecodeError, RecursionError):
@@ -198,6 +198,6 @@ def read_body(body: bytes) -> WaitingDocument | None:
     return found if ids.is_user_id(found.user_id) else None
 
 
-def body(found: WaitingDocument) -> bytes:
-    """The document of a participant who waits, as bytes."""
-    return to_json(found)
+def body(document: WaitingDocument) -> bytes:
+    """The content of the entry of a participant who waits, as bytes."""
+    return to_json(document)

@@ -1,24 +1,24 @@
-"""The lobby of projects whose sessions have several players: it matches participants, and forms their sessions.
+"""The lobby of projects whose sessions have several players: it matches participants and forms their sessions.
 
-This module does what a participant's request or start message does. Each request of a participant at the game step
-makes a *run*:
+This module handles participants' requests and start messages. Each request of a participant at the game step makes a
+*run*:
 1. It reads the document of decisions (`decisions.py`), and lists the folder of those who wait (`entries.py`).
 2. It looks up who can be a member, and which servers are ready (`lookups.py`).
-3. It decides (`rules.py`, by `run.py`), and writes the document if something has changed. If another run has written
-   the document meanwhile, it reads it and decides again; mostly nothing is left to do.
-4. It carries out what is decided for good (`store.py`): it writes the session's document, sends its server's start
-   message, and writes each member's membership; then it removes the entries, and marks the decision as done. If this is
-   interrupted, the next request of a member, or the sweep, does all of it again.
+3. It decides (`run.py`, by `rules.py`), and writes the document if something has changed. If another run has written
+   the document since step 1, it reads the document and decides again; mostly nothing is left to do.
+4. It carries out the decisions that are made for good (`store.py`): it writes the session's document, sends its
+   server's start message, and writes each member's membership; then it deletes the entries, and marks the decision as
+   done. If this is interrupted, the next request of a member, or the sweep, does all of it again.
 
-The sweep makes runs, too (`repair.py`). A request proposes sessions of all participants who are there, but it forms
-and carries out that of its own participant, and only a few others (`Lookups.proposals_to_form`).
+The sweep makes runs, too (`repair.py`). A request proposes sessions of all participants who are present. It forms and
+carries out its own participant's session, and only a few others (`Lookups.proposals_to_form`).
 
-A session whose server was started ahead waits in the document until a server is ready: the first that is goes to the
-session that was formed first. Only then it is decided for good, and its documents are written.
+A session whose server was started ahead waits in the document until a server is ready. The first server that is ready
+goes to the session that was formed first. Only then is the session decided for good, and its documents are written.
 
-A membership is written only for what stands in the document as formed, with its server, and a participant stands there
-at most once. A session is formed only if no member has one, which is looked up while they stand there as proposed. So
-no participant gets two.
+No participant gets two memberships, for two reasons. A membership is written only for a session that stands in the
+document as formed, with its server, and a participant stands in the document at most once. And a session is formed only
+if none of its members has a membership, which is looked up while they stand in the document as proposed.
 """
 
 from __future__ import annotations
@@ -50,38 +50,38 @@ from hippodrome.storage.repository import Repository
 from protocol.answer import UNMATCHED
 
 SEEN_ANEW = timedelta(seconds=1)
-"""The entry of a participant who waits is written anew only if it is older, however often their page asks."""
+"""A request writes its participant's entry anew only if the entry is older than this."""
 DELETED_AT_ONCE = 5
-"""Old entries that one request deletes."""
+"""How many old entries one request deletes at most."""
 Answers = Callable[[], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class LobbyState:
-    """What a participant who waits is told. `here` counts those who could play together, this participant included."""
+    """The lobby as the page of a participant who waits shows it."""
 
-    here: int
-    seconds: float  # since they came
-    proposed: bool  # others are found, and all are asked whether they are still there
+    here: int  # participants who could play together, this one included
+    seconds: float  # since the participant came
+    proposed: bool  # whether others are found: then the pages of all confirm that they are still open
 
 
 @dataclass(frozen=True, slots=True)
 class NoServerYet:
-    """A participant whose session is formed, and which still has no server that is ready.
+    """The participant's session is formed, and no server is ready for it yet.
 
-    `session` is the id of the server that was started ahead for it, and `record` that server's record. The session may
-    get another server that was started ahead, if that is ready sooner.
+    `session` is its id, and `record` the record of the server that was started ahead under this id. If another server
+    that was started ahead is ready sooner, the session gets that one, and its id.
     """
 
     session: str
     members: int
     record: Server | None
-    players: int  # with the places that nobody has; 0 in documents of earlier versions
+    players: int  # empty places included; 0 in documents of earlier versions
 
 
 @dataclass(frozen=True, slots=True)
-class _Asking:
-    """A participant who asks."""
+class _Asker:
+    """The participant whose request this is. `answers` reads their answers so far."""
 
     label: str
     user_id: str
@@ -106,16 +106,16 @@ class Lobby:
     def visit(
         self, project: Project, user_id: str, group: int | None, answers: Answers
     ) -> LobbyState | NoServerYet | Membership:
-        """The participant asks at the game step. Return their membership, or what they are told while they wait.
+        """Handle a request of a participant at the game step. Return their membership, or the state while they wait.
 
-        The membership also says that they are unmatched: then all game steps have their answers. `answers` reads the
-        participant's answers so far; it is called when they come, if `matching` goes by them. The project must have its
-        secret. Calls: `docs/architecture.md`.
+        The membership also says if the participant is unmatched; then the answer of each game step is stored. `answers`
+        reads the participant's answers so far. It is called only if `matching` needs them. The project must have its
+        secret. `docs/architecture.md` counts the calls.
         """
         label = ids.server_label(project.id, user_id)
         membership = self._repository.membership(project.id, user_id)
         if membership is None:
-            found = self._ask(project, _Asking(label, user_id, group, answers))
+            found = self._ask(project, _Asker(label, user_id, group, answers))
             if not isinstance(found, Membership):
                 return found
             membership = found
@@ -124,9 +124,10 @@ class Lobby:
         return membership
 
     def leave(self, project: Project, user_id: str) -> None:
-        """The participant has closed the page: they are not proposed until they ask again. A listing and some writes.
+        """Note that the participant has closed the page: they are not proposed until their next request.
 
-        Whoever is back within `entries.PRESENT` (a reload, another tab) keeps the time at which they came.
+        A participant who is back within `entries.PRESENT` (a reload, another tab) keeps the time at which they came.
+        One listing and some writes.
         """
         label = ids.server_label(project.id, user_id)
         found = self._store.entries(project, label)
@@ -137,16 +138,16 @@ class Lobby:
             self._store.delete(key for key in found.keys[label] if ".left." not in key)
 
     def forget(self, project: Project, user_id: str) -> None:
-        """Remove what the lobby knows of a participant who no longer needs a game. May be repeated. A listing."""
+        """Delete the entries of a participant who no longer needs a game. May be repeated. One listing."""
         label = ids.server_label(project.id, user_id)
         self._store.delete(self._store.entries(project, label).keys.get(label, ()))
 
     def under_way(self, project: Project, user_id: str) -> None:
-        """Note that the participant is on their way to the game, and see to it that a server is started for them.
+        """Note that the participant is under way to the game, and start a server ahead if one is needed for them.
 
-        May be repeated, and may come late: a participant who has a membership, or has answered all game steps, is not
-        under way. One server is started ahead for every `players` who are under way or wait. If the start message was
-        lost after the document was written, a repetition sends it again.
+        One server is started ahead for every `players` participants who are under way or wait. The call may be repeated
+        or late: for a participant who has a membership, or has answered all game steps, it does nothing. If the start
+        message was lost after the document was written, a repetition sends it again.
         """
         if self._repository.membership(project.id, user_id) is not None:
             return
@@ -182,18 +183,19 @@ class Lobby:
                 self._store.start_server(project, each.id, each.players)
 
     def repair(self, project: Project) -> Collection[str]:
-        """Finish what was interrupted, and bring servers that were started ahead to their number; for the sweep.
+        """Finish interrupted runs, and bring the servers that are started ahead to their number; for the sweep.
 
-        Return the ids of all sessions that the lobby lists afterwards. A server of a session that is not among them is
-        left over if the session has no document: the caller must have listed servers before this call, and looks for
-        the document after it. Raises what reading and writing the document raises; one that cannot be read is made
-        anew, empty.
+        Return the ids of all sessions that the lobby lists afterwards. The server of a session that is not among them
+        is left over if the session has no document: the caller must have listed servers before this call, and looks for
+        the document after it. A document of decisions that cannot be read is made anew, empty. Raises `RetryLater` and
+        the documents port's errors.
         """
         return self._repair.run(project)
 
     # A participant's request
 
-    def _ask(self, project: Project, me: _Asking) -> LobbyState | NoServerYet | Membership:
+    def _ask(self, project: Project, me: _Asker) -> LobbyState | NoServerYet | Membership:
+        """One run, for a participant without a membership."""
         known = self._store.read(project)
         formed = known.formed_of(me.label)
         if formed and formed.waits_for:
@@ -201,16 +203,15 @@ class Lobby:
         entries = self._store.entries(project)
         proposal = known.proposal_of(me.label)
         if me.label not in known.labels() or (proposal and me.label not in entries.waiting):
-            entries = self._be_seen(project, me, entries)
+            entries = self._write_entry(project, me, entries)
         if proposal and me.label not in entries.confirmed.get(proposal.id, ()):
             entries = self._confirm(project, me, proposal, entries)
-        wished: Sequence[Sequence[str]] = ()
+        chosen: Sequence[Sequence[str]] = ()
         if project.asks_match:
-            come = partial(_candidate, me)
-            wished = self._matcher.wished(project, me.label, come, known, entries)
+            chosen = self._matcher.chosen(project, me.label, partial(_candidate, me), known, entries)
         proposals = self._lookups.proposals_to_form(known, entries, me.label)
         servers = self._lookups.servers(project, known, me.label, proposals)
-        run = self._lookups.run(project, known, entries, proposals, servers=servers, wished=wished)
+        run = self._lookups.run(project, known, entries, proposals, servers=servers, chosen=chosen)
         own = entries.waiting.get(me.label)
         before = known  # the document that this run has changed
 
@@ -227,7 +228,7 @@ class Lobby:
             return rules.give_up(document, Unmatched(me.label, me.user_id, run.now, code, waited))
 
         after = known
-        if settle(known) != rules.without_done(known, entries.done):  # what is done leaves with the next other change
+        if settle(known) != rules.without_done(known, entries.done):  # to drop what is done alone is worth no write
             after = self._change(project, known, settle)
             if after is not known:
                 self._store.forget_done(project, after, entries)
@@ -246,9 +247,9 @@ class Lobby:
     def _begin_to_wait(
         self, project: Project, known: Decisions, after: Decisions, entries: Entries, servers: StartedAhead
     ) -> None:
-        """Sessions are formed that wait for a server: remove the entries of their members.
+        """Delete the entries of members whose sessions were formed by this run and wait for a server.
 
-        If the server that was started ahead has no record, its start message may be lost, and is sent again.
+        If such a server has no record, its start message may be lost, and is sent again.
         """
         fresh = [each for each in after.without_server() if known.labels_formed().isdisjoint(each.labels)]
         self._store.delete(key for each in fresh for label in each.labels for key in entries.keys.get(label, ()))
@@ -257,9 +258,9 @@ class Lobby:
                 self._store.start_server(project, each.id, each.players)
 
     def _wait_for_server(
-        self, project: Project, me: _Asking, known: Decisions, formed: Formed
+        self, project: Project, me: _Asker, known: Decisions, formed: Formed
     ) -> NoServerYet | Membership:
-        """The participant's session is formed, and waits for a server. Their entries are gone."""
+        """One run, for a member of a formed session that waits for a server. The members' entries are deleted."""
         now, before = self._platform.now(), known
         servers = self._lookups.servers(project, known, me.label, ())
         open_for = self._lookups.open_for(project)
@@ -279,15 +280,15 @@ class Lobby:
         return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
 
     def _change(self, project: Project, known: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
-        """Change the document; `known` if others change it all the time: the next request, in two seconds, decides."""
+        """Change the document; return `known` if others change it all the time. The next request then decides."""
         try:
             return self._store.change(project, settle)
         except RetryLater:
             logger.info("the lobby's document keeps changing", extra={"project": project.id})
             return known
 
-    def _be_seen(self, project: Project, me: _Asking, entries: Entries) -> Entries:
-        """Write down that the participant is there, at most once in `SEEN_ANEW`."""
+    def _write_entry(self, project: Project, me: _Asker, entries: Entries) -> Entries:
+        """Write the participant's entry, at most once in `SEEN_ANEW`; return `entries` with it."""
         now, found, left = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
         if found is not None and now - found.seen < SEEN_ANEW:
             return entries
@@ -300,13 +301,13 @@ class Lobby:
         present = folder.waiting_key(project.id, one)
         self._documents.put(present, folder.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != present and ".yes." not in key)
-        self._store.delete(others)  # that they had left, were under way, or opened two pages at once
+        self._store.delete(others)  # the entries that they left, are under way, or wait on another page
         return entries.with_waiting(one)
 
-    def _confirm(self, project: Project, me: _Asking, proposal: Proposal, entries: Entries) -> Entries:
-        """Write down that the participant has asked since the proposal could be read.
+    def _confirm(self, project: Project, me: _Asker, proposal: Proposal, entries: Entries) -> Entries:
+        """Write the participant's confirmation of the proposal; return the folder's entries, listed again.
 
-        The folder is listed again: of two who confirm at once, at least one sees both.
+        Of two participants who confirm at once, at least one sees both confirmations.
         """
         self._documents.put(folder.confirmation_key(project.id, me.label, proposal.id), b"")
         own = entries.waiting.get(me.label)
@@ -314,18 +315,18 @@ class Lobby:
         return entries.with_waiting(own) if own and me.label not in {*entries.waiting, *entries.left} else entries
 
 
-def _candidate(me: _Asking) -> questions.Candidate:
-    """The participant who asks, as the function `match` is told."""
+def _candidate(me: _Asker) -> questions.Candidate:
+    """The participant of this request, as the function `match` gets them."""
     return questions.candidate(me.label, me.group, dict(me.answers()))
 
 
 def _due(label: str, known: Decisions, before: Decisions, after: Decisions) -> Decisions:
-    """What this participant's request carries out. It has read `known` and has changed `before` to `after`.
+    """The decisions that this participant's request carries out. It has read `known` and changed `before` to `after`.
 
-    It carries out what is decided on its own participant, and the sessions of others to which it has given a server. If
-    another request has decided on its participant since it read `known`, that request carries this out.
+    They are the decision on its own participant, and the sessions of others to which it has given a server. If another
+    request has decided on this participant since `known` was read, that request carries the decision out.
     """
-    own = after.of(label) if known.is_decided(label) or not before.is_decided(label) else Decisions()
+    own = after.decided_for(label) if known.is_decided(label) or not before.is_decided(label) else Decisions()
     waited = {each.labels for each in before.without_server()}
     given = [each for each in after.for_good().formed if each.labels in waited and each not in own.formed]
     return Decisions(formed=(*own.formed, *given), unmatched=own.unmatched)

@@ -1,4 +1,4 @@
-"""What a run of the lobby (`lobby.py`) looks up before it decides: who can be a member, and which servers are ready."""
+"""The reads of a run of the lobby (`lobby.py`) before it decides: who can be a member, and which servers are ready."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from hippodrome.ports import Platform
 from hippodrome.storage.repository import Repository
 
 FORMED_LATE = timedelta(seconds=4)
-"""A confirmed session that was proposed longer ago is formed by requests of other participants, too."""
+"""If a confirmed session was proposed longer ago, requests of other participants form it, too."""
 FORMED_AT_ONCE = 10
-"""Sessions of others that one request forms."""
+"""How many sessions of others one request forms at most."""
 LOOKED_AT = 5
-"""Servers of open sessions at which a request looks whose session is the first that waits for one."""
+"""How many open sessions' servers a request reads, if its session is the first that waits for a server."""
 LOOKED_AT_IN_NEED = 50
-"""The same, if the session's own server has ended."""
+"""The same, if the server that its session waits for has ended."""
 
 
 class Lookups:
-    """The reads of a run, beside the document of decisions and the listing of entries."""
+    """The reads of a run, besides the document of decisions and the listing of entries."""
 
     def __init__(self, platform: Platform, repository: Repository) -> None:
         self._platform = platform
         self._repository = repository
 
     def open_for(self, project: Project) -> timedelta:
-        """For how long a server that was started ahead can be used."""
+        """For how long after its request a server that was started ahead can be given to a session."""
         return sessions.open_for(project, self._platform.settings)
 
     def run(
@@ -47,17 +47,17 @@ class Lookups:
         proposals: Sequence[Proposal],
         *,
         servers: StartedAhead,
-        wished: Sequence[Sequence[str]] = (),
+        chosen: Sequence[Sequence[str]] = (),
     ) -> LobbyRun:
-        """A run that may form the sessions of these confirmed proposals. Two reads for each member."""
+        """Return a run that may form the sessions of these confirmed proposals. Two reads for each member."""
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), self.open_for(project)
-        return LobbyRun(project, known, entries, members, broken, now, open_for, servers, wished)
+        return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
 
     def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
         """The confirmed proposals that this participant's request forms: their own, and some that have waited for long.
 
-        In a crowd the document takes fewer writes than participants come: so a write decides on several sessions.
+        In a crowd more participants come than the document takes writes, so one write decides on several sessions.
         """
         now = self._platform.now()
         confirmed = rules.confirmed(known, entries)
@@ -68,10 +68,11 @@ class Lookups:
     # Servers that were started ahead
 
     def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> StartedAhead:
-        """The servers at which this participant's request looks.
+        """Read the records of the servers that this participant's request may give to sessions.
 
-        None, unless their session (formed, or of `proposals`) needs one that was started ahead. Then that one; if no
-        other session waits before theirs, also some that are free; if theirs has ended, more of these.
+        The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
+        started ahead. Then it has that server; if no other session waits before theirs, also some servers of open
+        sessions; if the session's own server has ended, more of these.
         """
         formed = known.formed_of(label)
         own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
@@ -93,7 +94,7 @@ class Lookups:
         return StartedAhead(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
 
     def _server(self, project: Project, session_id: str) -> Server | None:
-        """The record of a session's server; None also if it cannot be read, which the next request tries again."""
+        """The record of a session's server; None if there is none, or if it cannot be read this time."""
         try:
             return self._repository.server_of(project.id, session_id)
         except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
@@ -107,9 +108,9 @@ class Lookups:
     ) -> tuple[Mapping[str, Sequence[Matched]], Collection[str]]:
         """The members of each session that can be formed, by the proposal's id; and the ids of the other proposals.
 
-        A session cannot be formed if a member has left, or has a membership: a late request of a second tab may have
-        brought them back into the lobby; nor if the project has been registered with another number of players since.
-        A proposal with a member who cannot be read is in neither: the next run looks again.
+        A session cannot be formed if a member has left, or has a membership already (a late request of a second tab may
+        have brought them back into the lobby), or if the project has been registered with another number of players
+        since it was proposed. A proposal with a member who cannot be read is in neither: the next run reads again.
         """
         waiting = [entries.waiting[label] for each in proposals for label in each.labels]
         looked = self._platform.run_all([partial(self._member, project, one) for one in waiting])
@@ -127,7 +128,7 @@ class Lookups:
         return members, broken
 
     def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
-        """The participant who waits, as a member; None if they have left or have a membership. Errors are returned."""
+        """The participant who waits, as a member; None if they have left or have a membership; the error of a read."""
         try:
             found = self._platform.documents.get(folder.waiting_key(project.id, one))
             written = folder.read_body(found.body) if found else None

@@ -1,7 +1,7 @@
-"""Asks the function `match` of agent.py who plays with whom (`questions.py`), by documents that servers read and write.
+"""Asks the function `match` of agent.py who plays with whom, by documents that servers read and write (`questions.py`).
 
-A server without members answers (`trial/server/matching.py`). The function is the researcher's code, so its answer may
-be anything: the rules take of it what is possible.
+A server without members answers (`trial/server/matching.py`). The function is the researcher's code, so the document of
+its answer may hold anything: the rules use only those of its sessions that are possible.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from hippodrome.storage.errors import RetryLater
 from protocol.keys import groups_folder, groups_key, questions_folder, waiting_key
 
 FORGOTTEN = timedelta(minutes=5)
-"""Questions and answers that are older are deleted: a question is asked anew after seconds."""
+"""Older questions and answers are deleted: a question is asked anew after seconds."""
 
 
 class Matcher:
-    """The questions of all projects."""
+    """Asks the functions `match` of all projects."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._documents = platform.documents
         self._shared = SharedDocuments(platform.documents)
 
-    def wished(
+    def chosen(
         self,
         project: Project,
         label: str,
-        come: Callable[[], Candidate],
+        candidate: Callable[[], Candidate],
         document: Decisions,
         entries: Entries,
     ) -> Sequence[Sequence[str]]:
-        """Sessions that `match` has chosen, by their members' labels; and ask it again if it is time.
+        """Return the sessions that `match` has chosen, by their members' labels; ask it again if a question is due.
 
-        The participant with this label asks, and is written down if they are new: then `come` says who they are. None
-        are wished if others change the question all the time. Two reads; two calls more if something is written.
+        This is for the request of the participant with this label. If they are new, they are added to the question, as
+        `candidate` returns them. No sessions are returned if other requests change the question all the time. Two
+        reads; two calls more if something is written.
         """
         now, key = self._platform.now(), waiting_key(project.id)
         question = self._read(key, project)
@@ -54,10 +55,10 @@ class Matcher:
         matched = {one for each in chosen for one in each}
         new: Candidate | None = None
         if label in entries.waiting and label not in question.candidates() and not questions.is_full(question):
-            new = come()
+            new = candidate()
 
         def change(current: Question) -> Question:
-            late = current.candidates().keys() - question.candidates().keys()  # who came after the listing was made
+            late = current.candidates().keys() - question.candidates().keys()  # came after the folder was listed
             if new is not None:
                 current = questions.with_candidate(current, new)
             return questions.next_question(
@@ -74,7 +75,7 @@ class Matcher:
             return chosen
         try:
             changed = self._shared.change(key, Question, change, renew=True)
-        except RetryLater:  # many come at once; the next request does it
+        except RetryLater:  # many participants come at once; the next request tries again
             logger.info("the question to match keeps changing", extra={"project": project.id})
             return ()
         if answer and answer.problem and changed.before.id == question.id != changed.after.id:
@@ -82,7 +83,7 @@ class Matcher:
         return chosen
 
     def forget(self, project: Project) -> None:
-        """Delete questions and answers that are old. Two listings. Nothing is lost: who waits is written down again."""
+        """Delete old questions and answers. Two listings. The next request of a participant who waits asks again."""
         now = self._platform.now()
         for folder in (questions_folder(project.id), groups_folder(project.id)):
             for entry in self._documents.list(folder):
@@ -97,7 +98,7 @@ class Matcher:
             return Question()
 
     def _answer(self, project: Project, question: Question) -> MatchAnswer | None:
-        """The answer to the question; None if it has none yet, or if too few wait for one."""
+        """The answer to the question; None if it has none yet, or if too few participants wait for a session."""
         if len(question.waiting) < project.players:
             return None
         found = self._documents.get(groups_key(project.id, question.id))

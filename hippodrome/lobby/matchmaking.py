@@ -1,6 +1,6 @@
-"""Which of the participants who wait play together: by arrival, traits, or as the function `match` says. Pure.
+"""Chooses which of the participants who wait play together: by arrival, by traits, or as `match` has chosen. Pure.
 
-A session is here a sequence of its members, in the order of their arrival.
+Here a session is a sequence of its members, in the order of their arrival.
 """
 
 from __future__ import annotations
@@ -15,24 +15,27 @@ from hippodrome.lobby.entries import Waiting, milliseconds
 from hippodrome.model.project import Project
 
 PROPOSED_AT_ONCE = 50
-"""Sessions that one run proposes, so that a crowd does not make one function slow: the next run proposes more."""
+"""One run proposes at most so many sessions, so that a crowd makes no function slow. The next run proposes more."""
 
 
 def patience_is_over(joined: int, project: Project, now: datetime) -> bool:
-    """Whether a participant who came at this time has waited for `patience` seconds, however late their page asks."""
+    """Whether a participant who came at `joined` (ms) has waited for `patience` seconds."""
     return milliseconds(now) - joined >= round(project.patience * 1000)
 
 
 def choose(
-    free: Sequence[Waiting], project: Project, now: datetime, wished: Sequence[Sequence[str]]
+    free: Sequence[Waiting], project: Project, now: datetime, chosen: Sequence[Sequence[str]]
 ) -> list[Sequence[Waiting]]:
-    """The sessions to propose, at most `PROPOSED_AT_ONCE`. `wished` is what `match` has chosen, by labels."""
+    """The sessions to propose, at most `PROPOSED_AT_ONCE`.
+
+    `free` are the participants who are in no session, in the order of arrival; `chosen`, the sessions that the function
+    `match` has chosen, by their members' labels.
+    """
     over = [one for one in free if patience_is_over(one.joined, project, now)]
     with_policies = project.after_patience == "policies"
-    late = {one.label for one in over}
-    candidates = free if with_policies else [one for one in free if one.label not in late]
+    candidates = free if with_policies else [one for one in free if not patience_is_over(one.joined, project, now)]
     if project.asks_match:
-        sessions = _wished(candidates, project, wished)
+        sessions = _of_match(candidates, project, chosen)
     elif traits.together(project):
         sessions = _of_one_trait(candidates, project.players)
     else:
@@ -43,11 +46,11 @@ def choose(
     return sessions[:PROPOSED_AT_ONCE]
 
 
-def _wished(free: Sequence[Waiting], project: Project, wished: Sequence[Sequence[str]]) -> list[Sequence[Waiting]]:
-    """Those of the wished sessions that are complete, and of participants who are free."""
+def _of_match(free: Sequence[Waiting], project: Project, chosen: Sequence[Sequence[str]]) -> list[Sequence[Waiting]]:
+    """Those of the chosen sessions that have `players` different members, all of whom are free."""
     waiting = {one.label: one for one in free}
     sessions: list[Sequence[Waiting]] = []
-    for labels in wished:
+    for labels in chosen:
         if len(set(labels)) == project.players and all(label in waiting for label in labels):
             members = [waiting.pop(label) for label in dict.fromkeys(labels)]
             sessions.append(members if project.seats == "match" else sorted(members, key=lambda one: one.order))
@@ -97,7 +100,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
 def _short_sessions(
     free: Sequence[Waiting], over: Sequence[Waiting], sessions: Iterable[Sequence[Waiting]], project: Project
 ) -> list[Sequence[Waiting]]:
-    """For each whose patience is over, and who is in no session: one with those who are there, even alone."""
+    """A session for each participant in `over` who is in none: with others who are free, or alone."""
     taken = {one.label for members in sessions for one in members}
     found: list[Sequence[Waiting]] = []
     for one in over:
@@ -110,7 +113,7 @@ def _short_sessions(
 
 
 def around(one: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
-    """This participant and those who may play with them, in the order of arrival; they may be too few for a session."""
+    """This participant and others who may play with them, in the order of arrival; at most `players`, perhaps fewer."""
     members, most = [one], None if traits.together(project) else traits.most_of_one(project)
     for other in free:
         if len(members) == project.players:

@@ -1,10 +1,10 @@
-"""What the function `match` of agent.py is asked (`matching: match`), and its answers. Pure: no clock, no I/O.
+"""The questions to the function `match` of agent.py (`matching: match`), and its answers. Pure: no clock, no I/O.
 
-The researcher's code runs on servers alone. So who waits is written into a document, `_match/{projectId}/waiting.json`,
-which servers without members look at. Each question has an id, and its answer a document of its own,
-`{projectId}/lobby/groups/{id}.json`, which the first of them creates. A question stays as it is until it is answered,
-or for `ANSWERED_WITHIN`. A participant who comes meanwhile stands beside it, for the next question. So an answer fits
-what the document still says, however many participants come.
+Researchers' code runs on servers alone. So the participants who wait are written into a document,
+`_match/{projectId}/waiting.json`, which servers without members read. Each question has an id. Its answer is a document
+of its own, `{projectId}/lobby/groups/{id}.json`, which the first of these servers creates. A question stays unchanged
+until it is answered, or for `ANSWERED_WITHIN`. A participant who comes in this time is kept beside it, in `came`, for
+the next question. So an answer fits the question in the document, however many participants come.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import Record, from_json, to_json
 
 WAITED_STEPS = 5
-"""Seconds. How long a participant has waited is told in steps of so many, and asked again as often."""
+"""Seconds. Waiting times are rounded down to a multiple of this, and a question is asked again as often."""
 ANSWERED_WITHIN = timedelta(seconds=10)
 """A question without an answer is asked anew after this: a server looks every two seconds, and `match` has five."""
 MOST_WAITING = 200
-"""Participants in one question: those who came first."""
+"""The most participants in one question: those who came first."""
 MOST_CAME = 200
-"""Further participants in the document. One who comes then is written down when there is room: the page asks again."""
+"""The most further participants in the document. Others are added by a later request, when there is room."""
 MOST_ANSWERS = 16 * 1024
-"""Bytes of one participant's answers. Larger ones are left out."""
+"""The most bytes of a candidate with their answers. If there are more, the answers are left out."""
 
 
 class Candidate(Record, frozen=True):
-    """A participant who waits, as `match` is told. `id` is their label; `waited` is in seconds."""
+    """A participant who waits, as `match` gets them. `id` is their label; `waited` is in seconds."""
 
     id: str
     waited: int = 0
@@ -43,7 +43,7 @@ class Candidate(Record, frozen=True):
 
 
 class Question(Record, frozen=True):
-    """The document that `match` is asked with. `came` are participants who came later, for the next question."""
+    """The document with the question: `waiting` may be matched now; `came` are participants for the next question."""
 
     id: str = ""
     players: int = 0
@@ -62,14 +62,14 @@ class _Groups(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class MatchAnswer:
-    """The sessions of an answer that can be played, and a sentence for the researcher on what is wrong with others."""
+    """The possible sessions of an answer. `problem`: a sentence on the first impossible one, "" if there is none."""
 
     sessions: Sequence[Sequence[str]] = ()
     problem: str = ""
 
 
 def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
-    """The candidate for a participant who comes. Answers that are too large are left out."""
+    """The candidate for a participant who comes, without answers that are too large."""
     found = Candidate(label, group=group, answers=answers)
     return found if len(to_json(found)) <= MOST_ANSWERS else Candidate(label, group=group)
 
@@ -87,21 +87,21 @@ def is_full(question: Question) -> bool:
 
 
 def read(body: bytes, question: Question) -> MatchAnswer:
-    """The answer in a document that a server has written, and that may hold anything."""
+    """Read the answer to `question` in a document that a server has written. The document may hold anything."""
     try:
         found = from_json(body, _Groups).groups
     except (ValueError, RecursionError):
         return MatchAnswer(problem="the answer of match cannot be read")
-    asked, taken, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
+    asked, matched, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
     for labels in found[:MOST_WAITING]:
         if len(labels) != question.players or len(set(labels)) != len(labels):
             problem = problem or f"match chose other members than {question.players} different participants"
         elif not asked.issuperset(labels):
             problem = problem or "match chose a participant who does not wait"
-        elif not taken.isdisjoint(labels):
+        elif not matched.isdisjoint(labels):
             problem = problem or "match chose a participant for two sessions"
         else:
-            taken.update(labels)
+            matched.update(labels)
             sessions.append(labels)
     return MatchAnswer(sessions, problem)
 
@@ -116,10 +116,10 @@ def next_question(
     matched: Collection[str],
     now: datetime,
 ) -> Question:
-    """What is asked now: `question` as it is, or a new one of those who are `free`.
+    """The question to ask now: `question` unchanged, or a new one about the participants who are `free`.
 
-    `waiting`: the labels of all who wait; a participant who is not among them is forgotten. `matched`: those whom the
-    answer to `question` matches; they are asked about again only if they stay free.
+    `waiting`: the labels of all participants who wait; others are dropped from the document. `matched`: the labels in
+    the answer to `question`. The new question leaves them out; a later one has them again if they are still free.
     """
     candidates = {label: each for label, each in question.candidates().items() if label in waiting}
     asked = sorted(
@@ -128,18 +128,18 @@ def next_question(
     asked = asked[:MOST_WAITING]
     if not _is_due(question, project, {one.label for one in asked}, answered=answered, now=now):
         return question
-    told = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)
-    labels = {each.id for each in told}
+    in_question = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)
+    labels = {each.id for each in in_question}
     rest = tuple(msgspec.structs.replace(each, waited=0) for label, each in candidates.items() if label not in labels)
-    made = Question(players=project.players, asked=now, waiting=told, came=rest)
+    made = Question(players=project.players, asked=now, waiting=in_question, came=rest)
     return msgspec.structs.replace(made, id=hashlib.sha256(to_json(made)).hexdigest()[:20])
 
 
 def _is_due(question: Question, project: Project, free: set[str], *, answered: bool, now: datetime) -> bool:
-    """Whether it is time for another question."""
+    """Whether another question should replace this one. `free`: the labels of the participants it would have."""
     age = now - question.asked if question.asked else timedelta.max
     is_new = free != {each.id for each in question.waiting}
-    if len(question.waiting) < project.players:  # no session can be made of them, and no server is asked
+    if len(question.waiting) < project.players:  # too few for a session, so no server answers it
         return is_new
     if not answered and age < ANSWERED_WITHIN:
         return False

@@ -1,4 +1,4 @@
-"""What the sweep does in a lobby: it finishes what was interrupted, and keeps up the number of servers ahead."""
+"""The sweep's run in a lobby: it finishes interrupted runs, and keeps up the number of servers started ahead."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from hippodrome.ports import Platform, Topic
 from hippodrome.storage.repository import Repository
 
 WRITTEN_WITHIN = timedelta(seconds=60)
-"""No request that writes a session takes longer (`next_step` ends after 29 seconds; sweeps are minutes apart)."""
+"""No request takes longer to write a session (`next_step` ends after 29 seconds; sweeps are minutes apart)."""
 NO_RECORD_AFTER = timedelta(minutes=3)
-"""If a server that was to start ahead has no record by then, its start message is sent again."""
+"""If a server that was requested ahead has no record after this time, its start message is sent again."""
 CLOSED_FOR_GOOD = timedelta(minutes=3)
-"""If the server of an open session has been closed for so long, it is not replaced any more."""
+"""If the server of an open session has been closed for longer, it is not replaced any more."""
 
 
 class Repair:
-    """The repair of all lobbies."""
+    """Repairs the lobbies of all projects."""
 
     def __init__(
         self, platform: Platform, repository: Repository, store: LobbyStore, matcher: Matcher, lookups: Lookups
@@ -41,12 +41,12 @@ class Repair:
         self._lookups = lookups
 
     def run(self, project: Project) -> Collection[str]:
-        """As `Lobby.repair`."""
+        """Repair the lobby of this project; see `Lobby.repair`."""
         known, entries = self._store.read(project), self._store.entries(project)
         self._store.delete(entries.outdated)
         if project.asks_match:
             self._matcher.forget(project)
-        # The document was lost, and what the requests that had read it were writing has been written.
+        # The document was lost, and the requests that had read it have ended: they write no session any more.
         may_finish = known.renewed is not None and self._platform.now() - known.renewed >= WRITTEN_WITHIN
         if may_finish:
             self._store.finish_sessions(project)

@@ -1,6 +1,6 @@
-"""When a session is proposed, falls apart, or is formed, and when a participant is unmatched. Pure: no clock, no I/O.
+"""Decides when a session is proposed, falls apart or is formed, and when a participant is unmatched. Pure.
 
-Each rule makes the next version of the document of decisions (`decisions.py`) of the one before.
+Each rule takes the document of decisions (`decisions.py`) and returns its next version.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from datetime import datetime, timedelta
 
 import msgspec
 
-from hippodrome.lobby.decisions import Ahead, Decisions, Formed, Matched, Proposal, Unmatched, by_age
+from hippodrome.lobby.decisions import Decisions, Formed, Matched, OpenSession, Proposal, Unmatched, by_age
 from hippodrome.lobby.entries import Entries, Waiting
 from hippodrome.lobby.matchmaking import around, choose, patience_is_over
 from hippodrome.model.project import Project
 
 CONFIRMED_WITHIN = timedelta(seconds=10)
-"""A proposal that not all have confirmed by then falls apart."""
+"""A proposal that not all members have confirmed within this time falls apart."""
 
 
 def decide(
@@ -31,15 +31,15 @@ def decide(
     *,
     open_for: timedelta,
     known: Decisions | None = None,
-    wished: Sequence[Sequence[str]] = (),
+    chosen: Sequence[Sequence[str]] = (),
 ) -> Decisions:
-    """Drop proposals that have fallen apart, and propose sessions of those who are there and in no other.
+    """Drop proposals that have fallen apart, and propose sessions of participants who are present and in no session.
 
-    `known` is the document as it was read before the listing `entries` was made; without it, `document` is. What was
-    proposed after that stays, and who stood there then is not proposed now: the listing is too old to tell.
-    `wished` are sessions, by labels, that a function of the researcher's has chosen (`matching: match`): those of them
-    are proposed that can be; the rules choose none then. `new_id` makes the id of a proposal, and of its session unless
-    its server was started ahead. Such a session is used for `open_for`.
+    `known` is the document as it was read before the listing `entries` was made; None: `document` itself. Proposals
+    that are not in `known` stay, and participants who stood in `known` are not proposed now: the listing is too old to
+    judge both. `chosen` are the sessions, by labels, that the function `match` has chosen; with `matching: match` only
+    possible ones among them are proposed. `new_id` makes the id of a proposal, and of its session unless that gets an
+    open session. An open session can be used for `open_for` after its server was requested.
     """
     seen = known if known is not None else document
     settled = _without_fallen(document, entries, seen, now)
@@ -47,19 +47,19 @@ def decide(
         return settled
     before = seen.labels()
     among = [one for one in free(settled, entries, now) if one.label not in before]
-    sessions = choose(among, project, now, wished)
+    sessions = choose(among, project, now, chosen)
     return _with_proposals(settled, sessions, now, new_id, players=project.players, open_for=open_for)
 
 
 def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
-    """The participants who are there and in no session, in the order of arrival."""
+    """The participants who are present and in no session, in the order of arrival."""
     busy = document.labels()
     found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
     return sorted(found, key=lambda one: one.order)
 
 
 def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
-    """The proposals that all members have confirmed, of whom none has left."""
+    """The proposals that all members have confirmed and no member has left."""
     return [
         each
         for each in document.proposed
@@ -69,7 +69,7 @@ def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
 
 
 def here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
-    """How many participants could play together now: this one, and others; at most `players`."""
+    """How many participants, this one included, could play together now; at most `players`."""
     proposal = document.proposal_of(label)
     if proposal is not None:
         return len(proposal.labels)
@@ -88,30 +88,30 @@ def here(document: Decisions, entries: Entries, project: Project, label: str, no
 
 
 def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
-    """The document without the proposals that have fallen apart, of those that stood in `seen`."""
+    """The document without those of the proposals in `seen` that have fallen apart."""
     before = {each.id for each in seen.proposed}
     fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
     return without_proposals(document, fallen)
 
 
 def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
-    """Whether its time is over, a member has left, or one who has not confirmed has not asked lately."""
+    """Whether its time is over, a member has left, or a member who has not confirmed is not present any more."""
     if now - proposal.at >= CONFIRMED_WITHIN:
         return True
-    yes = entries.confirmed.get(proposal.id, frozenset())
-    found = (entries.waiting.get(label) for label in proposal.labels)
-    return any(one is None or not (one.label in yes or one.is_present(now)) for one in found)
+    labels = entries.confirmed.get(proposal.id, frozenset())
+    members = (entries.waiting.get(label) for label in proposal.labels)
+    return any(one is None or not (one.label in labels or one.is_present(now)) for one in members)
 
 
 def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
-    """The document without these proposals; sessions whose servers were started ahead are open again."""
+    """The document without these proposals. The open sessions that they had are open again."""
     if not any(each.id in ids for each in document.proposed):
         return document
-    back = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
+    opened = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
     return msgspec.structs.replace(
         document,
         proposed=tuple(each for each in document.proposed if each.id not in ids),
-        open=by_age([*document.open, *back]),
+        open=by_age([*document.open, *opened]),
     )
 
 
@@ -124,7 +124,7 @@ def _with_proposals(
     players: int,
     open_for: timedelta,
 ) -> Decisions:
-    """The document with these sessions proposed, by their members. The oldest server is used first."""
+    """The document with a proposal for each of these sessions. They get open sessions, the oldest first."""
     usable = deque(each for each in document.open if each.is_usable(players, now, open_for))
     added = []
     for members in sessions:
@@ -147,9 +147,9 @@ def _with_proposals(
 def form(
     document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime, seats: str = "lot"
 ) -> Decisions:
-    """Form the proposed session with these members, unless its proposal has changed since they were asked.
+    """Form the proposed session with these members, unless the document has no such proposal of theirs any more.
 
-    `seats` says who plays which player (`project.seats`).
+    `seats` says which member plays which player (`project.seats`).
     """
     found = next((each for each in document.proposed if each.id == proposal_id), None)
     if found is None or found.labels != tuple(member.label for member in members):
@@ -166,8 +166,8 @@ def form(
 def _seated(members: Sequence[Matched], lot: str, seats: str) -> tuple[Matched, ...]:
     """The members in the order of their seats.
 
-    By lot, from the session's random id: else who comes first, and is perhaps more eager, would always play the same
-    player. It also decides between members of one group.
+    The lot is drawn from the session's random id. Otherwise the participant who comes first, and is perhaps more eager,
+    would always play the same player. The lot also decides between members of one group.
     """
     if seats == "match":
         return tuple(members)
@@ -185,7 +185,7 @@ def give_up(document: Decisions, one: Unmatched) -> Decisions:
 
 
 def without_done(document: Decisions, done: Collection[str]) -> Decisions:
-    """The document without formed sessions (by id) and unmatched participants (by label) of which all is written."""
+    """The document without the decisions that are carried out: sessions' ids and unmatched participants' labels."""
     if not any(each.id in done for each in document.formed) and not any(
         each.label in done for each in document.unmatched
     ):
@@ -198,9 +198,9 @@ def without_done(document: Decisions, done: Collection[str]) -> Decisions:
 
 
 def without(document: Decisions, label: str) -> Decisions:
-    """The document without this participant, whose data are erased. In a session that is formed their seat is empty."""
+    """The document without this participant, whose data are erased. Their seat in a formed session is empty then."""
 
-    def unnamed(ahead: Ahead | None) -> Ahead | None:
+    def unnamed(ahead: OpenSession | None) -> OpenSession | None:
         return msgspec.structs.replace(ahead, by="") if ahead and ahead.by == label else ahead
 
     formed = (

@@ -1,4 +1,4 @@
-"""What a run of the lobby (`lobby.py`) has read, and what it makes of any later version of the document. Pure."""
+"""A run of the lobby (`lobby.py`): what it has read, and its decisions on any later version of the document. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hippodrome.model.server import Server, ServerState, next_attempt
 
 @dataclass(frozen=True)
 class StartedAhead:
-    """The records of servers that were started ahead, by their sessions' ids; None for one without a record."""
+    """The records of servers that were started ahead, by their sessions' ids; None for a server without a record."""
 
     records: Mapping[str, Server | None]
 
@@ -27,13 +27,13 @@ class StartedAhead:
 
     @property
     def over(self) -> frozenset[str]:
-        """The ids of sessions whose servers have ended, and are not replaced."""
+        """The ids of sessions whose servers have ended and are not replaced."""
         closed = ((name, each) for name, each in self.records.items() if each and each.is_closed)
         return frozenset(name for name, each in closed if next_attempt(each) is None)
 
     @property
     def coming(self) -> frozenset[str]:
-        """The ids of sessions whose servers will be ready: they start, or are replaced."""
+        """The ids of sessions whose servers start now or are replaced, and so may become ready."""
         return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
 
     def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:
@@ -45,7 +45,7 @@ class StartedAhead:
 
 @dataclass(frozen=True)
 class LobbyRun:
-    """What a run has read, and what it makes of any later version of the document."""
+    """What a run has read. `decided` applies its decisions to a version of the document."""
 
     project: Project
     known: Decisions
@@ -55,10 +55,10 @@ class LobbyRun:
     now: datetime
     open_for: timedelta
     servers: StartedAhead
-    wished: Sequence[Sequence[str]] = ()  # what the function `match` has chosen, by labels
+    chosen: Sequence[Sequence[str]] = ()  # the sessions that the function `match` has chosen, by their members' labels
 
     def decided(self, document: Decisions) -> Decisions:
-        """The document with everything that this run can decide."""
+        """The document with all decisions that this run can make."""
         document = rules.without_done(document, self.entries.done)
         document = rules.without_proposals(document, self.broken)
         for proposal_id, found in self.members.items():
@@ -71,6 +71,6 @@ class LobbyRun:
             ids.new_session_id,
             open_for=self.open_for,
             known=self.known,
-            wished=self.wished,
+            chosen=self.chosen,
         )
         return self.servers.given(document, self.now, self.open_for)

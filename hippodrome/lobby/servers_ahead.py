@@ -1,4 +1,4 @@
-"""Sessions without members, whose servers are started ahead: how many, and which session gets which server. Pure."""
+"""Decides how many servers are started ahead of their sessions, and which session gets which server. Pure."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from datetime import datetime, timedelta
 
 import msgspec
 
-from hippodrome.lobby.decisions import Ahead, Decisions, Formed, by_age
+from hippodrome.lobby.decisions import Decisions, Formed, OpenSession, by_age
 from hippodrome.lobby.entries import Entries
 from hippodrome.model.project import Project
 
 SERVER_WITHIN = timedelta(minutes=5)
-"""A session that has waited for so long, and for which no server is ready, keeps the one that it was given."""
+"""If no server is ready for a session within this time, the session keeps the one that it waits for."""
 
 
 def sessions_wanted(document: Decisions, entries: Entries, project: Project, also: Collection[str] = ()) -> int:
-    """How many sessions without members should have a server: one for every `players` who are under way or wait.
+    """How many open sessions there should be: one for every `players` participants who are under way or wait.
 
-    `also` are the labels of further ones who are under way. Not more than `maxServers`, of which more could not run;
-    none in a project that is closed.
+    `also` are the labels of further participants who are under way. At most `maxServers`, since no more can run; 0 in a
+    project that is closed.
     """
     if not project.live:
         return 0
@@ -39,9 +39,9 @@ def open_sessions(
     players: int,
     open_for: timedelta,
 ) -> Decisions:
-    """The document with so many more open sessions for `players` that as many as `wanted` can be used."""
+    """The document with new open sessions for `players`, so that at least `wanted` can be used."""
     usable = sum(each.is_usable(players, now, open_for) for each in document.open)
-    added = [Ahead(new_id(), now, by, players) for _ in range(wanted - usable)]
+    added = [OpenSession(new_id(), now, by, players) for _ in range(wanted - usable)]
     return msgspec.structs.replace(document, open=by_age([*document.open, *added])) if added else document
 
 
@@ -56,13 +56,13 @@ def with_ready_servers(
 ) -> Decisions:
     """Give the servers that are ready to the sessions that were formed first, whichever server each has waited for.
 
-    * `ready`: servers that are ready, by their sessions' ids. A session gets one of an open session; if there is none,
-      it exchanges servers with the session that was formed last of those whose server is ready.
+    * `ready`: servers that are ready, by their sessions' ids. A session gets a ready server of an open session. If
+      there is none, it exchanges servers with the session that was formed last among those whose server is ready.
     * `over`: servers that have ended and are not replaced. `coming`: servers that start. A session whose server is over
-      waits for one that starts instead, if an open session has one.
-    * A session that finds no other server keeps its own, and its members are told why that one has ended. A session
-      that has waited for `SERVER_WITHIN` keeps its own as well.
-    * A session only gets a server that was started for as many players.
+      waits for a server that starts, if an open session has one.
+    * If there is no such server either, the session keeps its own, and its members are told why that server has ended.
+      A session that has waited for `SERVER_WITHIN` keeps its own as well.
+    * A session only gets a server that was started for the same number of players.
     """
     sessions = document.without_server()
     if not ready and not over and not (sessions and now - sessions[0].at >= SERVER_WITHIN):
@@ -111,9 +111,9 @@ def surplus(
     players: int,
     open_for: timedelta,
 ) -> frozenset[str]:
-    """The ids of the open sessions that can no longer be used, of those in `over`, and of those beyond `wanted`.
+    """The ids of open sessions to remove: those that can no longer be used, those in `over`, and those beyond `wanted`.
 
-    The servers that were asked for last are beyond `wanted`: they have the longest time to wait until they are ready.
+    The sessions whose servers were requested last are beyond `wanted`: these servers take longest to be ready.
     """
     usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
     return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])

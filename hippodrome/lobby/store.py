@@ -1,6 +1,6 @@
-"""The documents of the lobby: the one of decisions, the entries of those who wait, and what follows from decisions.
+"""Reads and writes the lobby's documents: the document of decisions, the entries, and what follows from decisions.
 
-What is written may be written again, by the same function or by others at the same time.
+Every write may be repeated, by the same function or by others at the same time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from protocol.session import BadSession, SessionDocument
 from protocol.times import time_text
 
 FORMED_LATELY = timedelta(hours=1)
-"""Sessions that were formed before have been written, or finished by a sweep."""
+"""Sessions that were formed longer ago have been written completely, or finished by a sweep."""
 
 
 class LobbyStore:
@@ -42,7 +42,7 @@ class LobbyStore:
     # Decisions
 
     def read(self, project: Project) -> Decisions:
-        """The document of decisions. One that cannot be read is made anew, empty."""
+        """Return the document of decisions. If it cannot be read, it is made anew, empty."""
         try:
             return self._shared.read(decisions.key(project.id), Decisions)
         except (ValueError, RecursionError) as error:
@@ -61,10 +61,10 @@ class LobbyStore:
     # Entries
 
     def entries(self, project: Project, label: str | None = None) -> Entries:
-        """The entries of all participants in the lobby, or of one. A listing.
+        """The entries of all participants in the lobby, or only of the one with this label. One listing.
 
-        A participant counts as under way for as long as the server that was started ahead for them can be used. So one
-        who never comes costs no second server.
+        A participant counts as under way as long as the server that was started ahead for them can be used. So a
+        participant who never comes costs no second server.
         """
         prefix = folder.prefix_of(project.id, label) if label else folder.folder(project.id)
         way = min(timedelta(minutes=project.max_runtime), sessions.open_for(project, self._platform.settings))
@@ -78,14 +78,12 @@ class LobbyStore:
     # What is decided for good
 
     def carry_out(self, project: Project, decided: Decisions, entries: Entries) -> Mapping[str, Membership]:
-        """Write what is formed, and who is unmatched; remove their entries, mark it as done.
+        """Write the sessions' documents and all memberships, delete the entries, and mark the decisions as done.
 
-        Return memberships by label.
-
-        The memberships come after all else that a session needs, and the mark goes last: until then any run does this
-        again. The next run that writes the document anyway drops what is marked, so that a crowd does not wait for a
-        write more. The answers of those who are unmatched are written when they ask next (`Lobby.visit`): the sweep may
-        write none.
+        Return the memberships by label. A session's memberships are written after everything else that it needs, and
+        its mark is written last: until then, any run does all of this again. The marked decisions leave the document
+        with its next other change, so that a crowd does not wait for one more write. The answers of unmatched
+        participants are written at their next request (`Lobby.visit`): the sweep's role may write no answers.
         """
         made: dict[str, Membership] = {}
         for formed in decided.formed:
@@ -99,10 +97,10 @@ class LobbyStore:
         return made
 
     def finish_sessions(self, project: Project) -> None:
-        """Write the memberships that sessions lack which were formed lately, and start messages that they may lack.
+        """Write the missing memberships of sessions that were formed lately, and send start messages that may be lost.
 
-        For a lobby whose document was lost while they were written: a session's own document says all of them. A
-        listing of all sessions' documents and recordings, and a read for each that was formed lately.
+        This is for a lobby whose document was lost while they were written: a session's own document names all its
+        members. One listing of all sessions' documents and recordings, and a read for each session formed lately.
         """
         since = self._platform.now() - FORMED_LATELY
         for entry in self._documents.list(sessions_folder(project.id)):
@@ -127,12 +125,12 @@ class LobbyStore:
             self._write_membership(project, each.user_id, membership)
 
     def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
-        """Remove the marks of decisions that have left the document, which must have been read after the listing."""
+        """Delete the marks of decisions that are not in `document`, which must have been read after the listing."""
         kept = {*(each.id for each in document.formed), *(each.label for each in document.unmatched)}
         self.delete(folder.done_key(project.id, name) for name in sorted(entries.done - kept))
 
     def answer_as_unmatched(self, project: Project, user_id: str) -> None:
-        """Store the answer of each game step, which moves the participant on. An earlier answer stays."""
+        """Store the answer `unmatched` at each game step, which moves the participant on. An earlier answer stays."""
         answers = {"outcome": answer.UNMATCHED}
         for step in project.steps:
             if step.type.on_server:
@@ -166,7 +164,7 @@ class LobbyStore:
         }
 
     def _write_membership(self, project: Project, user_id: str, membership: Membership) -> Membership:
-        """Write the participant's membership. What is there already stays, and is returned."""
+        """Write the participant's membership and return it. An earlier membership stays, and is returned instead."""
         if self._create(membership_key(project.id, user_id), to_json(membership)):
             return membership
         found = self._repository.membership(project.id, user_id)

@@ -260,7 +260,7 @@ class IamEnforcement:
     def _room(self, name: str) -> tuple[Any, dict[Any, Any]]:
         """Return the function's own platform, and the cache that it keeps between invocations."""
         if name not in self._rooms:
-            self._rooms[name] = (AwsPlatform.from_env(self.environment(name)), {})
+            self._rooms[name] = (AwsPlatform(self.environment(name)), {})
         return self._rooms[name]
 
     def environment(self, name: str) -> dict[str, str]:

@@ -20,7 +20,7 @@ from deploy.core import stages
 from deploy.core.stages import Executor
 from deploy.operate.eraser import SIGNING, Eraser
 from hippodrome.lobby import decisions, entries
-from hippodrome.lobby.decisions import Ahead, Decisions, Formed, Matched, Proposal, Unmatched
+from hippodrome.lobby.decisions import Decisions, Formed, Matched, OpenSession, Proposal, Unmatched
 from hippodrome.lobby.lobby import Lobby
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, parse_task_changed
@@ -206,7 +206,7 @@ def test_cut_off_at_any_call_it_goes_on_from_there(world: Installed, tmp_path: P
         pair(world.put, tmp_path, members=(user, other), session_id=sid)
         label = ids.server_label("maze", user)
         world.put(f"_lobby/maze/{label}.way", b"{}")
-        world.put(decisions.key("maze"), to_json(Decisions(at, open=(Ahead("s.0", datetime.now(UTC), label),))))
+        world.put(decisions.key("maze"), to_json(Decisions(at, open=(OpenSession("s.0", datetime.now(UTC), label),))))
         theirs = of(world, other)
         with pytest.MonkeyPatch.context() as patch:
             cut_off(patch, at, after)
@@ -327,7 +327,7 @@ def test_who_waits_in_the_lobby_leaves_it(world: Installed, capsys: Any) -> None
     world.put(f"_lobby/maze/{other}.1790000000000.-", to_json(entries.WaitingDocument(BOB)))
     decided = Decisions(
         3,
-        open=(Ahead("s.1", now, LABEL),),
+        open=(OpenSession("s.1", now, LABEL),),
         proposed=(Proposal("s.2", (LABEL, other), now),),
         formed=(Formed("s.3", (Matched(LABEL, ANN), Matched("slabel-of-another", "dora-0001")), now),),
         unmatched=(Unmatched(LABEL, ANN, now),),
@@ -380,7 +380,7 @@ def test_the_lobby_does_not_bring_back_who_was_erased(world: Installed, tmp_path
 
 def test_a_lobby_that_is_written_meanwhile_is_left_in_the_next_round(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=1)
-    world.put(decisions.key("maze"), to_json(Decisions(1, open=(Ahead("s.1", datetime.now(UTC), LABEL),))))
+    world.put(decisions.key("maze"), to_json(Decisions(1, open=(OpenSession("s.1", datetime.now(UTC), LABEL),))))
     made, times = eraser(world), iter(range(1))
     replace = made._bucket.replace
 

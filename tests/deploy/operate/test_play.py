@@ -26,7 +26,7 @@ from deploy.operate.doctor.play.copy import Copy, changed, left_behind, page_fil
 from deploy.operate.doctor.play.simulated import STAGES
 from deploy.operate.doctor.play.transcript import LINES, Transcript
 from hippodrome.lobby import decisions
-from hippodrome.lobby.decisions import Ahead, Decisions
+from hippodrome.lobby.decisions import Decisions, OpenSession
 from hippodrome.model.project import MASTER_LIST, MasterList, Step, UnreadableEntry, read_list, write_list
 from hippodrome.model.records import to_json
 from hippodrome.model.server import ServerState
@@ -228,7 +228,7 @@ def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningIn
     running.record(sid, ServerState.CLOSED, copy.project)
     running.record(ahead, ServerState.READY, copy.project)
     running.put(f"_lobby/{copy.id}/slabel.way", b"{}")
-    running.put(decisions.key(copy.id), to_json(Decisions(1, open=(Ahead(ahead, datetime.now(UTC)),))))
+    running.put(decisions.key(copy.id), to_json(Decisions(1, open=(OpenSession(ahead, datetime.now(UTC)),))))
     remove(account, installation, platform, copy.id, users=copy.users)
     assert_nothing_left(running)
     assert running.keys("_lob") == []

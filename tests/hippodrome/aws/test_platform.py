@@ -22,14 +22,14 @@ def _loaded(code: str) -> set[str]:
 
 
 def test_importing_costs_next_to_nothing() -> None:
-    loaded = _loaded("import hippodrome.aws; hippodrome.aws.AwsPlatform.from_env({}).settings")
+    loaded = _loaded("import hippodrome.aws; hippodrome.aws.AwsPlatform({}).settings")
     assert not {"boto3", "botocore", "urllib3", "asyncio", "logging"} & loaded
 
 
 def test_boto3_is_never_loaded() -> None:
     loaded = _loaded(
         "from hippodrome.aws import AwsPlatform\n"
-        "p = AwsPlatform.from_env({'AWS_REGION': 'us-east-1', 'BUCKET': 'b'})\n"
+        "p = AwsPlatform({'AWS_REGION': 'us-east-1', 'BUCKET': 'b'})\n"
         "p.documents._client(); p.bus; p.dns.browser_host"
     )
     assert "botocore.client" in loaded
@@ -52,32 +52,32 @@ def test_boto3_is_never_loaded() -> None:
 )
 def test_a_missing_variable_is_named(act, variable: str, port: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(RuntimeError, match=rf"{variable} is missing; the port '{port}' needs it"):
-        act(AwsPlatform.from_env({"AWS_REGION": "us-east-1", variable: " "}))
+        act(AwsPlatform({"AWS_REGION": "us-east-1", variable: " "}))
 
 
 def test_a_missing_region_is_named() -> None:
     with pytest.raises(RuntimeError, match="AWS_REGION is missing"):
-        AwsPlatform.from_env({"BUCKET": "b"}).documents.get("key")
+        AwsPlatform({"BUCKET": "b"}).documents.get("key")
 
 
 def test_only_what_is_used_needs_to_be_there() -> None:
-    platform = AwsPlatform.from_env({})
+    platform = AwsPlatform({})
     assert platform.dns.browser_host(DnsRecord("a.example.org", "203.0.113.1")) == "a.example.org"
     assert platform.settings.max_runtime == 24 * 60
 
 
 def test_front_ends_without_tokens_are_allowed_by_one_word_alone() -> None:
     for value, allowed in (("allowed", True), ("refused", False), ("", False), ("true", False)):
-        assert AwsPlatform.from_env({"PLAIN_CLIENTS": value}).settings.plain_clients is allowed
-    assert AwsPlatform.from_env({}).settings.plain_clients is False
+        assert AwsPlatform({"PLAIN_CLIENTS": value}).settings.plain_clients is allowed
+    assert AwsPlatform({}).settings.plain_clients is False
 
 
 def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> None:
-    platform = AwsPlatform.from_env({"ROOT_DOMAIN": "Example.org.", "SERVERS_HOST": "servers"})
+    platform = AwsPlatform({"ROOT_DOMAIN": "Example.org.", "SERVERS_HOST": "servers"})
     own, former = (f"wss://*.{domain}:{{}}" for domain in ("servers.example.org", "example.org"))
     expected = [source.format(port) for source in (own, former) for port in (443, 5000)]
     assert platform.settings.game_sources.split() == expected
-    assert AwsPlatform.from_env({}).settings.game_sources == ""
+    assert AwsPlatform({}).settings.game_sources == ""
 
 
 def test_no_call_waits_for_ever(moto_world: MotoWorld) -> None:

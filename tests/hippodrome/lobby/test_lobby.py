@@ -10,7 +10,7 @@ import pytest
 
 from hippodrome.lobby import decisions, rules
 from hippodrome.lobby import entries as folder
-from hippodrome.lobby.decisions import Ahead, Decisions
+from hippodrome.lobby.decisions import Decisions, OpenSession
 from hippodrome.lobby.lobby import LobbyState
 from hippodrome.model import ids, sessions
 from hippodrome.model.memberships import Membership
@@ -166,7 +166,7 @@ def test_a_function_of_the_researchers_may_choose_the_groups() -> None:
     labels = {user: room.label(user) for user in ("ann", "bob", "cem")}
     wished = [[labels["ann"], labels["cem"]], [labels["bob"], labels["cem"]], [labels["bob"]]]
     now, open_for = room.platform.now(), sessions.open_for(project, room.platform.settings)
-    decided = rules.decide(Decisions(), entries, project, now, ids.new_session_id, open_for=open_for, wished=wished)
+    decided = rules.decide(Decisions(), entries, project, now, ids.new_session_id, open_for=open_for, chosen=wished)
     assert [set(each.labels) for each in decided.proposed] == [{labels["ann"], labels["cem"]}]
 
 
@@ -571,10 +571,10 @@ def test_nothing_of_one_who_is_erased_stays_in_the_document() -> None:
     member = decisions.Matched
     now = WaitingRoom().platform.now()
     document = Decisions(
-        open=(Ahead("s.1", now, "ann"),),
+        open=(OpenSession("s.1", now, "ann"),),
         proposed=(
-            decisions.Proposal("s.2", ("ann", "bob"), now, Ahead("s.2", now)),
-            decisions.Proposal("s.4", ("dan", "eve"), now, Ahead("s.4", now, "ann")),
+            decisions.Proposal("s.2", ("ann", "bob"), now, OpenSession("s.2", now)),
+            decisions.Proposal("s.4", ("dan", "eve"), now, OpenSession("s.4", now, "ann")),
         ),
         formed=(decisions.Formed("s.3", (member("ann", "Ann"), member("cem", "Cem")), now),),
         unmatched=(decisions.Unmatched("ann", "Ann", now),),

@@ -12,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from hippodrome.lobby import decisions, matchmaking, rules, servers_ahead
-from hippodrome.lobby.decisions import Ahead, Decisions, Formed, Matched, Proposal, Unmatched
+from hippodrome.lobby.decisions import Decisions, Formed, Matched, OpenSession, Proposal, Unmatched
 from hippodrome.lobby.entries import Entries, Waiting, milliseconds
 from hippodrome.model.project import Project, Step
 from hippodrome.model.records import from_json, to_json
@@ -62,7 +62,7 @@ def groups(document: Decisions) -> list[str]:
     return ["".join(each.labels) for each in document.proposed]
 
 
-def proposal(labels: str, made: float = 1, name: str = "p", ahead: Ahead | None = None) -> Proposal:
+def proposal(labels: str, made: float = 1, name: str = "p", ahead: OpenSession | None = None) -> Proposal:
     return Proposal(name, tuple(labels), ago(made), ahead)
 
 
@@ -133,7 +133,7 @@ def test_a_run_makes_fifty_proposals_at_most() -> None:
 
 
 def test_what_changes_nothing_is_the_same_document() -> None:
-    document = Decisions(open=(Ahead("o", ago(5)),), proposed=(proposal("ab"),), formed=(formed("cd"),))
+    document = Decisions(open=(OpenSession("o", ago(5)),), proposed=(proposal("ab"),), formed=(formed("cd"),))
     assert decide(lobby(one("a"), one("b"), one("e")), document) is document
 
 
@@ -180,7 +180,7 @@ def test_mixed_without_groups_takes_one_of_each() -> None:
 
 def wish(*labels: str, people: str = "abcd", **changes: Any) -> list[str]:
     project = pairs(matching="match", **changes)
-    return groups(decide(lobby(*in_turn(people)), project=project, wished=[list(each) for each in labels]))
+    return groups(decide(lobby(*in_turn(people)), project=project, chosen=[list(each) for each in labels]))
 
 
 def test_groups_that_are_wished_are_proposed_in_their_order_each_by_arrival() -> None:
@@ -197,7 +197,7 @@ def test_who_is_wished_twice_is_in_the_first_group() -> None:
 
 
 def test_wishes_count_only_if_the_function_matches() -> None:
-    assert groups(decide(lobby(*in_turn("abcd")), wished=[["a", "d"]])) == ["ab", "cd"]
+    assert groups(decide(lobby(*in_turn("abcd")), chosen=[["a", "d"]])) == ["ab", "cd"]
 
 
 # Patience
@@ -305,8 +305,8 @@ def test_a_proposal_that_the_listing_cannot_know_stays() -> None:
 
 
 def test_the_server_of_a_fallen_proposal_is_used_for_the_next_which_is_another() -> None:
-    ahead = Ahead("o", ago(100), "x")
-    document = Decisions(open=(Ahead("later", ago(5)),), proposed=(proposal("ab", 10, "p", ahead),))
+    ahead = OpenSession("o", ago(100), "x")
+    document = Decisions(open=(OpenSession("later", ago(5)),), proposed=(proposal("ab", 10, "p", ahead),))
     fallen = decide(lobby(one("c", 8), one("d", 7)), document)
     assert fallen.proposed == (Proposal("new.1", ("c", "d"), NOW, ahead, players=2),)
     assert [each.id for each in fallen.open] == ["later"]
@@ -314,9 +314,9 @@ def test_the_server_of_a_fallen_proposal_is_used_for_the_next_which_is_another()
 
 
 def test_proposals_can_be_dropped() -> None:
-    ahead = Ahead("o", ago(3))
+    ahead = OpenSession("o", ago(3))
     document = Decisions(
-        open=(Ahead("first", ago(9)), Ahead("last", ago(1))),
+        open=(OpenSession("first", ago(9)), OpenSession("last", ago(1))),
         proposed=(proposal("ab", ahead=ahead), proposal("cd", name="q")),
     )
     assert rules.without_proposals(document, ["elsewhere"]) is document
@@ -378,19 +378,19 @@ def test_seats_by_group_are_drawn_by_lot_within_a_group_only() -> None:
 
 def test_seats_are_those_in_which_the_members_were_wished() -> None:
     project = pairs(players=3, matching="match", seats="match")
-    document = decide(lobby(*in_turn("abcd")), project=project, wished=[["d", "a", "c"]])
+    document = decide(lobby(*in_turn("abcd")), project=project, chosen=[["d", "a", "c"]])
     [found] = document.proposed
     assert found.labels == ("d", "a", "c")
     members = tuple(Matched(label, label.upper()) for label in found.labels)
     assert rules.form(document, found.id, members, NOW, "match").formed[0].labels == ("d", "a", "c")
     [by_lot] = decide(
-        lobby(*in_turn("abcd")), project=pairs(players=3, matching="match"), wished=[["d", "a", "c"]]
+        lobby(*in_turn("abcd")), project=pairs(players=3, matching="match"), chosen=[["d", "a", "c"]]
     ).proposed
     assert by_lot.labels == ("a", "c", "d")
 
 
 def test_a_formed_session_has_the_id_of_the_server_that_was_started_ahead() -> None:
-    document = Decisions(proposed=(proposal("ab", ahead=Ahead("o", ago(60))),))
+    document = Decisions(proposed=(proposal("ab", ahead=OpenSession("o", ago(60))),))
     done = rules.form(document, "p", (Matched("a", "A"), Matched("b", "B")), NOW)
     assert [(each.id, each.ahead) for each in done.formed] == [("o", True)]
     assert rules.form(document, "o", (Matched("a", "A"), Matched("b", "B")), NOW) is document
@@ -420,20 +420,20 @@ def test_each_change_counts_a_version() -> None:
 
 def test_the_document_says_where_a_participant_stands() -> None:
     ab, cd, e = proposal("ab"), formed("cd"), Unmatched("e", "E", NOW)
-    document = Decisions(version=3, open=(Ahead("o", NOW, "z"),), proposed=(ab,), formed=(cd,), unmatched=(e,))
+    document = Decisions(version=3, open=(OpenSession("o", NOW, "z"),), proposed=(ab,), formed=(cd,), unmatched=(e,))
     assert document.labels() == set("abcde")
     assert [document.proposal_of(label) for label in "abcez"] == [ab, ab, None, None, None]
     assert [document.formed_of(label) for label in "acdez"] == [None, cd, cd, None, None]
     assert [document.unmatched_of(label) for label in "acez"] == [None, None, e, None]
     assert [document.is_decided(label) for label in "acdez"] == [False, True, True, True, False]
-    assert document.of("c") == Decisions(formed=(cd,))
-    assert document.of("e") == Decisions(unmatched=(e,))
-    assert document.of("a") == document.of("z") == Decisions()
+    assert document.decided_for("c") == Decisions(formed=(cd,))
+    assert document.decided_for("e") == Decisions(unmatched=(e,))
+    assert document.decided_for("a") == document.decided_for("z") == Decisions()
 
 
 def test_sessions_that_may_have_a_server() -> None:
-    proposed = (proposal("ab", name="p"), proposal("cd", name="q", ahead=Ahead("o", NOW)))
-    document = Decisions(open=(Ahead("n", NOW),), proposed=proposed, formed=(formed("ef"),))
+    proposed = (proposal("ab", name="p"), proposal("cd", name="q", ahead=OpenSession("o", NOW)))
+    document = Decisions(open=(OpenSession("n", NOW),), proposed=proposed, formed=(formed("ef"),))
     assert document.session_ids() == {"n", "o", "f"}
 
 
@@ -520,7 +520,7 @@ def test_a_server_is_wanted_for_every_so_many_who_are_under_way_or_wait() -> Non
 
 
 def opened(number: int, *asked: float) -> list[tuple[str, datetime, str]]:
-    document = Decisions(open=tuple(Ahead(f"o{n}", ago(seconds)) for n, seconds in enumerate(asked)))
+    document = Decisions(open=tuple(OpenSession(f"o{n}", ago(seconds)) for n, seconds in enumerate(asked)))
     numbers = count(1)
     found = servers_ahead.open_sessions(
         document, number, "a", NOW, lambda: f"new.{next(numbers)}", players=2, open_for=OPEN_FOR
@@ -540,14 +540,16 @@ def test_as_many_sessions_are_opened_as_are_missing() -> None:
 def test_an_open_session_is_used_for_half_an_hour() -> None:
     assert len(opened(1, 1799.999)) == 1
     assert len(opened(1, 1800)) == 2
-    fresh = Decisions(open=(Ahead("old", ago(1800)), Ahead("new", ago(1799.999))))
+    fresh = Decisions(open=(OpenSession("old", ago(1800)), OpenSession("new", ago(1799.999))))
     decided = decide(lobby(*in_turn("abcd")), fresh)
     assert [each.session_id for each in decided.proposed] == ["new", "new.2"]
     assert [each.id for each in decided.open] == ["old"]
 
 
 def test_the_server_that_was_started_first_is_used_first() -> None:
-    document = Decisions(open=(Ahead("first", ago(9)), Ahead("second", ago(8)), Ahead("third", ago(7))))
+    document = Decisions(
+        open=(OpenSession("first", ago(9)), OpenSession("second", ago(8)), OpenSession("third", ago(7)))
+    )
     decided = decide(lobby(*in_turn("abcd")), document)
     assert [each.session_id for each in decided.proposed] == ["first", "second"]
     assert [each.id for each in decided.open] == ["third"]
@@ -555,7 +557,7 @@ def test_the_server_that_was_started_first_is_used_first() -> None:
 
 def surplus(number: int, over: Iterable[str] = ()) -> set[str]:
     document = Decisions(
-        open=tuple(Ahead(name, ago(seconds)) for name, seconds in [("x", 1800), ("a", 1799), ("b", 9), ("c", 5)])
+        open=tuple(OpenSession(name, ago(seconds)) for name, seconds in [("x", 1800), ("a", 1799), ("b", 9), ("c", 5)])
     )
     return set(servers_ahead.surplus(document, number, set(over), NOW, players=2, open_for=OPEN_FOR))
 
@@ -569,9 +571,9 @@ def test_open_sessions_beyond_those_wanted_are_surplus_the_last_first() -> None:
 
 
 def test_open_sessions_can_be_dropped() -> None:
-    document = Decisions(open=(Ahead("a", NOW), Ahead("b", NOW)), formed=(formed("ab"),))
+    document = Decisions(open=(OpenSession("a", NOW), OpenSession("b", NOW)), formed=(formed("ab"),))
     assert servers_ahead.without_open(document, ["a", "x"]) == Decisions(
-        open=(Ahead("b", NOW),), formed=document.formed
+        open=(OpenSession("b", NOW),), formed=document.formed
     )
 
 
@@ -581,18 +583,18 @@ def test_open_sessions_can_be_dropped() -> None:
 def test_of_one_who_is_erased_nothing_stays() -> None:
     document = Decisions(
         version=4,
-        open=(Ahead("o", ago(9), "a"), Ahead("n", ago(1), "b")),
+        open=(OpenSession("o", ago(9), "a"), OpenSession("n", ago(1), "b")),
         proposed=(
-            proposal("ab", ahead=Ahead("m", ago(5), "a")),
-            proposal("cd", name="q", ahead=Ahead("k", ago(4), "a")),
+            proposal("ab", ahead=OpenSession("m", ago(5), "a")),
+            proposal("cd", name="q", ahead=OpenSession("k", ago(4), "a")),
         ),
         formed=(formed("aef"), formed("gh", "g")),
         unmatched=(Unmatched("a", "A", NOW), Unmatched("z", "Z", NOW)),
     )
     assert rules.without(document, "a") == Decisions(
         version=4,
-        open=(Ahead("o", ago(9)), Ahead("m", ago(5)), Ahead("n", ago(1), "b")),
-        proposed=(proposal("cd", name="q", ahead=Ahead("k", ago(4))),),
+        open=(OpenSession("o", ago(9)), OpenSession("m", ago(5)), OpenSession("n", ago(1), "b")),
+        proposed=(proposal("cd", name="q", ahead=OpenSession("k", ago(4))),),
         formed=(Formed("f", (Matched("", ""), Matched("e", "E"), Matched("f", "F")), ago(1)), formed("gh", "g")),
         unmatched=(Unmatched("z", "Z", NOW),),
     )
@@ -604,7 +606,7 @@ def test_a_session_whose_members_are_all_erased_leaves_the_document() -> None:
 
 
 def test_who_is_not_there_takes_nothing_along() -> None:
-    document = Decisions(open=(Ahead("o", NOW, "b"),), proposed=(proposal("bc"),), formed=(formed("de"),))
+    document = Decisions(open=(OpenSession("o", NOW, "b"),), proposed=(proposal("bc"),), formed=(formed("de"),))
     assert to_json(rules.without(document, "a")) == to_json(document)
 
 
@@ -613,7 +615,7 @@ def test_who_is_not_there_takes_nothing_along() -> None:
 
 def pair_of(labels: str, server: str, at: datetime = NOW) -> Formed:
     """A session that waits for the server of this id."""
-    ahead = Ahead(server, ago(60))
+    ahead = OpenSession(server, ago(60))
     return Formed(server, tuple(Matched(label, label.upper()) for label in labels), at, True, ahead)
 
 
@@ -651,28 +653,28 @@ def test_a_session_whose_own_server_is_ready_keeps_it() -> None:
 
 
 def test_a_ready_server_of_an_open_session_is_given_first() -> None:
-    document = Decisions(open=(Ahead("o", ago(30)),), formed=THREE.formed)
+    document = Decisions(open=(OpenSession("o", ago(30)),), formed=THREE.formed)
     assert given(document, "o", "s3") == {"ab": ("o", True), "cd": ("s3", True), "ef": ("s2", False)}
 
 
 def test_an_open_server_that_has_waited_for_too_long_is_not_given() -> None:
-    document = Decisions(open=(Ahead("o", ago(1800)),), formed=(FIRST,))
+    document = Decisions(open=(OpenSession("o", ago(1800)),), formed=(FIRST,))
     assert given(document, "o") == {"ab": ("s1", False)}
 
 
 def test_a_session_keeps_a_server_that_has_ended_unless_an_open_one_is_ready() -> None:
     assert given(THREE, over=["s1"]) == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
     assert given(THREE, "s3", over=["s1"]) == {"ab": ("s1", True), "cd": ("s3", True), "ef": ("s2", False)}
-    document = Decisions(open=(Ahead("o", ago(30)),), formed=(FIRST,))
+    document = Decisions(open=(OpenSession("o", ago(30)),), formed=(FIRST,))
     assert given(document, "o", over=["s1"]) == {"ab": ("o", True)}
 
 
 def test_a_session_whose_server_has_ended_waits_for_an_open_one_that_starts() -> None:
-    document = Decisions(open=(Ahead("p", ago(40)), Ahead("o", ago(30))), formed=(FIRST, SECOND))
+    document = Decisions(open=(OpenSession("p", ago(40)), OpenSession("o", ago(30))), formed=(FIRST, SECOND))
     assert given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("o", False), "cd": ("s2", False)}
     assert given(document, over=["s1", "s2"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
     assert given(document, "s2", over=["s1"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
-    late = Decisions(open=(Ahead("o", ago(1800)),), formed=(FIRST,))
+    late = Decisions(open=(OpenSession("o", ago(1800)),), formed=(FIRST,))
     assert given(late, over=["s1"], coming=["o"]) == {"ab": ("s1", True)}
 
 
@@ -683,14 +685,14 @@ def of(players: int, session: Formed) -> Formed:
 
 
 def test_a_server_is_given_to_a_session_of_as_many_players_as_it_was_started_for() -> None:
-    document = Decisions(open=(Ahead("o", ago(30), players=3),), formed=(of(2, FIRST), of(3, SECOND)))
+    document = Decisions(open=(OpenSession("o", ago(30), players=3),), formed=(of(2, FIRST), of(3, SECOND)))
     assert given(document, "o") == {"ab": ("s1", False), "cd": ("o", True)}
     assert given(document, "s2") == {"ab": ("s1", False), "cd": ("s2", True)}
     assert given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("s1", True), "cd": ("s2", False)}
 
 
 def test_servers_that_were_started_for_another_number_of_players_are_replaced() -> None:
-    document = Decisions(open=(Ahead("two", ago(30), players=2), Ahead("three", ago(20), players=3)))
+    document = Decisions(open=(OpenSession("two", ago(30), players=2), OpenSession("three", ago(20), players=3)))
     after = servers_ahead.open_sessions(document, 2, "", NOW, lambda: "new", players=3, open_for=OPEN_FOR)
     assert {each.id: each.players for each in after.open} == {"two": 2, "three": 3, "new": 3}
     assert servers_ahead.surplus(after, 2, (), NOW, players=3, open_for=OPEN_FOR) == {"two"}
@@ -704,7 +706,7 @@ def test_a_session_that_has_waited_for_five_minutes_keeps_its_server() -> None:
 
 
 def test_without_a_server_that_is_ready_the_document_stays_as_it_is() -> None:
-    for document in (THREE, Decisions(open=(Ahead("o", NOW),)), Decisions()):
+    for document in (THREE, Decisions(open=(OpenSession("o", NOW),)), Decisions()):
         for ready in ([], ["o", "x"]):
             after = servers_ahead.with_ready_servers(document, ready, (), NOW, open_for=timedelta(minutes=30))
             assert after is document
@@ -720,13 +722,13 @@ def test_only_a_session_that_has_its_server_is_decided_for_good() -> None:
     settled = replace(FIRST, waits_for=None)
     document = Decisions(formed=(settled, SECOND), unmatched=(Unmatched("z", "Z", NOW),))
     assert [document.is_decided(label) for label in "acz"] == [True, False, True]
-    assert document.of("c") == Decisions()
+    assert document.decided_for("c") == Decisions()
     assert document.for_good() == Decisions(formed=(settled,), unmatched=document.unmatched)
     assert document.without_server() == [SECOND]
 
 
 def test_one_who_is_erased_is_forgotten_by_the_server_that_started_for_them() -> None:
-    waits = replace(FIRST, waits_for=Ahead("s1", NOW, "a"))
+    waits = replace(FIRST, waits_for=OpenSession("s1", NOW, "a"))
     [left] = rules.without(Decisions(formed=(waits,)), "a").formed
-    assert left.waits_for == Ahead("s1", NOW)
+    assert left.waits_for == OpenSession("s1", NOW)
     assert left.labels == ("", "b")

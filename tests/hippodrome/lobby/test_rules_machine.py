@@ -190,7 +190,7 @@ class World:
             assert who in after.labels() or who in self.memberships, "patience is overrun"
         yield
         self.delete(folder.done_key(self.project.id, name) for name in entries.done - kept)
-        yield from self.carry_out(after.of(who), entries)
+        yield from self.carry_out(after.decided_for(who), entries)
 
     def wait_for_server(self, who: str) -> Request:
         ready, now = set(self.ready), self.now
@@ -198,7 +198,7 @@ class World:
         yield from self.change(
             lambda document: servers_ahead.with_ready_servers(document, ready, (), now, open_for=OPEN_FOR), Entries()
         )
-        yield from self.carry_out(self.document.of(who), Entries())
+        yield from self.carry_out(self.document.decided_for(who), Entries())
 
     def is_written(self, entries: Entries, label: str) -> bool:
         return folder.waiting_key(self.project.id, entries.waiting[label]) in self.entries
