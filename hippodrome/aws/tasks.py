@@ -237,7 +237,7 @@ def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[Running
             yield RunningTask(task["taskArn"], cluster, name, interface, task["lastStatus"] == "RUNNING")
 
 
-def _run_error(error: ClientError, request: TaskRequest) -> Exception:
+def _run_error(error: Exception, request: TaskRequest) -> Exception:
     """The port's error for a failed RunTask; the error itself if the caller can only retry later."""
     name, text = errors.code(error), errors.message(error)
     if _TRANSIENT.search(text) or name not in _REFUSALS:

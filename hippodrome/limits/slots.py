@@ -1,4 +1,4 @@
-"""Takes and releases the slots of projects that have limits. Other projects cost no call."""
+"""Takes and releases the slots of projects that have limits. For other projects it makes no call."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.storage.compare_and_swap import SharedDocuments
 
-FULL_FOR = timedelta(seconds=10)  # how long a full study is known to be full without a call
+FULL_FOR = timedelta(seconds=10)  # for so long a function takes a study for full without a call
 
 
 class Release(NamedTuple):
-    """A server that ends, the reason, and whether the participant's next attempt keeps its slot."""
+    """A server that ends, the reason, and whether its slot is kept for the next attempt."""
 
     server: Server
     reason: Reason
@@ -29,7 +29,7 @@ class Release(NamedTuple):
 
 
 class Slots:
-    """The slots in all projects. Each running function has one, which remembers full studies for `FULL_FOR`."""
+    """The slots of all projects. Each running function has one, which remembers full studies for `FULL_FOR`."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -39,9 +39,9 @@ class Slots:
     # Participants
 
     def admit(self, project: Project, user_id: str) -> bool:
-        """Give a newcomer a slot, and return whether there is one. Two calls; none without `maxParticipants`.
+        """Give a newcomer a slot; return False if none is free. Mostly two calls; none without `maxParticipants`.
 
-        A participant who holds a slot keeps it, even if a crash came before `participant.json` was written.
+        A participant who holds a slot keeps it, even if a crash prevented that `participant.json` was written.
         """
         limit = project.max_participants
         if limit is None or self._is_known_full(project, limit):
@@ -64,8 +64,8 @@ class Slots:
     def set_limit(self, project: Project, user_ids: Iterable[str]) -> None:
         """Divide a new or changed `maxParticipants` among the shards; `user_ids` are the participants so far.
 
-        One read for each shard. If something changes, more calls for each shard, during which the study is full for
-        newcomers.
+        One read for each shard. If something has to change, more calls for each shard, and the study is full for
+        newcomers until the last of them.
         """
         limit = project.max_participants
         if limit is None:
@@ -87,23 +87,23 @@ class Slots:
             self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.with_room_for, more=more))
 
     def documents_naming(self, project_id: str, user_id: str) -> list[str]:
-        """The keys of documents that hold this participant's label: one listing, and a read of each shard.
+        """The keys of the documents that hold this participant's label. One listing, and a read of each shard.
 
-        Documents that cannot be read are not among them, see `unreadable`.
+        Documents that cannot be read are not among them; `unreadable` returns their keys.
         """
         label, readable = ids.server_label(project_id, user_id), self._participant_slots(project_id)
         return [key for key, people in readable.items() if people and label in people.labels]
 
     def unreadable(self, project_id: str) -> list[str]:
-        """The keys of documents of participants' slots that cannot be read. A call for each shard."""
+        """The keys of the documents of participants' slots that cannot be read. One listing, and a read of each."""
         return [key for key, people in self._participant_slots(project_id).items() if people is None]
 
     def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:
-        """By key, every document of participants' slots; None for those that cannot be read."""
-        ours = {limits.participant_slots_key(project_id, shard) for shard in range(SHARDS)}
+        """By key, the record in every document of participants' slots; None if it cannot be read."""
+        shards = {limits.participant_slots_key(project_id, shard) for shard in range(SHARDS)}
         found: dict[str, ParticipantSlots | None] = {}
         for entry in self._platform.documents.list(limits.participant_slots_folder(project_id)):
-            if entry.key in ours:
+            if entry.key in shards:
                 try:
                     found[entry.key] = self._shared.read(entry.key, ParticipantSlots)
                 except (ValueError, RecursionError) as error:
@@ -112,7 +112,7 @@ class Slots:
         return found
 
     def release_participant(self, project_id: str, user_id: str) -> None:
-        """Release the slot of a participant who is erased."""
+        """Release the slot of a participant whose data are erased."""
         label = ids.server_label(project_id, user_id)
         for key in self.documents_naming(project_id, user_id):
             self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.without, label=label))
@@ -120,9 +120,9 @@ class Slots:
     # Servers
 
     def acquire(self, project: Project, record: Server) -> bool:
-        """Take a slot for a server whose record is written; return whether one is free. Two calls, none without limits.
+        """Take a slot for a server whose record is written; False if none is free. Two calls, none without limits.
 
-        If there is none, a slot that is kept from an earlier attempt is released, too.
+        If none is free, a slot that was kept from an earlier attempt is released, too.
         """
         if not record.counted:
             return True
@@ -145,9 +145,9 @@ class Slots:
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, leave)
 
     def server_slots(self, projects: Iterable[Project]) -> dict[str, ServerSlots]:
-        """By project, the slots of its servers: one read for each of these projects that limits servers.
+        """By project, the slots of its servers. One read for each of these projects that limits servers.
 
-        There is no listing, so other documents in that folder are never read.
+        Without a listing, no other document in that folder is read.
         """
         found = {}
         for project in projects:
@@ -161,16 +161,16 @@ class Slots:
         return found
 
     def release_forgotten(self, project_id: str, forgotten: Mapping[str, Server | None]) -> None:
-        """Release slots that ended servers still hold, by name: two calls for all of them.
+        """Release slots that ended servers still hold. Two calls for all of them.
 
-        The value is the server's closed record, or None if there is none any more.
+        `forgotten` has, by the server's name, its closed record; None if it has none any more.
         """
-        gone = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
-        self._shared.change(limits.server_slots_key(project_id), ServerSlots, lambda running: running.without_all(gone))
+        ended = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
+        self._shared.change(limits.server_slots_key(project_id), ServerSlots, lambda slots: slots.without_all(ended))
 
 
 def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:
-    """A server's label, attempt and used seconds (None if its record does not tell); None if it is no server's name."""
+    """A server's label, attempt and used seconds (None: not known from its record); None if it is no server's name."""
     label, attempt = ids.parse_server_name(name) or ("", 0)
     if not label:
         return None

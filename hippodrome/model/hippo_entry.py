@@ -1,9 +1,9 @@
-"""An entry of `project_master_list.json` as HIPPO's `update_project_master_list` wrote it, in our form. Pure.
+"""Turns an entry of `project_master_list.json` that HIPPO's `update_project_master_list` wrote into our form. Pure.
 
 HIPPO stores `id`, `name`, `live`, `researcher`, `team_members`, `ecsTask`, `steps` (a map), `events`, `maxRuntime` and
 `bucket` as they were sent (IRLL/HIPPO_Gym_AWS, `update_project_master_list.py`). Functions that show pages read such
-an entry, so nothing heavy is imported here. `hippodrome.config.hippo_registration` reads what is registered, and says
-remarks.
+an entry, so this module imports nothing heavy. A registration by HIPPO's script is read by
+`hippodrome.config.hippo_registration`, which also makes remarks.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from hippodrome.model.step_order import FINAL, default_start, default_stop, posi
 from hippodrome.model.step_types import type_of
 
 SALT = "hippo"
-"""What the secret of such a project is derived from. A registration keeps it, so tickets and codes stay valid."""
+"""The salt of such a project, for its secret. A registration keeps it, so tickets and codes stay valid."""
 
-USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes
+USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes: HIPPO's default, and the most that we take
 _PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 
 
 def is_hippos(entry: Mapping[str, Any]) -> bool:
-    """Whether HIPPO wrote this entry: its steps are a map, and a list in our entries."""
+    """Whether HIPPO wrote this entry: its steps are a map. In our entries they are a list."""
     return isinstance(entry.get("steps"), dict)
 
 
@@ -50,7 +50,7 @@ def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _pages(steps: Mapping[str, Any]) -> dict[str, str]:
-    """By key, the pages in order: steps without a page are left out, and those after them count one less."""
+    """The pages in order, by their keys. Steps without a page are left out, and the keys of later steps count less."""
     numbers = _numbers(steps)
     if numbers != list(range(1, len(numbers) + 1)):
         raise ValueError("a number between its steps is missing")
@@ -68,7 +68,7 @@ def _numbers(steps: Mapping[str, Any]) -> list[int]:
 
 
 def _events(entry: Mapping[str, Any], keys: list[str], pages: Mapping[str, str]) -> dict[str, str]:
-    """The steps where the server starts and stops; around the game where the entry says nothing of use."""
+    """The steps at which the server starts and stops. Steps that do not fit the game are replaced by the defaults."""
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if not games:
         return {}
@@ -82,9 +82,9 @@ def _events(entry: Mapping[str, Any], keys: list[str], pages: Mapping[str, str])
     return {"startServerStep": keys[start], "stopServerStep": keys[stop]}
 
 
-def _place(named: object, steps: Mapping[str, Any], keys: list[str]) -> int | None:
-    """Where a step of HIPPO's stands among ours; the last one for what is beyond; None if it is not one."""
-    text = str(named)
+def _place(event: object, steps: Mapping[str, Any], keys: list[str]) -> int | None:
+    """The index in `keys` of the step that an event of HIPPO's names; the last if it is beyond; None if it is none."""
+    text = str(event)
     if text == FINAL:
         return len(keys) - 1
     numbers = _numbers(steps)
@@ -103,7 +103,7 @@ def _page(given: object) -> str:
 
 
 def _minutes(given: object) -> int:
-    """HIPPO takes numbers and numerals, and 60 for nothing."""
+    """The maxRuntime in minutes, of a number or a numeral as HIPPO takes both; `USUAL_RUNTIME` if it is missing."""
     if _is_blank(given):
         return USUAL_RUNTIME
     if isinstance(given, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(given)):

@@ -1,4 +1,4 @@
-"""Ids and what is derived from them: names of servers, groups, tickets, link signatures, completion codes. Pure."""
+"""Checks ids, and derives from them: servers' names, groups, tickets, link signatures, completion codes. Pure."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import secrets
 from datetime import datetime
 
 PROJECT_ID = re.compile(r"(?!_)[A-Za-z0-9_-]{1,64}")
-"""What an id may be that stands in S3 keys, in the family of a task definition, in an image's tag and in links.
+"""A valid project id. It stands in S3 keys, in the family of a task definition, in an image's tag and in links.
 
-ECS takes letters, digits, `-` and `_` in a family (API_RegisterTaskDefinition); ECR these and `.` in a tag. No DNS name
-holds a project's id. Folders of ours begin with `_` in the bucket, so no id does.
+ECS takes letters, digits, `-` and `_` in a family (API_RegisterTaskDefinition); ECR takes these and `.` in a tag. No
+DNS name holds a project's id. Our own folders in the bucket begin with `_`, so no id does.
 """
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
@@ -34,17 +34,17 @@ def is_user_id(text: object) -> bool:
 
 
 def warm_id(project_id: str, asked: datetime, number: int) -> str:
-    """The user id of a warm server until it is assigned. It is no valid participant's id, so no link can name it."""
+    """The user id in the record of this warm server. It is no valid participant's id, so no link can name it."""
     return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_warm_id(text: object) -> bool:
-    """Whether this user id is that of a warm server."""
+    """Whether this user id is a warm server's."""
     return isinstance(text, str) and _WARM_ID.fullmatch(text) is not None
 
 
 def new_session_id() -> str:
-    """The id of a new session: random. It is no valid participant's id, so no link can name it."""
+    """A new random id of a session or a proposal. It is no valid participant's id, so no link names it."""
     return f"s.{secrets.token_hex(10)}"
 
 
@@ -52,53 +52,54 @@ def new_session_id() -> str:
 def server_label(project_id: str, user_id: str) -> str:
     """The label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
 
-    21 characters of `[a-z2-7]`, the first a letter. 100 bits, so that the labels of a million participants differ.
+    It has 21 characters of `[a-z2-7]`, the first a letter. Its 100 bits tell a million participants apart.
     """
     digest = hashlib.sha256(f"server\0{project_id}\0{user_id}".encode()).digest()
     return "s" + base64.b32encode(digest).decode().lower()[:20]
 
 
 def server_name(label: str, attempt: int) -> str:
-    """The name of one attempt: its DNS label, its task's `startedBy`, its timer's name."""
+    """The name of one attempt of a server: its DNS label, its task's `startedBy`, and its timer's name."""
     return f"{label}-{attempt}"
 
 
 def parse_server_name(name: str) -> tuple[str, int] | None:
-    """The label and the attempt in a server's name; None if it is not the name of a server."""
+    """The label and the attempt in a server's name; None if this is no server's name."""
     found = _SERVER_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
 
 
 def delayed_timer(name: str) -> str:
-    """The name of a server's second timer, which stops it after a delay (the stop relay)."""
+    """The name of a server's second timer, with which the stop relay stops it after a delay."""
     return name + _DELAYED
 
 
 def timer_server(timer: str) -> str:
-    """The name of the server that a timer stops, either of its two."""
+    """The name of the server that this timer stops. A server may have two timers."""
     return timer.removesuffix(_DELAYED)
 
 
 def host_server(domain_name: str) -> str:
-    """The name of the server that a DNS name leads to: its first label."""
+    """The first label of a server's DNS name, which by default is the server's name."""
     return domain_name.partition(".")[0]
 
 
 def is_host_label(text: str) -> bool:
-    """Whether a server's DNS name may begin with this label: it is valid, and not the default name of any server.
+    """Whether a server's DNS name may begin with this label: it is valid, and no server's default name.
 
-    A label has at most 63 bytes (RFC 1035, 2.3.4), and Route 53 refuses a whole batch of changes for one that is longer
-    (DomainLabelTooLong). It takes any printable character and stores letters in lower case (Route 53 Developer Guide,
-    "DNS domain name format"); browsers are stricter: a label that begins or ends with a dash is no host (RFC 952), and
-    one that begins with `xn--` has to be Punycode (RFC 5890).
+    A label has at most 63 bytes (RFC 1035, 2.3.4); for a longer one Route 53 refuses a whole batch of changes
+    (DomainLabelTooLong). Route 53 takes any printable character and stores letters in lower case (Route 53 Developer
+    Guide, "DNS domain name format"). Browsers are stricter: a label that begins or ends with a dash is no host (RFC
+    952), and one that begins with `xn--` has to be Punycode (RFC 5890).
     """
     return _HOST.fullmatch(text) is not None and parse_server_name(text) is None
 
 
 def group(project_id: str, user_id: str, variants: int) -> int:
-    """The participant's group, 0 to `variants` - 1: always the same one, and each equally likely.
+    """The participant's group, 0 to `variants` - 1. It never changes, and all groups are equally likely.
 
-    A participant has the same group at all steps with the same number of variants, and independent ones otherwise.
+    A participant has the same group at all steps with the same number of variants. The groups for different numbers are
+    independent.
     """
     digest = hashlib.sha256(f"group\0{variants}\0{project_id}\0{user_id}".encode()).digest()
     return int.from_bytes(digest[:16], "big") % variants
@@ -110,14 +111,14 @@ def ticket(secret: str, user_id: str, step: str) -> str:
 
 
 def link_signature(secret: str, project_id: str, user_id: str) -> str:
-    """Proof, in a link, that this participant is invited: it takes the project's secret. 32 hex digits of an HMAC."""
+    """Proof, in a link, that this participant is invited. 32 hex digits of an HMAC with the project's secret."""
     return hmac.new(secret.encode(), f"link\0{project_id}\0{user_id}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
-    """The code that a participant gives to the recruiter: 10 characters, which only the project's secret makes.
+    """The code that a participant gives to the recruiter: 10 characters of an HMAC with the project's secret.
 
-    With an `outcome`, such as `unmatched`, it is another code.
+    Each `outcome`, such as `unmatched`, has another code.
     """
     about = f"completion\0{user_id}" + (f"\0{outcome}" if outcome else "")
     digest = hmac.new(secret.encode(), about.encode(), hashlib.sha256).digest()
@@ -125,5 +126,5 @@ def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
 
 
 def secrets_equal(given: str, expected: str) -> bool:
-    """Compare a secret from outside, which may hold any characters, with the expected one in constant time."""
+    """Compare a given secret, which may hold any characters, with the expected one in constant time."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())

@@ -1,4 +1,4 @@
-"""Who plays with whom (`matching` in config.yml): its values. Pure."""
+"""The values of `matching` and `seats` in config.yml, which say who plays with whom, and which player. Pure."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Mapping
 
 MATCH = "match"
 MATCHINGS = ("arrival", "group", "mixed", MATCH)
-"""Who came first, people of one group, of different groups, or as the function `match` of agent.py says."""
+"""In the order of arrival; people of one group; people of different groups; as the function `match` has chosen."""
 MATCHED_BY = ("same", "different")
-"""By what they answered in a field of an earlier page."""
+"""The keys of a `matching` that is a map: people with the same answer, or with different ones, in a field of a page."""
 
 SEATS = ("lot", "group", "match")
-"""Who of a session plays which player: by lot, by the number of the group, or in the order in which `match` names
+"""Which member of a session plays which player: by lot; by the number of the group; in the order in which `match` names
 the members."""
 
 
 def field_of(matching: str | Mapping[str, str]) -> str | None:
-    """The field of an earlier page whose answers decide; None if none does."""
+    """The field of an earlier page by whose answers participants are matched; None if they are matched otherwise."""
     return None if isinstance(matching, str) else next(iter(matching.values()), None)

@@ -1,7 +1,7 @@
-"""What a participant of a project with several `players` is: a member of a session, or unmatched. Pure.
+"""A participant's membership in a project with several `players`: they play in a session, or are unmatched. Pure.
 
-`{projectId}/users/{userId}/session.json` is created once, after the lobby has decided, and never changed. So it makes a
-participant a member, or unmatched, for good.
+`{projectId}/users/{userId}/session.json` is created once, after the lobby has decided, and never changed. So a
+participant stays a member of that session, or unmatched, for good.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from hippodrome.model.records import Record, from_json
 
 
 class Membership(Record, frozen=True, omit_defaults=False):
-    """The document. `session` is None for a participant who was not matched.
+    """The document of a membership. `session` is the session's id; None for an unmatched participant.
 
-    `seat` counts the human players of the environment from 0; `members` is how many participants the session has, and
-    `players` is how many it is for, with the places that nobody has; 0 in documents of earlier versions. An
-    unmatched participant is shown `completion_code`, which is another one than that of `participant.json`. `waited`:
-    the seconds that the participant spent in the lobby.
+    `seat` counts the human players of the environment from 0. `members` is how many participants the session has;
+    `players`, how many it is for, empty places included (0 in documents of earlier versions). `completion_code` is the
+    one that an unmatched participant is shown instead of the one in `participant.json`. `waited`: the seconds that the
+    participant spent in the lobby.
     """
 
     session: str | None = None
@@ -31,5 +31,5 @@ def read(body: bytes) -> Membership:
     """The membership in a document. Raises ValueError or RecursionError if it holds none."""
     found = from_json(body, Membership)
     if (found.session is None) is not found.unmatched:
-        raise ValueError("the document says neither which session nor that there is none")
+        raise ValueError("the document must either name a session or say that the participant is unmatched")
     return found

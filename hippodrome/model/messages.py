@@ -1,11 +1,11 @@
-"""Messages of the topics and queues, and ECS events: their records, and how they are parsed from untrusted JSON."""
+"""The records of messages and ECS events, which functions parse here from untrusted JSON. Pure."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
@@ -14,12 +14,13 @@ from hippodrome.model.records import Record, from_data
 from hippodrome.ports import Message
 from protocol.session import is_session_id
 
+R = TypeVar("R", bound=Record)
 STOP_REASON_PREFIX = "hippodrome:"  # begins each stoppedReason that our functions give
-_WORDS_BEFORE_CODE = (  # in stoppedReason; they decide even if there is a stopCode
+_WORDS_BEFORE_CODE = (  # patterns of stoppedReason that decide even if there is a stopCode
     ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
     ("InfrastructureHealth", re.compile(r"performing maintenance on the underlying infrastructure", re.IGNORECASE)),
 )
-_WORDS_WITHOUT_CODE = (  # they decide only if there is no stopCode
+_WORDS_WITHOUT_CODE = (  # patterns of stoppedReason that decide only if there is no stopCode
     ("UserInitiated", re.compile(r"stopped by user", re.IGNORECASE)),
     ("EssentialContainerExited", re.compile(r"essential container in task exited", re.IGNORECASE)),
     (
@@ -30,11 +31,11 @@ _WORDS_WITHOUT_CODE = (  # they decide only if there is no stopCode
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: start this participant's server. `attempt` is from 1.
+    """Start topic: start this participant's server. `attempt` counts from 1.
 
-    `user_id` may also be a warm server's id, or a session's. If sessions of the project have several players, a
-    participant's message starts no server of their own: it says that they are under way to the game. `players` is the
-    number of players of a session; 0: the number that its record says, or else the one that is registered now.
+    `user_id` may also be a warm server's id, or a session's. In a project with several players a participant's message
+    starts no server of their own: it says that they are under way to the game. `players` is the number of players of a
+    session; 0 means the number in its server's record, or without a record the registered one.
     """
 
     project_id: str
@@ -44,7 +45,7 @@ class StartServer(Record, frozen=True):
 
 
 class StopServer(Record, frozen=True):
-    """Stop topic: stop the server, but only this attempt. HIPPO's messages name none: then stop any attempt."""
+    """Stop topic: stop this attempt of the server; without `attempt`, as in HIPPO's messages, the present one."""
 
     project_id: str
     user_id: str
@@ -53,7 +54,7 @@ class StopServer(Record, frozen=True):
 
 
 class StopUser(Record, frozen=True):
-    """Stop topic: stop the participant's servers of all projects. HIPPO's relay and timers name no project."""
+    """Stop topic: stop the participant's servers in all projects. HIPPO's relay and timers name no project."""
 
     user_id: str
 
@@ -65,16 +66,16 @@ class KeepWarm(Record, frozen=True):
 
 
 class ServerAttempt(Record, frozen=True):
-    """One attempt of a server."""
+    """One attempt of a server, by the label of the server's record."""
 
     label: str
     attempt: int
 
 
 class DnsChanged(Record, frozen=True):
-    """From `task_changed` to itself: check whether this DNS change is INSYNC. `looked` counts the checks before.
+    """From `task_changed` to itself: check whether this DNS change is INSYNC, so that these servers are ready.
 
-    `unmade`: the zone was busy, so the change must still be made.
+    `looked` counts the checks before this one. `unmade`: the zone was busy, so the change must still be made.
     """
 
     change: str
@@ -84,7 +85,10 @@ class DnsChanged(Record, frozen=True):
 
 
 class TaskSeen(Record, frozen=True):
-    """To `task_changed`, from itself or the sweep: this task runs and has no DNS name yet."""
+    """To `task_changed`, from itself or the sweep: this task runs and has no DNS record yet.
+
+    `looked` counts how often its address was looked up before.
+    """
 
     task: str
     cluster: str
@@ -109,10 +113,10 @@ class TaskChanged(NamedTuple):
 
 
 def body_of(record: Any) -> Any:
-    """The JSON body of a record of SQS or SNS, taken out of SNS's envelope if there is one; None if it is not JSON.
+    """The JSON message in a record of SQS or SNS; None if it is not JSON.
 
-    An event that SNS sends to a function has the envelope as an object:
-    https://docs.aws.amazon.com/lambda/latest/dg/with-sns.html
+    SNS puts a message into an envelope. In an SQS record the envelope is JSON text; in an event that SNS sends to a
+    function it is an object: https://docs.aws.amazon.com/lambda/latest/dg/with-sns.html
     """
     try:
         if "Sns" in record:
@@ -126,37 +130,34 @@ def body_of(record: Any) -> Any:
 
 
 def parse_start_server(body: Any) -> StartServer | KeepWarm | None:
-    """The start message in a body; None if it is not a valid one."""
-    warm: KeepWarm | None = _read(body, KeepWarm)
-    if warm:
+    """Read a message of the start topic; None if it is not a valid one."""
+    if warm := _read(body, KeepWarm):
         return warm if ids.is_project_id(warm.keep_warm) else None
-    message: StartServer | None = _read(body, StartServer)
+    message = _read(body, StartServer)
     return message if message and _ids_are_valid(message) and message.attempt >= 1 else None
 
 
 def parse_stop_server(body: Any) -> StopServer | StopUser | None:
-    """The stop message in a body; None if it is not a valid one."""
+    """Read a message of the stop topic; None if it is not a valid one."""
     if isinstance(body, dict) and body.get("projectId") is None:
-        everywhere: StopUser | None = _read(body, StopUser)
+        everywhere = _read(body, StopUser)
         return everywhere if everywhere and ids.is_user_id(everywhere.user_id) else None
-    message: StopServer | None = _read(body, StopServer)
+    message = _read(body, StopServer)
     return message if message and _ids_are_valid(message) else None
 
 
 def parse_dns_changed(body: Any) -> DnsChanged | None:
-    """The follow-up message in a body; None if it is not a valid one."""
-    message: DnsChanged | None = _read(body, DnsChanged)
-    return message
+    """Read a message about a DNS change; None if it is not a valid one."""
+    return _read(body, DnsChanged)
 
 
 def parse_task_changed(body: Any) -> TaskChanged | None:
-    """The ECS event or the `TaskSeen` in a body; None if it is neither, or if the task is not a server's."""
-    seen: TaskSeen | None = _read(body, TaskSeen)
-    if seen:
-        named = TaskChanged(
+    """Read an ECS event or a `TaskSeen`; None if the body is neither, or if the task is not a server's."""
+    if seen := _read(body, TaskSeen):
+        running = TaskChanged(
             seen.task, seen.cluster, seen.name, "RUNNING", seen.interface, None, "", None, "", seen.looked
         )
-        return named if ids.parse_server_name(seen.name) else None
+        return running if ids.parse_server_name(seen.name) else None
     try:
         detail = body["detail"]
         if body["source"] != "aws.ecs" or ids.parse_server_name(detail["startedBy"]) is None:
@@ -181,7 +182,7 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
 
 
 def _status(detail: Mapping[str, Any]) -> str:
-    """`lastStatus`, or STOPPING; DEPROVISIONING only if the event has all that is needed about the task's end."""
+    """`lastStatus`; STOPPING instead, if containers may still run or the event does not say how they ended."""
     last = str(detail["lastStatus"])
     if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
         return "STOPPING"
@@ -191,18 +192,18 @@ def _status(detail: Mapping[str, Any]) -> str:
 
 
 def _has_ended(detail: Mapping[str, Any]) -> bool:
-    """Whether no container runs any more and the event says why: a trial that ended by itself has an exit code."""
+    """Whether all containers have stopped and the event says why: a trial that ended by itself needs an exit code."""
     containers, code = detail.get("containers", []), _stop_code(detail)
     exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
     return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
 
 
 def _stop_code(detail: Mapping[str, Any]) -> str | None:
-    """`stopCode`, or the code that `stoppedReason` belongs to (ECS Developer Guide, "Stopped task error messages").
+    """`stopCode`, or the code for the words in `stoppedReason` (ECS Developer Guide, "Stopped task error messages").
 
     A Spot interruption is recognised by its words: real events came without a code (aws/containers-roadmap, issues 797
-    and 1565), and a program that ends within the two minutes after the warning has the exit code 0. The retirement of
-    a Fargate machine also has words of its own ("Task retirement and maintenance"), with any code.
+    and 1565), and a program that ends within the two minutes after the warning has the exit code 0. The retirement of a
+    Fargate machine is recognised by its words too ("Task retirement and maintenance"), whatever the code.
     """
     code, words = detail.get("stopCode"), str(detail.get("stoppedReason") or "")
     if words.startswith(STOP_REASON_PREFIX):
@@ -218,7 +219,8 @@ def to_message(record: Record) -> Message:
     return dict(msgspec.to_builtins(record))
 
 
-def _read(body: Any, kind: type[Any]) -> Any:
+def _read(body: Any, kind: type[R]) -> R | None:
+    """Read a record of this kind; None if the body is none."""
     try:
         return from_data(body, kind)
     except (msgspec.ValidationError, RecursionError):

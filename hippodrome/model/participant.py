@@ -1,8 +1,8 @@
 """A participant's records, and the rule for the step that is due. Pure.
 
 An answer is a document of its own, created once and never changed. The first step without an answer is due. So one
-conditional write stores an answer and moves the participant on; a second submit of the same page changes nothing, two
-tabs cannot lose each other's answers, and no record grows.
+conditional write both stores an answer and moves the participant on. A second submission of the same page changes
+nothing, two tabs cannot lose each other's answers, and no record grows.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from hippodrome.ports import Entry
 from protocol.answer import Answer
 from protocol.keys import participant_folder
 
-REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step and repeats an answer this young is ignored
-MAX_COMPARED = 10  # such a form is compared with this many of the latest answers; each costs a read
+REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
+MAX_COMPARED = 10  # such a form is compared with so many of the latest answers; each costs a read
 
 
 class Participant(Record, frozen=True):
@@ -45,17 +45,17 @@ class Progress:
 
     @classmethod
     def from_listing(cls, folder: str, entries: Iterable[Entry]) -> Progress:
-        """Read a listing of `folder` in key order, up to participant.json: answers sort before it, recordings after."""
-        known, answered = False, {}
+        """Read a listing of `folder` in the order of keys. Answers come before participant.json, recordings after."""
+        has_arrived, answered = False, {}
         for entry in entries:
             name = entry.key.removeprefix(folder)
             if name > "participant.json":
                 break
             if name == "participant.json":
-                known = True
+                has_arrived = True
             elif name.startswith("answers/") and name.endswith(".json"):
                 answered[name.removeprefix("answers/").removesuffix(".json")] = entry.modified
-        return cls(known, answered)
+        return cls(has_arrived, answered)
 
     def position(self, project: Project) -> Step:
         """The step that is due: the first without an answer, or the final one."""
@@ -123,18 +123,17 @@ def stops_server(project: Project, step: Step) -> bool:
 
 
 def may_have_server(project: Project, step: Step) -> bool:
-    """Whether the participant may have a server at this step: from the start step on, up to before the stop step."""
-    start, stop = project.events.start_server_step, project.events.stop_server_step
-    here, first = project.index(step.key), project.index(start) if start else None
-    last = project.index(stop) if stop else None
-    return here is not None and first is not None and first <= here and (last is None or here < last)
+    """Whether the participant may have a server at this step: at the start step or later, and before the stop step."""
+    start = project.events.start_server_step
+    at, first = project.index(step.key), project.index(start) if start else None
+    return at is not None and first is not None and first <= at and not is_past_server(project, step)
 
 
 def is_past_server(project: Project, step: Step) -> bool:
     """Whether the participant needs no server any more at this step: it is the stop step or a later one."""
     stop = project.events.stop_server_step
-    here, last = project.index(step.key), project.index(stop) if stop else None
-    return here is not None and last is not None and here >= last
+    at, last = project.index(step.key), project.index(stop) if stop else None
+    return at is not None and last is not None and at >= last
 
 
 def reached_without_post(project: Project, step: Step) -> bool:

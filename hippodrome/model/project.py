@@ -20,7 +20,10 @@ MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRunt
 
 
 class Step(Record, frozen=True):
-    """One step of the study. `page` is a step file without `.html`, or `game`; `variants` counts `{page}-0.html` …"""
+    """One step of the study. `page` is a step file's name without `.html`, or `game`.
+
+    `variants` is the number of the files `{page}-0.html`, `{page}-1.html` …; 0 if the page has no variants.
+    """
 
     key: str
     page: str
@@ -32,7 +35,7 @@ class Step(Record, frozen=True):
 
     @property
     def files(self) -> list[str]:
-        """The step files of all groups; none for a step that has no page."""
+        """The names of the step files of all groups, without `.html`; none for a game."""
         if not self.type.has_files:
             return []
         return [f"{self.page}-{number}" for number in range(self.variants)] or [self.page]
@@ -64,9 +67,9 @@ class Ssl(Record, frozen=True):
 
 
 class ForPlayers(Record, frozen=True):
-    """What was registered last for this number of players. The fields are those of `Project`.
+    """The last registration for this number of players, before another number was registered.
 
-    Servers of games with this number run it, also after another number was registered. For 1 player these are the
+    The fields are those of `Project`. Servers of sessions with this number still run it. For 1 player these are the
     servers that participants had of their own before several players were registered.
     """
 
@@ -101,7 +104,7 @@ class Project(Record, frozen=True):
     max_participants: int | None = None
     max_servers: int | None = None  # at once
     max_server_hours: int | None = None  # of all servers together, ever
-    warm_servers: int = 0  # how many to keep started ahead of participants
+    warm_servers: int = 0  # how many servers to keep started ahead of participants
     signed_links: bool = False
     players: int = 1  # participants of one session; 1: each participant has a server of their own
     matching: str | dict[str, str] = "arrival"  # who plays with whom: see `matching.py`
@@ -118,26 +121,26 @@ class Project(Record, frozen=True):
     page_folder: Literal["steps", ""] = (
         STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
     )
-    other_numbers: tuple[ForPlayers, ...] = ()  # that were registered before
+    other_numbers: tuple[ForPlayers, ...] = ()  # the last registrations for other numbers of players
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` fills it in; earlier versions stored it
+    secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` sets it; earlier versions stored it here
 
     @property
     def final(self) -> Step:
-        """The step where the study ends."""
+        """The last step of the study."""
         return self.steps[-1]
 
     @property
     def game_steps(self) -> list[str]:
-        """The keys of the steps that take place on the participant's server; the trial stores their answers."""
+        """The keys of the steps that are played on a server, whose trial stores their answers."""
         return [step.key for step in self.steps if step.type.on_server]
 
     @property
     def pages_in_game(self) -> list[Step]:
-        """The pages that game steps show, each as a step whose key is the key of `trial` that names it."""
-        named = {key: self.trial.get(key) for key in GAME_PAGES} if self.game_steps else {}
-        return [Step(key, page, self.game_pages.get(key, 0)) for key, page in named.items() if isinstance(page, str)]
+        """The pages that game steps show, each as a `Step` with the key of `trial` that names the page."""
+        pages = {key: self.trial.get(key) for key in GAME_PAGES} if self.game_steps else {}
+        return [Step(key, page, self.game_pages.get(key, 0)) for key, page in pages.items() if isinstance(page, str)]
 
     @property
     def size(self) -> AwsSetup:
@@ -149,7 +152,7 @@ class Project(Record, frozen=True):
         return self.players > 1
 
     def following(self, before: Project | None) -> Project:
-        """This registration, completed by what `before`, the one before it, has for other numbers of players."""
+        """This registration, with those for other numbers of players from `before`, the present registration."""
         kept = {each.players: each for each in (before.other_numbers if before else ())}
         if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
@@ -157,10 +160,10 @@ class Project(Record, frozen=True):
         return msgspec.structs.replace(self, other_numbers=others)
 
     def for_session(self, players: int) -> Project | None:
-        """The project as servers of games with so many players run it: as that number was registered last.
+        """The project as it was registered last for this number of players, for servers of sessions with that number.
 
-        0 stands for the number that is registered now. None if the number never was registered. Warm servers run only
-        what is registered now.
+        0 stands for the number that is registered now. None if the number was never registered. The result for another
+        number has no warm servers: they run only the present registration.
         """
         if players in (0, self.players):
             return self
@@ -185,7 +188,7 @@ class Project(Record, frozen=True):
         return self.max_servers is not None or self.max_server_hours is not None
 
     def page_key(self, file: str) -> str:
-        """The key of one of its step pages."""
+        """The key of a step page; `file` is the page's name without `.html`."""
         return step_key(self.id, file, self.page_folder)
 
     def index(self, key: str) -> int | None:
@@ -197,7 +200,7 @@ class Project(Record, frozen=True):
         return next((step for step in self.steps if step.key == key), None)
 
     def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
-        """The step with this key, if the ticket proves that this participant was shown it; else None."""
+        """The step with this key, if the ticket proves that this participant was shown that step; else None."""
         step = self.step(key)
         proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key))
         return step if proven else None
@@ -208,27 +211,28 @@ class Project(Record, frozen=True):
         return ids.group(self.id, user_id, variants) if variants else None
 
     def file(self, user_id: str, step: Step) -> str:
-        """The step file that this participant sees, such as `consent-1`; without variants, the page itself."""
+        """The name of the step file that this participant sees, such as `consent-1`; `page` if it has no variants."""
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
 def number_of_groups(variants: Iterable[int]) -> int:
-    """How many groups of participants there are if pages have so many variants; 0 if no page has any."""
+    """The number of groups of participants, given the number of variants of each page; 0 if no page has variants."""
     return max(variants, default=0)
 
 
 class UnreadableEntry(NamedTuple):
     """An entry of the master list that cannot be read as a project."""
 
-    raw: bytes  # its JSON, unchanged
-    id: str | None  # the project's, if it has a valid one
-    why: str  # what is wrong with it
+    raw: bytes  # the entry's JSON, unchanged
+    id: str | None  # the project's id, if it is valid
+    why: str  # the reason why it cannot be read
 
 
 class MasterList(Record, frozen=True):
-    """`project_master_list.json`, in HIPPO's shape. An entry that cannot be read does not affect the others.
+    """`project_master_list.json`, in HIPPO's form. An entry that cannot be read does not affect the others.
 
-    `hippos`: by id, the JSON of entries that HIPPO wrote. They are among `projects`, and are written back unchanged.
+    `hippos`: the JSON of the entries that HIPPO wrote, by project id. Their projects are among `projects`; the JSON is
+    written back unchanged.
     """
 
     projects: list[Project] = msgspec.field(default_factory=list)
@@ -239,11 +243,11 @@ class MasterList(Record, frozen=True):
         return next((project for project in self.projects if project.id == project_id), None)
 
     def is_unreadable(self, project_id: str) -> bool:
-        """Whether this project has an entry that cannot be read, and no other."""
+        """Whether this project has an entry that cannot be read, and none that can."""
         return self.find(project_id) is None and any(entry.id == project_id for entry in self.unreadable)
 
     def salt(self, project_id: str) -> str | None:
-        """The project's salt, also of an entry that cannot be read; None if the project has no entry."""
+        """The project's salt, also from an entry that cannot be read; None if the project has no entry."""
         found = self.find(project_id)
         if found:
             return found.salt
@@ -251,7 +255,7 @@ class MasterList(Record, frozen=True):
         return next((_string(entry, "salt") for entry in entries), None)
 
     def secrets(self) -> dict[str, str]:
-        """By project, the secrets that an earlier version wrote into entries, also those that cannot be read."""
+        """The secrets that an earlier version wrote into entries, readable or not, by project id."""
         unread = {entry.id: _string(_as_object(entry.raw), "secret") for entry in self.unreadable if entry.id}
         known = unread | {project.id: project.secret for project in self.projects}
         return {project_id: secret for project_id, secret in known.items() if secret}
@@ -263,7 +267,7 @@ class MasterList(Record, frozen=True):
         return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.hippos.items()})
 
     def with_project(self, project: Project) -> MasterList:
-        """The list with this project, in place of any entry with its id, readable or not."""
+        """The list with this project, which replaces any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
         unread = tuple(entry for entry in self.unreadable if entry.id != project.id)
@@ -277,10 +281,10 @@ class _MasterListDocument(Record, frozen=True):
 
 
 def read_list(body: bytes) -> MasterList:
-    """The master list in a document. Raises ValueError or RecursionError if the document is no list of entries."""
+    """Read the master list in a document. Raises ValueError or RecursionError if it is no list of entries."""
     projects: list[Project] = []
     unread: list[UnreadableEntry] = []
-    others: list[bytes] = []  # looked at last: of two entries with one id, ours counts
+    others: list[bytes] = []  # HIPPO's entries. They are read last: of two entries with one id, ours counts
     for raw in map(bytes, from_json(body, _MasterListDocument).projects):
         try:
             projects.append(_checked(from_json(raw, Project)))
@@ -304,19 +308,19 @@ def read_list(body: bytes) -> MasterList:
 
 
 def _checked(project: Project) -> Project:
-    """The project. Raises ValueError if it cannot be one."""
+    """Return the project. Raises ValueError if it has no valid id or no steps."""
     if not ids.is_project_id(project.id) or not project.steps:
         raise ValueError("it has no steps" if project.steps == [] else "its id is not well formed")
     return project
 
 
 def _unreadable(raw: bytes, error: Exception) -> UnreadableEntry:
-    named = _as_object(raw).get("id")
-    return UnreadableEntry(raw, named if ids.is_project_id(named) else None, str(error))
+    project_id = _as_object(raw).get("id")
+    return UnreadableEntry(raw, project_id if ids.is_project_id(project_id) else None, str(error))
 
 
 def write_list(listed: MasterList) -> bytes:
-    """The master list as a document. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
+    """The master list as JSON. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
     projects = [
         msgspec.Raw(listed.hippos.get(project.id) or msgspec.json.encode(project)) for project in listed.projects
     ]
@@ -338,7 +342,7 @@ def _string(entry: Mapping[str, Any], key: str) -> str:
 
 
 def _without_secret(raw: bytes) -> bytes:
-    """An entry that cannot be read, without the secret that an earlier version may have written into it."""
+    """The JSON of an entry without the secret that an earlier version may have written into it."""
     if not _string(_as_object(raw), "secret"):
         return raw
     entry = from_json(raw, dict[str, msgspec.Raw])
@@ -349,5 +353,5 @@ MASTER_LIST = "project_master_list.json"
 
 
 def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:
-    """The key of a step page; see `Project.page_folder`."""
+    """The key of a step page; `file` is its name without `.html`, `folder` the project's `page_folder`."""
     return f"{project_id}/{folder}/{file}.html" if folder else f"{project_id}/{file}.html"

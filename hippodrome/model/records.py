@@ -1,7 +1,8 @@
-"""Records as JSON documents: camelCase keys, times in ISO 8601, unknown keys are ignored.
+"""Reads and writes records as JSON documents: camelCase keys, times in ISO 8601; unknown keys are ignored.
 
-Nothing else reads into types: msgspec 0.22 shares what it knows of a Struct before it knows all of it, so a process
-ends with a segmentation fault where two threads read one kind of record for the first time at the same moment.
+No other module decodes JSON into records. msgspec 0.22 shares its information on a Struct between threads before that
+information is complete: a process dies with a segmentation fault if two threads decode one type of record for the first
+time at the same moment. The lock here prevents that.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class Record(msgspec.Struct, frozen=True, omit_defaults=True, rename="camel"):
 
 _encoder = msgspec.json.Encoder()
 _decoders: dict[Any, msgspec.json.Decoder[Any]] = {}
-_making = threading.Lock()  # one thread at a time has msgspec look at types, and at those within them
+_making = threading.Lock()  # held while msgspec inspects a type of record, and the types of its fields
 
 
 def to_json(record: Record) -> bytes:

@@ -1,6 +1,6 @@
-"""A participant's server: its record and the transitions of its state. Pure: no clock, no I/O.
+"""The record of a server, and the transitions of its state. Pure: no clock, no I/O.
 
-States: (no record: queued) → starting → naming → ready → closed. `closed` is written when the server's resources are
+States: (no record: queued) → starting → naming → ready → closed. `closed` is written after the server's resources are
 removed, so a function that fails before that is run again. If a server ended by itself, its timer is deleted after the
 record is closed (`servers/termination.py`).
 
@@ -25,9 +25,9 @@ from hippodrome.ports import Address, DnsRecord, Settings
 from protocol.session import is_session_id
 
 RECORDS = "_servers/"  # the folder of all servers' records
-SPOT_ATTEMPTS = 2  # so many attempts of a participant run on Spot; later ones run on demand
-AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # a lost server is replaced automatically up to this attempt, which is on demand
-MAX_ATTEMPTS = 8  # and at the participant's request up to this one
+SPOT_ATTEMPTS = 2  # the attempts up to this one run on Spot, later ones on demand
+AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # up to this attempt, which is on demand, a lost server is replaced by itself
+MAX_ATTEMPTS = 8  # up to this attempt, a participant may request another server
 
 R = TypeVar("R")
 
@@ -45,8 +45,8 @@ class Reason(StrEnum):
     """Why a server was closed."""
 
     STOPPED = "stopped"  # the study's stop step, a relay, an administrator
-    DEADLINE = "deadline"  # maxRuntime was over
-    ENDED = "ended"  # the trial ended by itself: it was done, or no participant came
+    DEADLINE = "deadline"  # its deadline, which follows from maxRuntime, was over
+    ENDED = "ended"  # the trial ended by itself: it was complete, or no participant came
     LOST = "lost"  # a Spot interruption, a failed machine, or it never became healthy
     REFUSED = "refused"  # AWS refuses to run it as it is configured
     NO_CAPACITY = "no capacity"
@@ -54,7 +54,7 @@ class Reason(StrEnum):
     ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
 
 
-REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which it makes sense to start another automatically
+REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which the next attempt is started automatically
 
 
 class PastAttempt(Record, frozen=True):
@@ -75,9 +75,9 @@ class PastAttempt(Record, frozen=True):
 
 
 class Server(Record, frozen=True):
-    """`_servers/{label}.json`: one per participant or session, with the present attempt and the earlier ones.
+    """`_servers/{label}.json`: the server of a participant or a session, with its present and its earlier attempts.
 
-    `user_id` is the participant's id, the session's, or that of a warm server.
+    `user_id` is the id of the participant, of the session, or of the warm server.
     """
 
     project_id: str
@@ -90,26 +90,26 @@ class Server(Record, frozen=True):
     cluster: str
     dns: str = ""  # its full DNS name
     spot: bool = True
-    task: str | None = None  # its id, once it runs
-    host: str | None = None  # the address of its DNS record, exactly as in the zone
-    port: int | None = None  # the one its task is told to listen on, then the one it does
+    task: str | None = None  # the task's id, once the task runs
+    host: str | None = None  # the address in its DNS record, exactly as in the zone
+    port: int | None = None  # the port on which it should listen; once its task runs, the port on which it does
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
     reason: Reason | None = None
     cause: str = ""  # why it failed, if it did (`servers.causes.Cause`)
-    cpu: float = 0  # vCPU; 0 in records of before it was written down
+    cpu: float = 0  # vCPU; 0 in records of earlier versions
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
     counted: bool = False  # whether it holds one of its project's slots until it is closed
-    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # the one that was assigned to it, by name
+    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # of the warm server assigned to it
     assigned_to: str | None = msgspec.field(
         default=None, name="takenBy"
     )  # of a warm server: the label of the participant's record that owns its resources now
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
-    game_steps: tuple[str, ...] = ()  # it may store their answers; as in the project when it was started
-    may_match: bool = False  # `matching: match`: until there are members, it may say who plays with whom
-    players: int = 0  # of a session: how many its trial is for; 0 in records of earlier versions
+    game_steps: tuple[str, ...] = ()  # the steps whose answers it may store: the project's when it was started
+    may_match: bool = False  # with `matching: match`: whether it answers questions to `match` while it has no members
+    players: int = 0  # how many players a session's trial is for; 0 in records of earlier versions
 
     @property
     def label(self) -> str:
@@ -122,17 +122,17 @@ class Server(Record, frozen=True):
 
     @property
     def is_warm_server(self) -> bool:
-        """Whether it is a warm server, started without a participant."""
+        """Whether it was started as a warm server, without a participant."""
         return ids.is_warm_id(self.user_id)
 
     @property
     def is_sessions(self) -> bool:
-        """Whether it is the server of a session: several participants play there."""
+        """Whether it is the server of a session, on which several participants play."""
         return is_session_id(self.user_id)
 
     @property
     def warm_server_label(self) -> str:
-        """The label of the warm server that was assigned to it; empty if none."""
+        """The label of the warm server that was assigned to it; "" if none was."""
         return (ids.parse_server_name(self.warm_server_name or "") or ("", 0))[0]
 
     @property
@@ -140,9 +140,9 @@ class Server(Record, frozen=True):
         return self.state is ServerState.CLOSED
 
     def lacks(self, step_key: str) -> bool:
-        """Whether it can never play this game step: the steps were registered anew since it was started.
+        """Whether it can never play this game step, because the steps were registered anew since it was started.
 
-        Not known of records of earlier versions, and not asked of a session's server, where others play.
+        False for records of earlier versions, which do not say it, and for a session's server, on which others play.
         """
         return bool(self.game_steps) and not self.is_sessions and step_key not in self.game_steps
 
@@ -151,12 +151,12 @@ class Server(Record, frozen=True):
         return self.attempt == attempt and not self.is_closed
 
     def owns(self, name: str) -> bool:
-        """Whether resources of this name are this server's: it may have been assigned a warm server of another name."""
+        """Whether this open record owns the resources of this name, which is a warm server's if one was assigned."""
         return self.name == name and not self.is_closed
 
     @property
     def dns_record(self) -> DnsRecord | None:
-        """The DNS record that it owns, with the exact values stored; None if it has no address."""
+        """The DNS record that it owns, with exactly the stored values; None if it has no address."""
         return DnsRecord(self.dns, self.host) if self.host else None
 
     @property
@@ -166,7 +166,7 @@ class Server(Record, frozen=True):
 
     @property
     def domain(self) -> str:
-        """The domain directly above its DNS name; it shows that domain's certificate."""
+        """The domain directly above its DNS name. The server shows the certificate of that domain."""
         return self.dns.partition(".")[2]
 
     @property
@@ -176,30 +176,30 @@ class Server(Record, frozen=True):
 
 
 class TaskStopped(NamedTuple):
-    """What an ECS event says about a task that has ended."""
+    """The facts in an ECS event about a task that has ended."""
 
     code: str | None  # stopCode
     exit_code: int | None
-    words: str = ""  # the reasons that ECS gives, the task's and its container's
+    words: str = ""  # the reasons that ECS gives for the task and for its container
 
 
 def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Server]) -> R | None:
-    """Return the record that owns this resource name, following handovers; None for a name that leads to none.
+    """Return the record that owns the resources of this name, following handovers; None if there is none.
 
-    `read` returns what is stored under a label, and `server` the record in it: two reads for an assigned warm server,
-    else one. The record may be of another attempt by now: its `name` tells.
+    `read` returns the stored record under a label, and `server` the `Server` in it. One read; two for an assigned warm
+    server. The record may be at another attempt now: compare its `name`.
     """
     parsed = ids.parse_server_name(name)
     found = read(parsed[0]) if parsed else None
     assigned_to = server(found).assigned_to if found is not None else None
     if assigned_to is None:
         return found
-    heir = read(assigned_to)
-    return heir if heir is not None and server(heir).name == name else found
+    new_owner = read(assigned_to)
+    return new_owner if new_owner is not None and server(new_owner).name == name else found
 
 
 def key(label: str) -> str:
-    """The key of the record. It has the label, which also begins the name of each resource of the server."""
+    """The key of the record under this label. The names of the server's resources begin with the label, too."""
     return f"{RECORDS}{label}.json"
 
 
@@ -208,11 +208,11 @@ def new_attempt(
 ) -> Server:
     """The record of a new attempt. It is written before anything is started.
 
-    Its DNS name is a hash below the servers' domain. With `subdomain: userId` it is the participant's id instead, if
-    the installation allows it and the id is a valid DNS label: ids come with the link, so the author of a link chooses
-    the name, but only on that level. A warm server's deadline bounds its waiting; once it is assigned, it gets the same
-    time to play as other servers. A session's server may have been started before its members are matched, and gets
-    that time in addition (`sessions.lifetime`).
+    Its DNS name is a hash below the servers' domain. With `subdomain: userId` the participant's id takes the place of
+    the hash, if the installation allows it and the id is a valid DNS label. Ids come with the link, so the author of a
+    link chooses that label, but no other part of the name. The deadline of a warm server bounds its waiting; once it is
+    assigned, it gets the same time to play as other servers. A session's server gets the time in which it may wait for
+    its members in addition (`sessions.lifetime`).
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
@@ -243,7 +243,7 @@ def new_attempt(
 
 
 def past_attempt(server: Server) -> PastAttempt:
-    """What the next attempt's record keeps of this one."""
+    """The part of this attempt that the next attempt's record keeps."""
     return PastAttempt(
         attempt=server.attempt,
         requested=server.requested,
@@ -261,7 +261,7 @@ def past_attempt(server: Server) -> PastAttempt:
 
 
 def next_attempt(closed: Server) -> int | None:
-    """The attempt that replaces a closed server automatically; None if it stays closed, as a warm server does."""
+    """The attempt that automatically replaces a closed server; None if there is none, as for a warm server."""
     if closed.is_warm_server or not closed.is_closed or closed.attempt >= AUTOMATIC_ATTEMPTS:
         return None
     return closed.attempt + 1 if closed.reason in REPLACED else None
@@ -273,7 +273,7 @@ def plays_on(record: Server) -> bool:
 
 
 def requestable_attempt(record: Server) -> int | None:
-    """The attempt that the participant may request, or None. An attempt that found no slot may be repeated."""
+    """The attempt that the participant may request; None if there is none. An attempt without a slot is repeated."""
     if not record.is_closed or next_attempt(record) is not None:
         return None
     if record.reason is Reason.FULL:
@@ -282,22 +282,22 @@ def requestable_attempt(record: Server) -> int | None:
 
 
 def replacing(before: Server, wanted: Server) -> Server:
-    """The next attempt's record, with the closed one added to `earlier`."""
+    """The next attempt's record `wanted`, with the closed attempt `before` added to `earlier`."""
     return msgspec.structs.replace(wanted, earlier=(*before.earlier, past_attempt(before)))
 
 
 def found_no_slot(server: Server, attempt: int) -> bool:
-    """Whether this attempt found no slot: nothing was started, so it may be repeated under the same name."""
+    """Whether this attempt was closed because no slot was free. Nothing was started, so it may be repeated."""
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
 def repeating(before: Server, wanted: Server) -> Server:
-    """The record of an attempt that found no slot and is repeated."""
+    """The record `wanted` of an attempt that found no slot and is repeated, with the attempts before it."""
     return msgspec.structs.replace(wanted, earlier=before.earlier)
 
 
 def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
-    """The closed record of a server that was stopped before it was started: a late start message finds it."""
+    """The closed record of a server that was stopped before it was started. A late start message finds it closed."""
     return Server(
         project_id=project_id,
         user_id=user_id,
@@ -313,12 +313,18 @@ def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datet
 
 
 def on_demand(server: Server) -> Server:
-    """Spot has no capacity: run on demand. Written before that request, so that a repetition does not make both."""
+    """The record of a server that runs on demand, because Spot has no capacity.
+
+    It is written before RunTask is called again, so that a repetition does not run a task of both kinds.
+    """
     return msgspec.structs.replace(server, spot=False)
 
 
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
-    """The task runs and has an address. Written before the DNS record is created, so that each record has an owner."""
+    """The record of a server whose task runs and has an address.
+
+    It is written before the DNS record is created, so that each DNS record has an owner.
+    """
     port = address.port or server.port or LEGACY_PORT  # records of earlier versions have no port yet here
     return msgspec.structs.replace(
         server, state=ServerState.NAMING, task=task, host=address.host, port=port, running=now
@@ -326,17 +332,20 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
 
 def with_default_name(server: Server) -> Server:
-    """The record with the default DNS name, because the zone refuses the present one."""
+    """The record with the default DNS name. The zone refuses the present name."""
     return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
 
 def ready(server: Server, now: datetime) -> Server:
-    """Its DNS record is INSYNC: the participant may connect."""
+    """The record of a server whose DNS record is INSYNC, so that the participant may connect."""
     return msgspec.structs.replace(server, state=ServerState.READY, ready=now)
 
 
 def reserving(server: Server, warm_server: Server) -> Server:
-    """Reserve this warm server. Written before the warm server's own record, so that a repetition reserves no other."""
+    """The record with this warm server reserved.
+
+    It is written before the warm server's own record, so that a repetition reserves no other one.
+    """
     return msgspec.structs.replace(
         server,
         warm_server_name=warm_server.name,
@@ -350,9 +359,10 @@ def reserving(server: Server, warm_server: Server) -> Server:
 
 
 def without_warm_server(server: Server, own: Server) -> Server:
-    """The record of a server of their own, because the reserved warm server was gone.
+    """The record without the reserved warm server, which has ended or is another participant's.
 
-    The nonce stays: a task may have been started with secrets that are derived from it.
+    It gets the names of `own`, a new server's record. The nonce stays: a task may have been started with secrets that
+    are derived from it.
     """
     return msgspec.structs.replace(
         server,
@@ -367,26 +377,26 @@ def without_warm_server(server: Server, own: Server) -> Server:
 
 
 def handed_over(warm_server: Server, label: str, now: datetime) -> Server:
-    """Close a warm server's record: the participant's record under `label` owns its resources now."""
+    """The closed record of a warm server whose resources the participant's record under `label` owns now."""
     return msgspec.structs.replace(
         warm_server, state=ServerState.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
     )
 
 
 def draining(warm_server: Server) -> Server:
-    """Drain a warm server: it can no longer be assigned. Written before any of its resources is removed."""
+    """The record of a warm server that can no longer be assigned. It is written before a resource is removed."""
     return msgspec.structs.replace(warm_server, state=ServerState.DRAINING)
 
 
 def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
-    """The warm server's resources are this server's: the participant may connect."""
+    """The record of a server that has got the warm server's resources, so that the participant may connect."""
     return msgspec.structs.replace(
         server, state=ServerState.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
     )
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
-    """Close the record. `servers/termination.py` says which resources are removed before, and which after."""
+    """The closed record. `servers/termination.py` says which resources are removed before, and which after."""
     return msgspec.structs.replace(server, state=ServerState.CLOSED, closed=now, reason=reason, cause=cause)
 
 

@@ -1,4 +1,4 @@
-"""The order of steps, which of them participants visit, and which one an event names. Pure."""
+"""Orders the keys of steps, and finds the steps that participants visit and the step that an event names. Pure."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ FINAL = "finalStep"
 
 
 def ordered(keys: Iterable[str]) -> list[str]:
-    """The keys of steps in their order: by number, finalStep last."""
+    """The keys of steps in the order of their numbers, finalStep last."""
     return sorted(keys, key=lambda key: (key == FINAL, 0 if key == FINAL else int(key)))
 
 
 def visited(keys: list[str], pages: Mapping[str, str]) -> list[str]:
-    """The keys of the steps that participants visit: finalStep only if it has a page of its own."""
+    """The keys of the steps that participants visit: without finalStep, if it has the same page as the step before."""
     same = len(keys) > 1 and keys[-1] == FINAL and pages.get(FINAL) == pages.get(keys[-2])
     return keys[:-1] if same and FINAL in pages else keys
 
 
 def position(key: str | None, keys: list[str]) -> int | None:
-    """The index of the step that an event names. The last one may be called finalStep, or, as in HIPPO, one more."""
+    """The index of the step that an event names; None if there is none.
+
+    The last step may also be named finalStep, or, as in HIPPO, by the number after the last.
+    """
     if key in keys:
         return keys.index(key)
     numbers = [int(number) for number in keys if number != FINAL]
@@ -27,9 +30,9 @@ def position(key: str | None, keys: list[str]) -> int | None:
 
 
 def default_start(games: Sequence[int]) -> int:
-    """The index of the step at which a server starts by default: the second, which is only reached with an answer.
+    """The index of the step at which a server starts by default: the second step, which only an answer leads to.
 
-    If the game is the first step, it is that one. `games` are the indexes of the game steps.
+    If the first step is a game, it is that one. `games` are the indexes of the game steps.
     """
     return min(1, games[0])
 

@@ -11,20 +11,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StepType:
-    """A type of step, as the control plane needs it."""
+    """A type of step."""
 
     name: str
-    has_files: bool  # it is shown from files in the steps folder: one, or one for each group
-    on_server: bool  # it takes place on the participant's server, whose trial stores the answer; else a form is posted
+    has_files: bool  # whether it is shown from files in the steps folder: one, or one for each group
+    on_server: bool  # whether it is played on a server, whose trial stores the answer; otherwise a form is posted
 
 
 PAGE = StepType("page", has_files=True, on_server=False)
 GAME = StepType("game", has_files=False, on_server=True)
 
 RESERVED = {"game": GAME}
-"""By page name in config.yml. Every other page name is that of a step file."""
+"""The types with a reserved page name, by that name in config.yml. Every other page name is that of a step file."""
 NAMES = " or ".join(RESERVED)
-"""The reserved words, as messages say them."""
+"""The reserved page names, as messages to people list them."""
 
 
 def type_of(page: str) -> StepType:

@@ -1,8 +1,8 @@
-"""What Hippodrome itself says to participants: one table of short names and English texts, and a study's own words.
+"""The texts that participants read from Hippodrome itself: one table of names and English texts, and a study's own words.
 
-`{name}` in a text stands for a number, a time or a name. Scripts and templates of `web/` write `TEXT.start`, and
-`TEXT.seconds(5)` for a text with such places, in the order in which the English text has them;
-`hippodrome/participants/texts.py` puts the study's texts there when a page is made. docs/texts.md lists all of them.
+`{name}` in a text is a place for a number, a time or a name. Scripts and templates of `web/` write `TEXT.start`, and
+`TEXT.seconds(5)` for a text with places, with the values in the order of the places in the English text. When a page is
+made, `hippodrome/participants/texts.py` puts the study's texts there. docs/texts.md lists all texts. Pure.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ _RIGHT_TO_LEFT = re.compile(
     "pnb|prs|ps|pus|sdh?|skr|snd|syr|ug|uig|urd?|yid?"
 )
 _SCRIPTS = re.compile("adlm|arab|hebr|mand|nkoo|rohg|samr|syrc|thaa")
-"""Languages and scripts that are written from right to left, as browsers know them. Others can name their script."""
+"""Languages and scripts that are written from right to left, as in browsers. Tags of other languages can name a script."""
 _LANGUAGE = re.compile(
     "[A-Za-z]{2,3}(-[A-Za-z]{4})?(-([A-Za-z]{2}|[0-9]{3}))?(-([A-Za-z0-9]{5,8}|[0-9][A-Za-z0-9]{3}))?"
 )
-"""Language, script, region, variant. Others, such as `zh-cmn` and `en-GB-UK`, are none for the browser's own functions:
-they raise RangeError (ECMA-402, section 6.2)."""
+"""Language, script, region, variant. With other tags, such as `zh-cmn` and `en-GB-UK`, the browser's functions raise
+RangeError (ECMA-402, section 6.2)."""
 LANGUAGE = "language"
-"""The name of the text that is no text: the language of the others, as pages name it (`<html lang>`)."""
+"""The name of the entry that has no text but the language of all texts, as in `<html lang>`."""
 
 _PAGES = {
     "language": "en",
@@ -307,7 +307,7 @@ SAID_TOGETHER = {
     ),
 }
 SAID = SAID_ALONE | SAID_TOGETHER
-"""What the servers say (`trial/core/`), in English as all that they send; the page puts the study's words for it."""
+"""The sentences that servers send, in English (`trial/core/`). The page replaces them with the study's own words."""
 _LINKS = {
     "studyFull": "This study is full",
     "studyFullText": (
@@ -351,19 +351,19 @@ ENGLISH: Mapping[str, str] = {name: text for group in GROUPS.values() for name, 
 
 
 def is_language(text: str) -> bool:
-    """Whether pages and scripts can name a language so, such as `de` or `pt-BR`."""
+    """Whether pages and scripts can use this text as the tag of a language, such as `de` or `pt-BR`."""
     return _LANGUAGE.fullmatch(text) is not None
 
 
 def is_right_to_left(language: str) -> bool:
-    """Whether a language is written from right to left, as pages name it: by its script if it names one (`ku-Arab`)."""
+    """Whether the language with this tag is written from right to left; a script in the tag (`ku-Arab`) decides."""
     name, script, *_ = [*language.lower().split("-"), ""]
     by_script = len(script) == 4 and script.isalpha()
     return bool(_SCRIPTS.fullmatch(script) if by_script else _RIGHT_TO_LEFT.fullmatch(name))
 
 
 def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
-    """The names of the texts that participants of such a study may read."""
+    """The names of the texts that participants may read in a study with or without a game and sessions."""
     groups = [_PAGES, _LINKS]
     groups += [_WAITING, _ENDED, _GAME, SAID_ALONE] if has_game else []
     groups += [_LOBBY, _TOGETHER, SAID_TOGETHER] if has_sessions else []
@@ -371,12 +371,12 @@ def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
 
 
 def places(text: str) -> tuple[str, ...]:
-    """The names of the places in a text, such as `seconds`: each once, in the order in which they come first."""
+    """The names of the places in a text, such as `seconds`: each once, in the order of their first occurrence."""
     return tuple(dict.fromkeys(PLACE.findall(text)))
 
 
 class Texts:
-    """The texts of one study: its own words, and English where it has none. Equal and hashed by its own words."""
+    """The texts of one study: its own words, and the English text for any other name. Equal if the own words are."""
 
     __slots__ = ("_hash", "_own")
 
@@ -395,7 +395,7 @@ class Texts:
 
     @property
     def language(self) -> str:
-        """The language of these texts, as pages name it."""
+        """The tag of the language of these texts."""
         return self[LANGUAGE]
 
     def all(self) -> dict[str, str]:
@@ -403,11 +403,11 @@ class Texts:
         return {**ENGLISH, **self._own}
 
     def say(self, name: str, /, **values: Any) -> str:
-        """The text with these values in its places. A place that has no value stays as it is."""
+        """The text with these values in its places. A place without a value stays as it is."""
         return PLACE.sub(lambda place: str(values.get(place[1], place[0])), self[name])
 
     def of_server(self) -> dict[str, str]:
-        """The study's words for what servers say, by the English sentence; only those that differ."""
+        """The study's own words for the sentences of servers, by the English sentence; only those that differ from it."""
         return {ENGLISH[name]: self[name] for name in SAID if self[name] != ENGLISH[name]}
 
 

@@ -14,9 +14,9 @@ from hippodrome.model.records import Record
 from hippodrome.ports import Settings
 
 POOLS = "_spares/"
-LONGEST_WAIT = timedelta(hours=12)  # then a warm server is replaced
-COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, where each warm server reserves so much
-MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers may only wait for less, none is started
+LONGEST_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
+COUNTED_WAIT = timedelta(hours=1)  # the same in a project with maxServerHours, of which a warm server reserves its wait
+MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for less, none is started
 
 
 def pool_key(project_id: str) -> str:
@@ -25,19 +25,19 @@ def pool_key(project_id: str) -> str:
 
 
 def longest_wait(project: Project, settings: Settings) -> timedelta:
-    """How long a warm server waits at most: the installation's maxRuntime bounds waiting and play together."""
+    """How long a warm server waits at most. The installation's maxRuntime bounds the sum of waiting and play."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
     return min(longest, timedelta(minutes=settings.max_runtime) - sessions.lifetime(project, settings))
 
 
 def deadline(project: Project, settings: Settings, label: str, now: datetime) -> datetime:
-    """When a warm server that starts now ends: after 75 to 100 % of `longest_wait`, so that not all end at once."""
+    """The deadline of a warm server that starts now: 75 to 100 % of `longest_wait`, so that not all end at once."""
     share = hashlib.sha256(label.encode()).digest()[0] / 256
     return now + timedelta(seconds=round(longest_wait(project, settings).total_seconds() * (1 - share / 4)))
 
 
 class WarmServer(Record, frozen=True):
-    """A server in the pool. `version` is that of the project when it was requested."""
+    """A warm server in the pool. `version` is the project's when the server was requested."""
 
     version: str
     requested: datetime = msgspec.field(name="asked")
@@ -45,7 +45,7 @@ class WarmServer(Record, frozen=True):
 
 
 class Pool(Record, frozen=True):
-    """`_spares/{projectId}.json`: warm servers that wait or start, by warm id, and how many were ever requested."""
+    """`_spares/{projectId}.json`: warm servers that wait or start, by warm id; `made` counts all ever requested."""
 
     warm_servers: Mapping[str, WarmServer] = msgspec.field(default_factory=dict, name="spares")
     made: int = 0
@@ -60,24 +60,24 @@ class Pool(Record, frozen=True):
         return min(ready)[1] if ready else None
 
     def without_first(self, version: str) -> Pool:
-        """The pool without `first`."""
+        """The pool without the warm server that `first` returns."""
         first = self.first(version)
         return self.without([first]) if first else self
 
-    def without(self, gone: Collection[str]) -> Pool:
+    def without(self, warm_ids: Collection[str]) -> Pool:
         """The pool without these warm servers."""
         return self._with(
-            {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in gone}
+            {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in warm_ids}
         )
 
-    def with_ready(self, those: Collection[str]) -> Pool:
+    def with_ready(self, warm_ids: Collection[str]) -> Pool:
         """The pool with these warm servers marked ready; ids that are not in the pool are ignored."""
-        known = self.warm_servers.keys() & those
+        known = self.warm_servers.keys() & warm_ids
         ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
         return self._with({**self.warm_servers, **ready})
 
     def with_returned(self, warm_id: str, warm_server: WarmServer) -> Pool:
-        """The pool with a warm server that was taken out and not needed."""
+        """The pool with a warm server that was taken out and is not needed."""
         return self._with({**self.warm_servers, warm_id: warm_server})
 
     def of_registration(self, project: Project | None) -> Mapping[str, WarmServer]:
@@ -110,9 +110,9 @@ class Pool(Record, frozen=True):
 
 
 def target_size(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
-    """How many warm servers a project should have. It has `waiting` now, and slots for `room` more (None: no limit).
+    """How many warm servers a project should have, if it has `waiting` now, and slots for `room` more (None: no limit).
 
-    0 if the project is closed or the wait would be shorter than `MIN_LONGEST_WAIT`.
+    0 if the project is closed, or if warm servers could only wait for less than `MIN_LONGEST_WAIT`.
     """
     if project is None or not project.live or longest_wait(project, settings) < MIN_LONGEST_WAIT:
         return 0

@@ -1,1 +1,1 @@
-"""What participants ask for over HTTP: pages, answers, the state of their server, the relays."""
+"""Handles participants' HTTP requests: pages, answers, the state of their server, and the relays."""

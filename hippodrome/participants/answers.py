@@ -1,4 +1,4 @@
-"""The answers to steps: `Answers.store` stores what a participant POSTs, and `read` reads it for later pages.
+"""Stores and reads the answers to steps: `Answers.store` stores a participant's form, `read` reads it for later pages.
 
 `journey.py` finds the step that a form answers and calls the step's type (`steps/`), which calls `store`. The trial
 stores the answer to a game step (`trial/recordings/recorder.py`) in a document of the same form (`protocol/answer.py`).
@@ -22,7 +22,7 @@ from protocol.keys import answer_key
 
 
 class Answers:
-    """The answers of all participants. A method is one call unless its docstring says otherwise."""
+    """The answers of all participants. A method makes one AWS call unless its docstring says otherwise."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -43,7 +43,7 @@ class Answers:
         logger.info("answered", extra={"project": project.id, "step": step.key})
 
     def read(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
-        """The participant's answers at a step; empty if there are none, or if the document holds no answers."""
+        """Return the participant's answers at a step; empty if there are none, or if the document holds no answers."""
         found = self._platform.documents.get(answer_key(project_id, user_id, step))
         answers = answers_in(found.body) if found else {}
         if answers is None:
@@ -51,10 +51,10 @@ class Answers:
         return answers or {}
 
     def repeats(self, project: Project, user_id: str, progress: Progress, answers: Mapping[str, Any]) -> bool:
-        """Whether a form that names no step has the same answers as an earlier step within the last minute.
+        """Whether these answers, of a form that names no step, equal those of a step answered within the last minute.
 
-        Safe for simultaneous requests: `progress` has every answer before the step that is due, and answers never
-        change. One read for each answer of that minute.
+        Simultaneous requests get the same result: `progress` has every answer before the due step, and answers never
+        change. One read for each answer of that minute, at most `participant.MAX_COMPARED`.
         """
         recent = progress.recently_answered(project, self._platform.now())
         earlier = (self.read(project.id, user_id, key) for key in recent)

@@ -1,4 +1,4 @@
-"""The messages that a step calls for when a participant reaches it (`events` in config.yml)."""
+"""Publishes the messages of a step that a participant reaches (`events` in config.yml)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hippodrome.ports import Platform, Topic
 
 
 def publish_events(platform: Platform, project: Project, user_id: str, step: Step) -> None:
-    """Publish the start or stop message that reaching `step` calls for."""
+    """Publish the start message, the stop message, or none, according to the project's `events` at this step."""
     if participant.starts_server(project, step):
         platform.bus.publish(Topic.START, to_message(StartServer(project.id, user_id)))
     if participant.stops_server(project, step):

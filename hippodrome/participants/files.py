@@ -1,4 +1,4 @@
-"""Files in the steps folder that pages load by relative addresses, such as pictures."""
+"""Serves files of the steps folder that pages load by relative addresses, such as pictures."""
 
 from __future__ import annotations
 
@@ -20,23 +20,21 @@ KINDS = {
 
 
 class Files:
-    """Serves files of live projects, of the kinds in `KINDS` only."""
+    """Serves files of live projects. Only files with a suffix in `KINDS` are served."""
 
     def __init__(self, project_cache: ProjectCache) -> None:
         self._project_cache = project_cache
 
     def respond(self, request: Request) -> Response:
-        """Return the file for `/steps/{projectId}/{file}`. Raises `PageError` if there is no such file."""
+        """Respond to a GET of `/steps/{projectId}/{file}`. Raises `PageError` (404) if there is no such file."""
         parts = request.path.split("/")
         project = (
             self._project_cache.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
         )
         name = parts[-1]
         kind = KINDS.get(name.rsplit(".", 1)[-1].lower())
-        plain = name.isprintable() and not name.startswith(".") and len(name) <= LONGEST_NAME
-        if project is None or kind is None or not plain:
-            raise PageError(404, "There is nothing here", "Please open your study link again.")
-        found = self._project_cache.document(f"{project.id}/steps/{name}")
-        if found is None:
+        is_valid = name.isprintable() and not name.startswith(".") and len(name) <= LONGEST_NAME
+        found = self._project_cache.document(f"{project.id}/steps/{name}") if project and kind and is_valid else None
+        if found is None or kind is None:
             raise PageError(404, "There is nothing here", "Please open your study link again.")
         return Response(200, found.body, {"Content-Type": kind, **_HEADERS})

@@ -1,4 +1,4 @@
-"""The fields that a participant sends, as a form or as a JSON object, read from untrusted bytes."""
+"""Reads the fields that a participant sends, as a form or as a JSON object, from untrusted bytes."""
 
 from __future__ import annotations
 
@@ -13,50 +13,48 @@ from hippodrome.model.texts import ENGLISH, Texts
 
 MAX_BODY = 256 * 1024  # bytes
 MAX_FIELDS = 2_000
-MAX_DEPTH = (
-    20  # levels of lists and objects in JSON: stored documents are indented, so each level makes every line longer
-)
+MAX_DEPTH = 20  # levels of lists and objects in JSON: stored documents are indented, so each level makes lines longer
 FORM = "application/x-www-form-urlencoded"
 JSON = "application/json"
-STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"
+STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"  # the hidden fields
 
 
 class BadForm(Exception):
-    """The form is refused. `status` is the HTTP status, `text` the reason, in English."""
+    """The form is refused. `status` is the HTTP status, `text` the reason in English."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
         self.status, self.text = status, text
 
     def reason(self, texts: Texts) -> str:
-        """The reason in a study's own words, or in English if it has none for it."""
+        """The reason as a participant of a study with these texts reads it; here, in English."""
         return self.text
 
 
 class BadPageForm(BadForm):
-    """The same of a form that one of our pages can send. `name` is that of a text; a study may have its own for it."""
+    """A refusal that a form of our own pages may get. `name` is that of the text with the reason (`model/texts.py`)."""
 
     def __init__(self, status: int, name: str) -> None:
         super().__init__(status, ENGLISH[name])
         self._name = name
 
     def reason(self, texts: Texts) -> str:
-        """The study's text of this name."""
+        """The reason in the study's own words."""
         return texts[self._name]
 
 
 @dataclass(frozen=True)
 class PostedForm:
-    """The answers of one page, and the hidden fields of the frame."""
+    """The answers of one page, and the hidden fields that the page's frame adds."""
 
-    answers: Mapping[str, Any]  # a field named twice (checkboxes) holds a list
+    answers: Mapping[str, Any]  # a name that occurs twice, as checkboxes may have it, has a list of values
     step: str | None = None
     ticket: str | None = None
     action: str | None = None
 
 
 def read(request: Request) -> PostedForm:
-    """Return the form in a request. Raises `BadForm`."""
+    """Read the form in a request's body. Raises `BadForm`."""
     if request.body is None:
         raise BadPageForm(400, "formUnread")
     if len(request.body) > MAX_BODY:
@@ -70,8 +68,8 @@ def read(request: Request) -> PostedForm:
     return _form(fields)
 
 
-def of_query(query: Iterable[tuple[str, str]]) -> PostedForm:
-    """The form in a query's fields."""
+def read_query(query: Iterable[tuple[str, str]]) -> PostedForm:
+    """Read the form in the fields of a query."""
     return _form(_gather(list(query)))
 
 
@@ -107,7 +105,7 @@ def _json(body: bytes) -> dict[str, Any]:
 
 
 def _deeper(data: Any, most: int) -> bool:
-    """Whether JSON data has more than so many levels of lists and objects."""
+    """Whether JSON data has more than `most` levels of lists and objects."""
     level = [data]
     for _ in range(most):
         groups = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
@@ -118,11 +116,11 @@ def _deeper(data: Any, most: int) -> bool:
 
 
 def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A mapping of names to values; a name that is there twice gets the list of its values, in order."""
-    seen: dict[str, list[Any]] = {}
+    """A mapping of names to values; a name that occurs several times has the list of its values, in order."""
+    values_of: dict[str, list[Any]] = {}
     for name, value in pairs:
-        seen.setdefault(name, []).append(value)
-    return {name: values[0] if len(values) == 1 else values for name, values in seen.items()}
+        values_of.setdefault(name, []).append(value)
+    return {name: values[0] if len(values) == 1 else values for name, values in values_of.items()}
 
 
 def _no_constant(name: str) -> Any:
@@ -130,7 +128,7 @@ def _no_constant(name: str) -> Any:
 
 
 def _text(value: Any) -> str | None:
-    """A hidden field as text. It may be there twice with the same value: a client's form may already contain it."""
+    """A hidden field as text; None if it is no text. A client may send it twice, with the same value."""
     if isinstance(value, list) and value and all(each == value[0] for each in value):
         value = value[0]
     return value if isinstance(value, str) else None

@@ -1,9 +1,9 @@
-"""A researcher's step page: prepared for the frame, then filled with values (`sandbox.py`).
+"""Prepares a researcher's step page for the frame, and fills values into it (`sandbox.py`).
 
-The researcher's text stays unchanged, byte for byte, except for a few tags: those of a whole document (`<html>`,
-`<body>`, `<form>` …) are dropped, relative addresses (of pictures, for example) point to the project's files, and
-scripts get the nonce without which no browser runs them. That is done before any value is filled in, so no value can
-gain a nonce or an address.
+The researcher's text stays unchanged, byte for byte, except for a few tags. Those of a whole document (`<html>`,
+`<body>`, `<form>` …) are dropped. Relative addresses, of pictures for example, are changed to those of the project's
+files. Scripts get the nonce without which no browser runs them. All of this happens before values are filled in, so a
+tag in a value gets neither a nonce nor another address.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from hippodrome.participants import sandbox
 
-_MARK = f"nonce-{secrets.token_hex(16)}"  # stands for the nonce in prepared pages; known to this process only
+_MARK = f"nonce-{secrets.token_hex(16)}"  # takes the nonce's place in prepared pages; known to this process only
 
 _JINJA_START = re.compile(r"\{[{%#]|\ue000")
 _JINJA_END = {"{{": "}}", "{%": "%}", "{#": "#}"}
@@ -56,17 +56,17 @@ ADDRESSES = {
 
 @dataclass(frozen=True)
 class Fragment:
-    """A step page that is ready to be filled in, and what the frame needs to know about it."""
+    """A prepared step page, and the facts about it that the frame needs."""
 
     text: str
-    has_fields: bool = False  # named inputs: something to send
+    has_fields: bool = False  # inputs with names, whose values are sent
     has_submit: bool = False  # a submit button of its own
     has_heading: bool = False  # an <h1>
     title: str = ""
     lang: str = ""
 
     def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
-        """Return the page for one participant. Raises FragmentError."""
+        """Return the page with these values and the nonce of its response. Raises FragmentError."""
         text = sandbox.render(self.text, values) if sandbox.uses_jinja(self.text) else self.text
         mark = _MARK if nonce else f' nonce="{_MARK}"'
         return text.replace(mark, nonce)
@@ -74,18 +74,18 @@ class Fragment:
 
 @lru_cache(maxsize=64)
 def prepare(source: str, base: str = "", hosts: tuple[str, ...] = ()) -> Fragment:
-    """Prepare a step page for the frame. No text makes it raise.
+    """Prepare a step page for the frame. No text makes this raise.
 
-    `base` is where the project's files are served, ending with a slash; scripts of `hosts` (origins) may run too.
+    `base` is the address of the project's files; it ends with a slash. Scripts of `hosts` (origins) may run, too.
     """
     return _Preparation(source, base, hosts).run()
 
 
 class _Preparation:
-    """One pass over a page's tags. Jinja's expressions are set aside first, so that `{% if a < b %}` is no tag."""
+    """One pass over a page's tags. Jinja's expressions are set aside first, so that `a < b` in them is no tag."""
 
     def __init__(self, source: str, base: str, hosts: tuple[str, ...]) -> None:
-        self._aside: list[str] = []
+        self._aside: list[str] = []  # Jinja's expressions, in the order of their placeholders
         self._source = self._set_aside(source.replace("\0", "\ufffd"))
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
@@ -118,7 +118,7 @@ class _Preparation:
         )
 
     def _set_aside(self, source: str) -> str:
-        """The source with a mark for each expression of Jinja (and for what looks like such a mark)."""
+        """The source with a placeholder for each expression of Jinja, and for text that looks like a placeholder."""
         out: list[str] = []
         at = start = 0
         unclosed: set[str] = set()
@@ -152,7 +152,7 @@ class _Preparation:
             self._out.append(found[0].replace("<", "&lt;"))
 
     def _start(self, found: re.Match[str]) -> int:
-        """Copy a start tag (and, for a script and its like, all up to its end tag). Returns where to go on."""
+        """Copy a start tag; for a script and other elements in `_RAW`, all up to the end tag. Return where to go on."""
         name = found["start"].lower()
         if not found["closed"]:  # a tag that never ends would swallow what follows in the frame
             self._out.append(found[0].replace("<", "&lt;"))
@@ -175,7 +175,7 @@ class _Preparation:
         return found.end() + len(inside) + len(end)
 
     def _inside(self, name: str, at: int) -> tuple[str, str]:
-        """What a script or its like holds from `at` on, and its end tag; an empty one if it never ends.
+        """The content from `at` on of an element in `_RAW`, and its end tag, which is empty if the element never ends.
 
         Only the first end tag counts: if no ">" follows it, none follows a later one either.
         """
@@ -186,7 +186,7 @@ class _Preparation:
         return self._source[at : end.start()], self._source[end.start() : close + 1]
 
     def _note(self, name: str, given: Mapping[str, str]) -> None:
-        """Note what the frame needs to know about this tag."""
+        """Note the facts about this tag that the frame needs."""
         kind = given.get("type", "").strip().lower()
         if name in ("input", "select", "textarea", "button") and given.get("name", "").strip():
             self._seen["field"] = True
@@ -208,7 +208,7 @@ class _Preparation:
         return f"<{found['start']}{attributes}>"
 
     def _may_run(self, address: str) -> bool:
-        """Whether a script is the researcher's own: written in the page, beside it, or on a host the project allows."""
+        """Whether a script is the researcher's: in the page, among the project's files, or on a host in `hosts`."""
         origin = _ORIGIN.match(address)
         if origin:
             return origin[1].lower() in self._hosts
@@ -232,7 +232,7 @@ class _Preparation:
 
 
 def _attributes(text: str) -> dict[str, str]:
-    """Attribute names in lower case with their values; the first of a name counts, as in browsers."""
+    """The values of attributes by their names in lower case. Of two with one name, the first counts, as in browsers."""
     found: dict[str, str] = {}
     for each in _ATTRIBUTE.finditer(text):
         value = each["value"] or ""

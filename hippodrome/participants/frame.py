@@ -1,7 +1,7 @@
-"""The frame around every page, and its headers: a page holds its style and scripts, and loads nothing from elsewhere.
+"""Makes the frame around every page, and the page's headers. A page holds its style and scripts itself.
 
-The templates lie in `web/`. They are plain (`string.Template`): Jinja, whose import costs cold starts, is loaded only
-for step pages that use it. The Content-Security-Policy lets only those scripts run that carry the page's nonce.
+The templates lie in `web/`. They use `string.Template`, because Jinja's import makes cold starts longer; Jinja is
+loaded only for step pages that use it. The Content-Security-Policy lets only scripts with the page's nonce run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hippodrome.participants import scripts
 from hippodrome.participants.texts import in_script, in_template
 
 WEB = Path(__file__).resolve().parents[2] / "web"
-_SOURCE = re.compile(r"(?:https?|wss?)://[A-Za-z0-9.*\[\]:_-]+")  # what may stand in a policy
+_SOURCE = re.compile(r"(?:https?|wss?)://[A-Za-z0-9.*\[\]:_-]+")  # a valid source in a Content-Security-Policy
 
 
 class Page(NamedTuple):
@@ -32,13 +32,13 @@ class Page(NamedTuple):
 
 
 class Html(str):
-    """Text that is HTML already. Everything else is escaped when it is filled in."""
+    """Text that is HTML. `fill` escapes all other text."""
 
     __slots__ = ()
 
 
 def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
-    """A page with one sentence, such as an error."""
+    """A page with a title and a text, such as an error."""
     nonce = secrets.token_urlsafe(16)
     page = fill(
         "frame.html",
@@ -58,16 +58,16 @@ def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> P
 
 
 def form_message(title: str, text: str, *, step: str = "", ticket: str = "", also: str = "") -> str:
-    """A title and a sentence for the form in which a program shows pages, as HIPPO's front end does.
+    """A title and a text as HTML, for a program that shows pages in a form of its own, as HIPPO's front end does.
 
-    The hidden fields before it name `step`; if it is empty, such a form answers none, and gets the page that is due.
+    The hidden fields in front name `step`. If `step` is empty, the form answers no step, and gets the due step's page.
     """
     fields = fill("named", step=step, ticket=ticket)
     return fields + also + fill("message", title=title, text=text)
 
 
 def style(kind: str | None = None) -> str:
-    """The style sheet of all pages, or only what pages of one kind use ("step", "game" or "message")."""
+    """The style sheet for pages of this kind ("step", "game" or "message"); None: for all pages."""
     return _style(kind)
 
 
@@ -87,9 +87,9 @@ def frame(
     sheet: str = "",
     data: Html = Html(),  # noqa: B008
 ) -> Html:
-    """A whole page. `data` are attributes of its body; `heading` makes the study's name the page's first heading.
+    """A whole page. `data` are attributes of its body. With `heading`, the study's name is the page's first heading.
 
-    `sheet` is a style sheet of `web/` that only some pages need, besides that of every page.
+    `sheet` names a further style sheet of `web/`, which only some pages need.
     """
     texts = Texts(project.texts)
     lang = lang or texts.language
@@ -115,13 +115,13 @@ def frame(
 def script(
     name: str, nonce: str, *, module: bool = False, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH
 ) -> Html:
-    """A script of `web/`, with the page's nonce. `also` are modules beside it that are to stand before it."""
+    """The script element with a script of `web/`. `also` are modules in the same folder that come before it."""
     kind = ' type="module"' if module else ""
     return Html(f'<script{kind} nonce="{nonce}">\n{_code(name, also, texts)}</script>\n')
 
 
 def script_json(data: Any) -> Html:
-    """JSON for a script element: nothing in it can end the element."""
+    """JSON for a script element. No text in it can end the element."""
     return Html(json.dumps(data).replace("<", "\\u003c"))
 
 
@@ -129,7 +129,7 @@ def script_json(data: Any) -> Html:
 
 
 def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str, str]:
-    """The headers of a page; `connect` are further sources that its scripts may connect to."""
+    """The headers of a page. `connect` has further sources, separated by spaces, to which its scripts may connect."""
     hosts = " ".join(allowed_sources(project.allowed_hosts)) if project else ""
     policy = {
         "default-src": "'none'",
@@ -148,7 +148,7 @@ def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str,
         "Content-Security-Policy": "; ".join(f"{name} {value.strip()}" for name, value in policy.items()),
         "Referrer-Policy": "no-referrer",
         "X-Content-Type-Options": "nosniff",
-        "Cache-Control": "private, no-cache",  # not no-store: going back must find the form as it was
+        "Cache-Control": "private, no-cache",  # not no-store: after "back" a browser must show the form as it was
         "Permissions-Policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=(), browsing-topics=()",
     }
 
@@ -201,7 +201,7 @@ $texts
 
 
 def fill(name: str, texts: Texts = IN_ENGLISH, /, **values: Any) -> Html:
-    """Fill in a template of a study with these texts; values that are not `Html` are escaped."""
+    """Fill values into a template with the texts of a study; values that are not `Html` are escaped."""
     safe = {key: value if isinstance(value, Html) else html.escape(str(value)) for key, value in values.items()}
     return Html(_template(name, texts).substitute(safe))
 
@@ -219,7 +219,7 @@ def _style(kind: str | None) -> str:
 
 
 def _direction(lang: str) -> Html:
-    """The attribute of a page in a language that is written from right to left: browsers do not go by `lang`."""
+    """The attribute `dir` for a language that is written from right to left: browsers do not derive it from `lang`."""
     return Html(' dir="rtl"' if is_right_to_left(lang) else "")
 
 
@@ -234,13 +234,13 @@ def _sheet(name: str) -> str:
 
 @lru_cache(maxsize=16)
 def _joined(name: str, also: tuple[str, ...]) -> str:
-    """A script of `web/` with the modules that it imports, and with others. It names its texts."""
+    """A script of `web/`, with the modules that it imports and those in `also`. It still has names of texts."""
     return _plain(name, scripts.join(WEB / name, also))
 
 
 @lru_cache(maxsize=32)
 def _code(name: str, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH) -> str:
-    """The same with the texts of a study."""
+    """The same script with a study's texts in place of their names."""
     return in_script(_joined(name, also), texts)
 
 
@@ -253,21 +253,21 @@ def _template(name: str, texts: Texts) -> Template:
 _CODE_OR_TEXT = re.compile(
     r"""(?P<text>"(?:[^"\\\n]|\\.)*"|`(?:[^`\\$]|\\.|\$(?!\{)|\$\{(?:[^`{}]|`[^`]*`)*\})*`)|[^"`]+"""
 )
-"""A text, a template with the code in it (which may have templates of its own), or other code."""
+"""A string; a template literal, with the code in it, which may have template literals of its own; or other code."""
 _AROUND = re.compile(r" ?(=>|[=!]==|&&|\|\||\?\?=?|[-+*/]=|\*|[+-](?= [^-+])|[=?:{},;<>()[\]]) ?")
-"""Operators and brackets around which spaces mean nothing. `a + +b` is something else without them."""
+"""Operators and brackets around which spaces mean nothing. The spaces in `a + +b` are kept: `a++b` is no such sum."""
 
 
 def _dense(code: str) -> str:
-    """Code without most spaces and line ends: each statement ends with a semicolon or a block; none is empty."""
+    """Code without most spaces and line ends. Its statements must end with semicolons or blocks; none may be empty."""
     code = re.sub(r",\n(?=[}\])])", "", _AROUND.sub(r"\1", code))
     return re.sub(r";(?=})", "", re.sub(r"([;{},(\[])\n", r"\1", code))
 
 
 def _plain(name: str, text: str) -> str:
-    """A style or script without comments, indentation, and most spaces and line ends that mean nothing.
+    """A style sheet or script without comments, indentation, and most of the spaces and line ends that mean nothing.
 
-    A comment behind code begins with space, `//`, space. No regular expression of ours has spaces.
+    A comment after code begins with a space, `//` and a space. No regular expression in our scripts has spaces.
     """
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)

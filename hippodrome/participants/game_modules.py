@@ -1,7 +1,7 @@
-"""The modules of `web/game/` that only some projects need, and which projects those are.
+"""The modules of `web/game/` that only some projects need, with the condition for each.
 
-The game page of every project carries `main.js` and what that imports. A module in this table adds itself to
-`web/game/hooks.js` when it is loaded; `main.js` does not import it.
+The game page of every project has `main.js` and the modules that it imports. It does not import the modules in this
+table: each adds itself to `web/game/hooks.js` when it is loaded.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from hippodrome.model.texts import Texts
 
 
 def _has_scene(trial: Mapping[str, Any]) -> bool:
-    """Its game is drawn by objects (docs/objects.md)."""
+    """Whether the game is drawn by objects (docs/objects.md)."""
     return trial.get("scene") is not None
 
 
 def _jumps(trial: Mapping[str, Any]) -> bool:
-    """It has a button for up, and none for down."""
+    """Whether the game has a button for up, and none for down."""
     ui = trial.get("ui")
     return isinstance(ui, Mapping) and ui.get("up") is True and not ui.get("down")
 
@@ -34,16 +34,16 @@ MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "thumbs.js": _jumps,
     **dict.fromkeys(("painter.js", "scene.js", "sprites.js"), _has_scene),
 }
-"""By file name in `web/game/`: whether a project with this `trial` section, as it is registered, needs the module."""
+"""By file name in `web/game/`: whether a project with this registered `trial` section needs the module."""
 
 OWN_WORDS = ("words.js",)
-"""The module of a study with other words for what its servers say."""
+"""The module for studies with words of their own for the sentences of servers."""
 TOGETHER = ("people.js", "lobby.js")
-"""The modules of a game that several participants play together. `lobby.js` is last: what stands behind it waits."""
+"""The modules of a game for several participants. `lobby.js` is last: the code after it waits for the match."""
 
 
-def of(project: Project) -> tuple[str, ...]:
-    """The names of the modules that a project needs besides those of every project."""
+def modules_of(project: Project) -> tuple[str, ...]:
+    """The names of the modules that a project needs besides `main.js` and those that it imports."""
     own = tuple(name for name, needed in MODULES.items() if needed(project.trial))
     own += OWN_WORDS if Texts(project.texts).of_server() else ()
     return own + TOGETHER if project.has_sessions else own

@@ -1,8 +1,8 @@
 """`next_step`: shows the step that is due, and stores the answers that participants send.
 
-A GET moves no participant on; a POST answers one step. AWS calls, with project and pages in the cache: a GET costs
-one listing (and at a game step a read of the server's record), a POST one conditional write (and a message at an event
-step).
+A GET moves no participant on; a POST answers one step. If project and pages are in the cache, a GET makes one listing
+(and at a game step a read of the server's record), and a POST one conditional write (and publishes a message if the
+next step is one of the project's `events`).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from hippodrome.storage.secret import SecretCache
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
 OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
 LEAVE = "leave"
-"""The action in the form that the lobby's page sends when it is closed."""
+"""The value of `hippodrome-action` in the form that the lobby's page sends when it is closed."""
 LINK = "…/next?projectId=your-project&userId=…"
 
 
 class Journey:
-    """The primary controller. Each running function has one; it caches projects and pages."""
+    """Handles the requests of `next_step`. Each running function has one; it caches projects and pages."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -73,13 +73,13 @@ class Journey:
             return error.response(request)
 
     def _dispatch(self, request: Request, project: Project) -> Response:
-        """Identify the participant and call the method for this request."""
+        """Identify the participant, and call the method for this kind of request."""
         texts = Texts(project.texts)
         user_id = _user_id(request, texts)
         if project.signed_links:
             user_id = _verify_invitation(request, project, user_id, texts)
         if user_id is None:
-            if request.wants_json:  # a program would be shown a page, and would not learn its id
+            if request.wants_json:  # a program would follow a redirect, but not learn the new id from the page
                 raise PageError(400, "Who are you?", "The address lacks userId.", PROJECT_NOT_FOUND)
             return http.found(request.url(userId=secrets.token_hex(12)))
         if request.method == "HEAD":
@@ -91,7 +91,7 @@ class Journey:
         return self._get(request, project, user_id)
 
     def _project(self, request: Request) -> Project:
-        """The live project that the link names."""
+        """The live project that the link names. Raises `PageError` if there is none."""
         if request.query is None:
             raise PageError.of(IN_ENGLISH, 400, "brokenLink")
         if not request.has_query("projectId"):
@@ -125,7 +125,7 @@ class Journey:
         return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
 
     def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
-        """First visit. The message is published before the record is written: a crash may repeat it, never lose it."""
+        """Handle a first visit. The message is published before the record is written, so no crash loses it."""
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError.of(Texts(project.texts), 200, "studyFull")
@@ -142,8 +142,8 @@ class Journey:
             form = forms.read(request)
         except forms.BadForm as bad:
             if request.wants_json:
-                said = f"{bad.text} Please answer the page again."
-                raise PageError(bad.status, ENGLISH["notSaved"], said) from None
+                text = f"{bad.text} Please answer the page again."
+                raise PageError(bad.status, ENGLISH["notSaved"], text) from None
             texts = Texts(project.texts)
             raise PageError.of(texts, bad.status, "notSaved", why=bad.reason(texts)) from None
         if form.action == LEAVE and project.has_sessions:
@@ -156,9 +156,9 @@ class Journey:
     def _step_of(self, form: forms.PostedForm, project: Project, user_id: str) -> Step | None:
         """The step that this form may answer; None if that step is not due.
 
-        A ticket proves that the participant was shown the step, so their folder is not listed. A form without a ticket
-        answers the step that is due. If it names no step either, and repeats answers of the last minute, it is the same
-        form sent again, see `Answers.repeats`.
+        A valid ticket proves that the participant was shown the step, so their folder need not be listed. A form
+        without one may only answer the step that is due. If it names no step and repeats answers of the last minute, it
+        is the same form sent again (`Answers.repeats`), and answers none.
         """
         shown = project.step_of_ticket(user_id, form.step, form.ticket)
         if shown is not None:
@@ -172,14 +172,14 @@ class Journey:
         return None if repeated else current
 
     def _leave(self, project: Project, user_id: str, form: forms.PostedForm) -> Response:
-        """The page of the lobby was closed, and says so with its ticket. A redirect would be followed, as a visit."""
+        """Handle the form that the lobby's page sends when it is closed. A redirect would count as another visit."""
         if project.step_of_ticket(user_id, form.step, form.ticket):
             self._shared_game.leave(project, user_id)
         return Response(204)
 
     def _poll(self, request: Request, project: Project, user_id: str) -> Response:
-        """The state of the server, for the waiting page: one read of its record. With sessions see `SharedGame`."""
-        if request.has_query("ticket"):  # only a page for several has one
+        """Return the state of the server as JSON. One read of its record; with sessions, see `SharedGame`."""
+        if request.has_query("ticket"):  # only the page of a game for several participants sends one
             project = self._project_cache.live_project(project.id, fits=lambda listed: listed.has_sessions) or project
         step = project.step(request.query_value("poll"))
         if project.has_sessions:
@@ -188,13 +188,13 @@ class Journey:
         return http.as_json(200, self._services.state(project, user_id, step, record))
 
     def _poll_together(self, request: Request, project: Project, user_id: str, step: Step | None) -> dict[str, Any]:
-        """The state of the lobby, or of the session's server. Who has no membership shows the step's ticket."""
+        """The state of the lobby, or of the session's server. Without a membership, the query must have a ticket."""
         shown = project.step_of_ticket(user_id, step.key if step else None, request.query_value("ticket"))
         if shown is not None and shown.type.on_server:
             standing = self._shared_game.visit(project, user_id, shown)
         else:
             found = self._shared_game.decided(project, user_id)
-            if found is None or not request.has_query("ticket"):  # a page that was made for one has no ticket
+            if found is None or not request.has_query("ticket"):  # the page of a game for one participant sends none
                 alone = self._shared_game.state_alone(project, user_id, step, is_member=found is not None)
                 if alone is not None:
                     return alone

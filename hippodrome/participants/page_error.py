@@ -1,4 +1,4 @@
-"""The exception that ends a request with a page of one sentence."""
+"""The exception `PageError`, which ends a request with a page of a title and a text."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from hippodrome.participants import frame
 
 
 class HippoAnswer(NamedTuple):
-    """The status and the text with which HIPPO answers. Without a text, a program gets the page's own."""
+    """HIPPO's own response in the same case: its status and its text. `page` is empty if HIPPO's text is not used."""
 
     status: int
     page: str = ""
 
 
 ACTED_ON = (200, 400)
-"""HIPPO's front end shows the page of 200, and for 400 a page that asks for the project's id. After any other status it
-waits for ever (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`). HIPPO answers these two (IRLL/HIPPO_Gym_AWS,
-`next_step.py`)."""
+"""The statuses on which HIPPO's front end acts: after 200 it shows the page, after 400 it asks for the project's id.
+After any other status it waits without end (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`). HIPPO responds with these
+two alone (IRLL/HIPPO_Gym_AWS, `next_step.py`)."""
 PROJECT_NOT_FOUND = HippoAnswer(400, "Project ID Not Found")
 CONTENT_NOT_FOUND = HippoAnswer(200, "Content Not Found")
 REFUSED = HippoAnswer(400)
 
 
 class PageError(Exception):
-    """Ends a request with a page of this title and text, or JSON for a program. `status` is the HTTP status.
+    """Ends a request with a page of this title and text, or with JSON for a program.
 
-    If HIPPO has an answer of its own in this case, programs get its status and its text. A front end gets 200 where it
-    acts on no other status. `lang` is the language of title and text.
+    `status` is the HTTP status, `lang` the language of title and text. With `hippo`, programs get HIPPO's status and
+    text. A front end gets status 200 instead of one on which HIPPO's does not act (`ACTED_ON`).
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class PageError(Exception):
 
     @classmethod
     def of(cls, texts: Texts, status: int, name: str, hippo: HippoAnswer | None = None, **values: object) -> PageError:
-        """The error in a study's words: its text of this name is the title, its text `{name}Text` the text."""
+        """The error in a study's own words: the title is its text `name`, the text is `{name}Text` with `values`."""
         title, text = texts[name], texts.say(f"{name}Text", **values)
         return cls(status, title, text, hippo, texts.language)
 
     def response(self, request: Request) -> Response:
-        """The page, or JSON for a program."""
+        """The response to this request: the page, or JSON for a program."""
         if request.wants_json:
             answer = self.hippo or HippoAnswer(self.status)
             status = answer.status if answer.status in ACTED_ON or not request.is_front_end else 200
@@ -56,6 +56,6 @@ class PageError(Exception):
 
 
 def program_message(status: int, title: str, text: str, page: str = "") -> Response:
-    """JSON for a program that shows pages: `page` is the given text, or title and text as HTML for a form."""
+    """JSON for a program that shows pages. Its `page` is the given one; if that is empty, title and text as HTML."""
     shown = page or frame.form_message(title, text)
     return http.as_json(status, {"page": shown, "css": None, "message": f"{title}. {text}"})

@@ -1,4 +1,4 @@
-"""Python's HTML parser for pages as people write them: it reads to the end what browsers read."""
+"""Python's HTML parser, changed so that it reads to the end every page that browsers read."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from html.parser import HTMLParser
 
 
 class PageParser(HTMLParser):
-    """An HTMLParser that takes `<![…]>` for a comment, as browsers do, where Python's raises AssertionError."""
+    """An HTMLParser that reads `<![…]>` as a comment, as browsers do. Python's may raise AssertionError there."""
 
     def parse_marked_section(self, i: int, report: bool = True) -> int:
-        """The place after the section that begins at `i`; -1 if its end is not there yet."""
+        """Return the index after the section that begins at `i`; -1 if the text has no end of it yet."""
         try:
             return super().parse_marked_section(i, report)
         except AssertionError:

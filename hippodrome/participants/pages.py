@@ -1,4 +1,4 @@
-"""What participants see: step pages in their frame, and the game page."""
+"""Makes the pages that participants see: step pages in their frame, and the game page."""
 
 from __future__ import annotations
 
@@ -23,45 +23,45 @@ from hippodrome.participants.frame import (
     script_json,
 )
 
-STAGES = ("queued", "starting", "naming", "ready")  # of waiting, in this order
+STAGES = ("queued", "starting", "naming", "ready")  # the states of a server that the waiting page shows, in this order
 LOBBY = "lobby"
 """The state of a participant who waits for others to play with."""
 
 
 @dataclass(frozen=True)
 class StepView:
-    """What the page of a step shows to one participant."""
+    """The content of a step page for one participant."""
 
     project: Project
     step: Step
     user_id: str
-    source: str  # the researcher's file
-    values: Mapping[str, Any]  # that the file may use
+    source: str  # the text of the researcher's file
+    values: Mapping[str, Any]  # the values that the file may use
     ticket: str
-    action: str  # where the form goes: the page's own address
-    final: bool
-    has_form: bool = False  # the step is answered by a form, even if the file has no fields
-    answered: bool = False  # a final step whose form was sent before
+    action: str  # the address to which the form is sent: the page's own
+    final: bool  # whether it is the last step
+    has_form: bool = False  # whether a form answers the step even if the file has no fields
+    answered: bool = False  # whether it is a final step whose form was sent before
     problem: str | None = None  # a sentence at the top
-    files: str | None = None  # where the project's files are served, if it is not /steps/{projectId}/
+    files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 
 
 @dataclass(frozen=True)
 class GameView:
-    """What the page of a game step shows to one participant, who waits on it and then plays."""
+    """The content of the game page for one participant, who first waits and then plays on it."""
 
     project: Project  # as the participant's session runs it (`Project.for_session`)
     step: Step
     user_id: str
-    state: Mapping[str, Any]  # as the poll address answers, see docs/pages.md
-    poll: str
-    page: str
-    action: str
+    state: Mapping[str, Any]  # the same as the response of `poll`, see docs/pages.md
+    poll: str  # the address of the state
+    page: str  # the page's own address
+    action: str  # the address to which its form is sent
     ticket: str
-    sources: str  # what the game may connect to, as in a Content-Security-Policy
-    # by the key of `trial` that names it, a researcher's page with its values
+    sources: str  # the sources in the Content-Security-Policy to which the game may connect
+    # the researcher's pages that the game page shows, each with its values, by the key of `trial` that names it
     texts: Mapping[str, tuple[str, Mapping[str, Any]]] = field(default_factory=dict)
-    files: str | None = None  # where the project's files are served, if it is not /steps/{projectId}/
+    files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 
 
 # Pages
@@ -103,10 +103,10 @@ def step_page(view: StepView) -> Page:
 
 
 def fragment(view: StepView) -> str:
-    """The researcher's part of a page, for clients with a frame and a form of their own. Raises FragmentError.
+    """The researcher's part of a page, for programs with a frame and a form of their own. Raises FragmentError.
 
-    The hidden fields that name the step come first; such a client sends them along. (HIPPO's front end
-    posts all named elements of its form, IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`.)
+    The hidden fields that name the step come first. The program sends them with the form: HIPPO's front end posts all
+    named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
     """
     return _step_fields(view) + _prepared(view).render(view.values)
 
@@ -160,7 +160,7 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("game/main.js", nonce, module=True, also=game_modules.of(view.project), texts=texts),
+        script=script("game/main.js", nonce, module=True, also=game_modules.modules_of(view.project), texts=texts),
         head=Html() if over or in_lobby(view.state) else _REFRESH,
         sheet="sessions.css" if together else "",
         body="game",
@@ -169,19 +169,19 @@ def game_page(view: GameView) -> Page:
 
 
 def is_over(state: Mapping[str, Any]) -> bool:
-    """Whether there is no server, and none will come."""
+    """Whether the server has ended or failed, and no other one will start by itself."""
     return state.get("state") in ("ended", "failed")
 
 
 def in_lobby(state: Mapping[str, Any]) -> bool:
-    """Whether the participant waits for others to play with. They have not been matched yet."""
+    """Whether the participant waits for others to play with and is not matched yet."""
     return state.get("state") == LOBBY
 
 
 def game_message(view: GameView) -> str:
-    """What a program shows of a game step whose server was lost or has ended: a sentence for the program's own form.
+    """The page of a game step whose server was lost or has ended, for a program that shows it in a form of its own.
 
-    The form asks for another server if the participant may have one.
+    The form requests another server if the participant may have one.
     """
     texts = Texts(view.project.texts)
     moved = texts["movedProgramTitle"], texts["movedProgram"]
@@ -195,15 +195,16 @@ def game_message(view: GameView) -> str:
 
 
 def _step_fields(view: StepView) -> Html:
-    """The hidden fields that say and prove which step a form answers."""
+    """The hidden fields that name the step which a form answers, with the ticket that proves it."""
     return fill("named", step=view.step.key, ticket=view.ticket)
 
 
 _REFRESH = Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n')
-"""Asks again in a browser without JavaScript. Not in the lobby: who asks there can be matched, and could not play."""
+"""Reloads the page in a browser without JavaScript. Not in the lobby: a participant there could be matched, but not
+play."""
 _TITLES = {"lost": "lostTitle", "full": "fullTitle"}
-_TRANSIENT = ("no capacity", "full")  # waiting may help
-_TO_REPORT = ("lost", "refused")  # the researcher or the administrator has to act, if it stays so
+_TRANSIENT = ("no capacity", "full")  # reasons that may pass by themselves
+_TO_REPORT = ("lost", "refused")  # reasons for which the researcher or the administrator may have to act
 _REASONS = {  # the values of `hippodrome.model.server.Reason`, and the texts for them
     "stopped": "stopped",
     "deadline": "deadline",
@@ -216,9 +217,9 @@ _REASONS = {  # the values of `hippodrome.model.server.Reason`, and the texts fo
 
 
 def _over_texts(state: Mapping[str, Any], texts: Texts, *, below: bool = False) -> tuple[str, str]:
-    """The title and the text for a server that has ended: what happened, what is kept, what to do.
+    """The title and the text for a server that has ended. They say what happened, what is kept, and what to do.
 
-    `below`: the text names no button, since the client shows one of its own below it.
+    With `below` the text names no button, because the client shows its own button below the text.
     """
     reason, ending = str(state.get("reason")), str(state["state"])
     title = texts[_TITLES.get(reason, f"{ending}Title")]
@@ -237,7 +238,7 @@ def _button(state: str, texts: Texts) -> str:
 
 
 def _stages(state: str, texts: Texts) -> Html:
-    """The stages of waiting; the present one is marked."""
+    """The list of the stages of waiting, with the present one marked."""
     now = STAGES.index(state) if state in STAGES else 0
     marks = {
         f"{name}_now": Html(' aria-current="step"') if at == now else Html(' class="past"') if at < now else Html()
@@ -247,7 +248,7 @@ def _stages(state: str, texts: Texts) -> Html:
 
 
 def _lobby(view: GameView, texts: Texts) -> Html:
-    """Where participants wait for each other (`web/game/lobby.js` fills it in). Hidden once they are matched."""
+    """The lobby on the game page, which `web/game/lobby.js` fills in. It is hidden once the participant is matched."""
     players = _players(view)
     two = players == 2
     return fill(
@@ -259,7 +260,7 @@ def _lobby(view: GameView, texts: Texts) -> Html:
 
 
 def _players(view: GameView) -> int:
-    """How many play together: in a session of another number than is registered now, its own."""
+    """How many participants play together: the session's number, if it differs from the registered one."""
     return int(view.state.get("players", view.project.players))
 
 
@@ -273,7 +274,7 @@ def _prepare(project: Project, source: str, files: str | None) -> Fragment:
 
 
 def _reading(view: GameView, nonce: str, texts: Texts) -> Html:
-    """The researcher's pages that the game page shows. They stand last: no id in them hides one of the page's own."""
+    """The researcher's pages that the game page shows. They come last, so no id in them hides one of the page's."""
     shown = [
         fill("text", key=key, content=Html(_prepare(view.project, source, view.files).render(values, nonce)))
         for key, (source, values) in view.texts.items()

@@ -1,9 +1,9 @@
-"""Requests that do not come from a participant: programs and browsers that fetch a link before a person opens it.
+"""Recognises previews: requests of programs and browsers that fetch a link before a person opens it.
 
-They create no participant and start no server. Sources: Fetch and HTML Standards (`Sec-Purpose: prefetch`, and
+A preview creates no participant and starts no server. Sources: Fetch and HTML Standards (`Sec-Purpose: prefetch`, and
 `prefetch;prerender`), Chrome's and Safari's older `Purpose` and `X-Purpose`, Firefox's older `X-Moz`; MTurk's API
-reference, "ExternalQuestion" (assignmentId of a HIT that is previewed before it is accepted). Mail scanners that pose
-as browsers cannot be told from participants.
+reference, "ExternalQuestion" (assignmentId of a HIT that is previewed before it is accepted). Mail scanners that
+pretend to be browsers cannot be distinguished from participants.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hippodrome.http import Request
 NOT_ACCEPTED = "ASSIGNMENT_ID_NOT_AVAILABLE"
 _PURPOSE = ("sec-purpose", "purpose", "x-purpose", "x-moz")  # headers
 
-# Programs that show a card for a link in a chat, or index pages. Whole names: Cubot is a maker of phones.
+# User agents of programs that show a card for a link in a chat, or index pages. Not of Cubot, a maker of phones.
 _PROGRAMS = re.compile(
     r"(?<!cu)bot\b|crawler|spider\b|facebookexternalhit|facebookcatalog|meta-external|whatsapp/"
     r"|slack-imgproxy|skypeuripreview|bingpreview|google-pagerenderer|googleother|google-inspectiontool"
@@ -26,7 +26,7 @@ _PROGRAMS = re.compile(
 
 
 class PreviewKind(Enum):
-    """Which kind of preview a request is."""
+    """The kind of a preview."""
 
     HIT = "an MTurk task that is not accepted yet"
     PREFETCH = "a browser that fetches a link ahead"

@@ -1,8 +1,8 @@
-"""The relays over HTTP: publish a start or stop message for the participant's server, a stop also after a delay.
+"""The relays: HTTP requests that publish a start or stop message for the participant's server, a stop also later.
 
-The participant must exist, must be allowed to do so now, and must prove who they are: by a ticket of one of their
-pages, or by the token of their running server. A POST has the fields in its body, a GET, as HIPPO's scripts send it, in
-its query.
+The participant must have arrived, a server must be due (or there to be stopped), and the request must prove who sends
+it: by a ticket of one of the participant's pages, or by the token of their running server. A POST has the fields in its
+body. A GET, as HIPPO's scripts send it, has them in its query.
 
 A member of a session has a token of their own for its server, and cannot stop it for the others: their stop message
 says that they have left (`hippodrome/servers/sessions.py`).
@@ -38,7 +38,7 @@ NO_PROOF = (
 
 
 class Refusal(Exception):
-    """The request is refused, with this HTTP status and sentence."""
+    """A relay refuses the request with this HTTP status and sentence."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -56,11 +56,14 @@ class Relays:
         self._repository = Repository(platform.documents)
 
     def start(self, request: Request) -> Response:
-        """Publish to the start topic."""
+        """Publish the start message of the participant's server, or refuse with a status and a sentence."""
         return self._respond(request, self._start)
 
     def stop(self, request: Request) -> Response:
-        """Publish to the stop topic, or set a timer that will: `delay` is in seconds, up to a day."""
+        """Publish the stop message of the participant's server, or set a timer that does so after `delay`.
+
+        The request's field `delay` is in seconds, 0 to `LONGEST_DELAY`. Refuses with a status and a sentence.
+        """
         return self._respond(request, self._stop)
 
     def _respond(self, request: Request, act: Any) -> Response:
@@ -87,7 +90,7 @@ class Relays:
         return project, str(user_id)
 
     def _project_of_ticket(self, user_id: str, form: PostedForm) -> Project:
-        """The project in which the ticket proves that this participant was shown a step: HIPPO's stop names none."""
+        """The project whose ticket this is, for HIPPO's stop request, which names no project. Raises `Refusal`."""
         for found in self._project_cache.projects():
             project = self._secrets.with_secret(found) if found.live and found.step(form.step) and form.ticket else None
             if project and project.step_of_ticket(user_id, form.step, form.ticket):
@@ -105,8 +108,8 @@ class Relays:
             attempt = 1
         elif not record.is_closed:
             attempt = record.attempt  # it is open: the message changes nothing
-        elif (wished := requestable_attempt(record)) is not None:
-            attempt = wished
+        elif (requestable := requestable_attempt(record)) is not None:
+            attempt = requestable
         else:
             raise Refusal(409, "No further server can be started.")
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
@@ -118,7 +121,7 @@ class Relays:
         self._authorize(project, user_id, form, record)
         if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
-        if record is None or record.is_closed or record.is_sessions:  # they leave the lobby or the session: no attempt
+        if record is None or record.is_closed or record.is_sessions:  # the participant leaves the lobby or the session
             message, name = StopServer(project.id, user_id), ids.server_name(ids.server_label(project.id, user_id), 1)
         else:
             message, name = StopServer(project.id, user_id, record.attempt), record.name
@@ -129,6 +132,7 @@ class Relays:
             self._platform.bus.publish(Topic.STOP, to_message(message))
 
     def _authorize(self, project: Project, user_id: str, form: PostedForm, record: Server | None) -> None:
+        """Raise `Refusal` unless the form has the token of this server or a ticket of this participant."""
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
         if expected and record and record.is_sessions:
@@ -150,15 +154,16 @@ def _form(request: Request) -> PostedForm:
         raise Refusal(403, "Nothing was started or stopped: this is the preview of a link, not a participant.")
     if request.query is None:
         raise Refusal(400, "The query cannot be read.")
-    return forms.of_query(request.query)
+    return forms.read_query(request.query)
 
 
 def _answer(status: int, text: str) -> Response:
-    """JSON with the text, also as `page`, which programs of HIPPO's users expect in every answer."""
+    """JSON with the text as `message`, and as `page`, which programs of HIPPO's users expect in every response."""
     return http.as_json(status, {"message": text, "page": text, "css": None})
 
 
 def _delay(answers: Mapping[str, Any]) -> int:
+    """The field `delay`, in seconds; 0 without it. Raises `Refusal`."""
     given = answers.get("delay", 0)
     try:
         delay = int(given) if not isinstance(given, bool) else -1

@@ -1,4 +1,4 @@
-"""Jinja's sandbox: it fills values into researchers' pages (`fragments.py`). Jinja is imported once it is needed."""
+"""Fills values into researchers' pages (`fragments.py`) in Jinja's sandbox. Jinja is imported once it is needed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 LIMIT = 2_000_000  # characters of a rendered page
-VALUES_READ = frozenset({"participant", "answers"})  # each costs a read of the participant's records
+VALUES_READ = frozenset({"participant", "answers"})  # the values that cost reads of the participant's documents
 
 
 class FragmentError(Exception):
-    """A step page that Jinja cannot render. `line` counts in the researcher's file; None if it is not known."""
+    """Jinja cannot render a step page. `line` is the line in the researcher's file; None if it is not known."""
 
     def __init__(self, message: str, line: int | None = None) -> None:
         super().__init__(message)
@@ -31,9 +31,9 @@ def uses_jinja(text: str) -> bool:
 
 @lru_cache(maxsize=64)
 def records_mentioned(source: str) -> frozenset[str]:
-    """Which of the participant's records a step page uses: `participant`, `answers`, or single steps as `answers.3`.
+    """The participant's documents that a step page uses: `participant`, `answers`, or single steps such as `answers.3`.
 
-    Empty for a page that does not parse.
+    Empty for a page that Jinja cannot parse.
     """
     if not uses_jinja(source):
         return frozenset()
@@ -50,7 +50,7 @@ def records_mentioned(source: str) -> frozenset[str]:
 
 
 def _answers(parsed: Any) -> set[str]:
-    """`answers.{step}` for each step named as such; `answers` if the page uses them in any other way."""
+    """`answers.{step}` for each step that the page names in this way; `answers` if it uses answers in another way."""
     from jinja2 import nodes  # noqa: PLC0415 - as above
 
     steps = set()
@@ -64,7 +64,7 @@ def _answers(parsed: Any) -> set[str]:
 
 
 def render(text: str, values: Mapping[str, Any]) -> str:
-    """Fill the values into a page. Raises FragmentError."""
+    """Return the page with these values. Raises FragmentError."""
     parts: list[str] = []
     size = 0
     try:
@@ -86,7 +86,7 @@ def _compile(text: str) -> Template:
 
 
 def _line(error: Exception) -> int | None:
-    """The line of the template where it failed: Jinja knows it of syntax errors, the traceback of others."""
+    """The line of the template at which it failed, from Jinja's syntax error or from the traceback."""
     line: int | None = getattr(error, "lineno", None)
     trace = error.__traceback__
     while trace is not None:
@@ -98,7 +98,7 @@ def _line(error: Exception) -> int | None:
 
 @cache
 def environment() -> ImmutableSandboxedEnvironment:
-    """The sandbox of all pages, made once."""
+    """Return the sandbox of all pages, which is made once."""
     from jinja2 import ChainableUndefined  # noqa: PLC0415 - as above
     from jinja2.exceptions import SecurityError  # noqa: PLC0415
     from jinja2.sandbox import ImmutableSandboxedEnvironment  # noqa: PLC0415
@@ -120,7 +120,7 @@ def environment() -> ImmutableSandboxedEnvironment:
             return call(left, right)
 
     def empty(value: object) -> None:
-        """A missing value is null in JSON, as it is empty in a text."""
+        """Make a missing value null in JSON; in a text it is empty."""
         if not isinstance(value, ChainableUndefined):
             raise TypeError(f"{type(value).__name__} is not JSON serializable")
 

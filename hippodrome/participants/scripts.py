@@ -1,9 +1,9 @@
 """Joins the ES modules of a script into the one script that a page carries.
 
-`web/game/` is written as modules that browsers could load one by one. That would cost a request for each, one after the
-other along their imports, on a page that people open on bad Wi-Fi, and a page without one of them would not work. So
-the page carries all of them, in the order in which a browser would run them. They then share one scope: no top-level
-name may occur in two of them, and an import keeps its name (`tests/hippodrome/participants/test_scripts.py`).
+`web/game/` has modules that browsers could load one by one. That would take one request after the other along their
+imports, also on bad Wi-Fi, and without one of them the page would not work. So the page contains all of them, in the
+order in which a browser would run them. They share one scope then: no top-level name may occur in two of them, and an
+import must keep its name (`tests/hippodrome/participants/test_scripts.py`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ _LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def join(main: Path, also: tuple[str, ...] = ()) -> str:
-    """The script of this module and of all that it imports, each once and after what it imports itself.
+    """One script of this module and all modules that it imports: each once, after its own imports.
 
-    `also` are modules beside it that it does not import: they and what they import stand before it.
-    Raises ValueError for an import or export of another form.
+    `also` are modules in the same folder that `main` does not import. They and their imports come before it. Raises
+    ValueError for an import or export of another form, and if a module imports itself.
     """
     found: dict[Path, str] = {}
     for module in (*map(main.with_name, also), main):

@@ -1,8 +1,8 @@
 """Puts a study's texts (`hippodrome/model/texts.py`) into the scripts and templates of `web/`, which name them.
 
-An English page carries neither the names nor a table: that would cost more than a tenth of the game page's script. In a
-script, `TEXT.start` becomes `"Start"`, and `TEXT.seconds(left)` becomes `` `${left} seconds` ``. So what stands between
-the brackets may be worked out never or twice, as the text has the place: it must do nothing else than give a value.
+A page contains neither names nor a table of texts, which would be more than a tenth of the game page's script. In a
+script, `TEXT.start` becomes `"Start"`, and `TEXT.seconds(left)` becomes `` `${left} seconds` ``. The expression between
+the brackets is evaluated as often as the text has its place, so it must have no effect but its value.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ NAMED = re.compile(r"\bTEXT\.([A-Za-z]+)")
 
 
 def in_script(code: str, texts: Texts) -> str:
-    """The script with the texts where it names them."""
+    """The script with a study's texts in place of their names."""
     return _filled(code, {**texts.all(), LANGUAGE: _for_numbers(texts.language)})
 
 
 def _for_numbers(language: str) -> str:
-    """The language in which a script has the browser write numbers: with the digits that all other numbers have.
+    """The language in which a script lets the browser format numbers, with the digits 0 to 9.
 
-    English for what is no language, as a project may name it that nothing has checked: no number could be written.
+    English if the text is no valid language, as in a project that was registered without a check: the browser's
+    functions would raise.
     """
     english = IN_ENGLISH.language
     return f"{language}-u-nu-latn" if language != english and is_language(language) else english
 
 
 def in_template(template: str, texts: Texts) -> str:
-    """The HTML template with the texts, escaped, where it names them. `{step}` in a text becomes `$step`."""
+    """The HTML template with a study's texts, escaped, in place of their names. `{step}` in a text becomes `$step`."""
     known = texts.all()
     return NAMED.sub(lambda found: _in_html(known[found[1]], places(ENGLISH[found[1]])), template)
 
@@ -58,7 +59,7 @@ def _filled(code: str, texts: dict[str, str]) -> str:
 
 
 def _literal(text: str) -> str:
-    """The text as a script writes it. `<` could end the script, and two signs end a line for some browsers."""
+    """The text as a string literal. `<` could end the script, and two characters end a line in older browsers."""
     written = json.dumps(text, ensure_ascii=False).replace("<", "\\u003c")
     return written.replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
@@ -73,7 +74,7 @@ _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|`[^`$]*`|[(\[{]|[)\]}]|,|[^"`(\[{)\]},
 
 
 def _arguments(code: str, at: int) -> tuple[list[str], int]:
-    """What stands between the brackets that open at `at`, and where they are closed."""
+    """The arguments between the brackets that open at `at`, and the index after the closing bracket."""
     given, depth = [""], 0
     while token := _TOKEN.match(code, at):
         at = token.end()

@@ -1,4 +1,4 @@
-"""The state of a participant's server, as the waiting page and the game page get it."""
+"""Makes the state of a participant's server, as JSON data for the game page."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from hippodrome.model.server import Reason, Server, ServerState, next_attempt, r
 from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import SecretCache
 
-MAX_START_TIMES = 50  # starts
+MAX_START_TIMES = 50  # of the latest starts, for `typical`
 FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 
 class ServerStates:
-    """States of servers, and how long their starts took lately. docs/pages.md describes the JSON of `state`."""
+    """Makes the states of servers (docs/pages.md), and remembers how long their latest starts took."""
 
     def __init__(self, settings: Settings, secrets: SecretCache) -> None:
         self._settings = settings
@@ -33,7 +33,7 @@ class ServerStates:
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
-        """The state as JSON data. `since`, when the participant reached the step, is used if there is no record."""
+        """The state as JSON data. `since` is when the participant reached the step; it counts if there is no record."""
         state: dict[str, Any] = {
             "state": ServerState.QUEUED,
             "attempt": 1,
@@ -49,7 +49,7 @@ class ServerStates:
             if record.is_closed:
                 state.update(_closed(record))
             elif step is not None and step.type.on_server and record.lacks(step.key):
-                state["state"] = ServerState.QUEUED  # it is being stopped, see `GameStep`
+                state["state"] = ServerState.QUEUED  # the server is being stopped (`GameStep`), another one will start
             elif record.state is ServerState.READY and record.dns_record:
                 self._remember(record)
                 host = dns.browser_host(record.dns_record)
@@ -69,7 +69,7 @@ class ServerStates:
 
 
 def _closed(record: Server) -> dict[str, Any]:
-    """The part of the state that a closed record decides."""
+    """The part of the state that follows from a closed record."""
     if next_attempt(record) is not None:
         return {"state": ServerState.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"

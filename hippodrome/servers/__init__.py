@@ -1,1 +1,1 @@
-"""The life of a participant's server: start, DNS name, termination, sweep, and the requests that are signed for it."""
+"""Starts, names, replaces and ends servers, sweeps up what is left over, and signs requests for them."""

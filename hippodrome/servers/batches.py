@@ -1,4 +1,4 @@
-"""Batches: items are processed independently and may run at the same time; one failure does not affect the rest."""
+"""Processes the items of a batch independently, possibly at the same time. One failure does not affect the rest."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def for_each(
     log_text: str,
     name: Callable[[I], str] | None = None,
 ) -> tuple[list[tuple[I, T]], list[I]]:
-    """Call `act` on each item; return those with a result, each with its result, and those for which it raised.
+    """Call `act` on each item; return the items whose result is not None, with it, and the items for which it raised.
 
-    Each error is logged as `log_text`, with the server name that `name` returns.
+    Each error is logged as `log_text`, with the server's name that `name` returns for the item.
     """
 
     def one(item: I) -> tuple[I, T | None, bool]:

@@ -1,4 +1,4 @@
-"""Why a server failed, worded for the researcher and the administrator, from what ECS says of it. Pure.
+"""Finds the cause why a server failed from ECS's words, and explains it to researchers and administrators. Pure.
 
 Wordings (ECS Developer Guide, "Stopped task error messages" and "API failure reasons", API Reference, `Task`, and
 events of real tasks; read November 2026). `stopCode` is one of TaskFailedToStart, EssentialContainerExited,
@@ -23,7 +23,7 @@ _KILLED = 137  # by SIGKILL
 
 
 class FailureCategory(StrEnum):
-    """A group of causes with one remedy, counted by one metric and watched by one alarm."""
+    """A group of causes, counted by one metric and watched by one alarm."""
 
     IMAGE = "image"
     INITIALISATION = "initialisation"
@@ -34,7 +34,7 @@ class FailureCategory(StrEnum):
 
 
 class Cause(StrEnum):
-    """Why a server failed, as written in its record."""
+    """The cause of a server's failure, as it is written in the server's record."""
 
     IMAGE = "image"
     INITIALISATION = "initialisation"
@@ -72,16 +72,16 @@ class _Explanation(NamedTuple):
     remedy: str
 
 
-_LOGS = "Its last words are in `python -m deploy logs trial`."
+_LOGS = "The last lines of its log are in `python -m deploy logs trial`."
 _EXPLANATIONS = {
     Cause.IMAGE: _Explanation(
         FailureCategory.IMAGE,
         "The image cannot be pulled: it is gone, was never pushed, or its registry cannot be reached.",
-        "Register the project again, which builds and pushes it; `python -m deploy doctor` looks whether it is there.",
+        "Register the project again, which builds and pushes it; `python -m deploy doctor` says whether it exists.",
     ),
     Cause.INITIALISATION: _Explanation(
         FailureCategory.INITIALISATION,
-        "What a container needs before it begins cannot be had: its log group, its secrets, the login to the registry.",
+        "ECS could not prepare the container: its log group, its secrets, or the login to the image's registry.",
         "`python -m deploy plan` shows what is missing and `apply` puts it back; with a network of your own, see "
         "whether its subnets reach the Internet.",
     ),
@@ -164,12 +164,12 @@ _EXPLANATIONS = {
     ),
     Cause.VANISHED: _Explanation(
         FailureCategory.AWS,
-        "The server was gone without a word from AWS, and a sweep noticed.",
-        "`python -m deploy logs task_changed --errors` shows whether its end was told and could not be dealt with.",
+        "The server had ended, no event of ECS was handled, and a sweep noticed it.",
+        "`python -m deploy logs task_changed --errors` shows whether an event came and could not be handled.",
     ),
     Cause.UNKNOWN: _Explanation(
         FailureCategory.AWS,
-        "AWS ended the server for a reason that is not known here.",
+        "AWS ended the server for a reason that Hippodrome does not know.",
         "The console of ECS tells it for an hour, among the cluster's stopped tasks.",
     ),
 }
@@ -193,7 +193,7 @@ _REFUSAL_PATTERNS = (
 
 
 def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
-    """Why a failed task ended. `was_ready`: whether its server was ready for its participant."""
+    """The cause why a failed task ended. `was_ready`: whether its server was ready for its participant."""
     if stopped.code in ("SpotInterruption", "TerminationNotice"):
         return Cause.SPOT
     if matched := _first_match(_TASK_PATTERNS, stopped.words):
@@ -212,7 +212,7 @@ def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
 
 
 def cause_of_refusal(error: NoCapacity | Refused) -> Cause:
-    """Why RunTask ran no task."""
+    """The cause why RunTask ran no task."""
     if isinstance(error, NoCapacity):
         return Cause.QUOTA if _first_match(_TASK_PATTERNS, str(error)) is Cause.QUOTA else Cause.CAPACITY
     return _first_match(_REFUSAL_PATTERNS, str(error)) or Cause.REFUSED

@@ -1,14 +1,14 @@
-"""The DNS records of servers: `DnsRecords` creates them, `delete_dns_records` deletes them.
+"""Creates and deletes the DNS records of servers.
 
-`task_changed` finds the addresses of running tasks, creates their DNS records, and marks the servers `ready`.
-Records are deleted when a server ends (`termination.py`), and what that missed by the sweep and the commands.
+`task_changed` finds the addresses of running tasks, creates their DNS records, and marks the servers `ready`. A
+server's record is deleted when the server ends (`termination.py`). The sweep and the commands delete leftovers.
 
-The function sends itself messages to check whether a DNS change is INSYNC. Lambda takes such a chain for a loop: by
-default it drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
-count travels in the trace header that AWS's SDKs send, and the guide does not say which count a batch inherits). The
+The function sends itself messages to check whether a DNS change is INSYNC. Lambda takes such a chain for a loop, and by
+default drops the next invocation after about 16 (Lambda Developer Guide, "Use Lambda recursive loop detection"; the
+count is in the trace header that AWS's SDKs send, and the guide does not say which count a batch inherits). The
 template allows this function its loop, and `MAX_CHECKS` ends it. Fewer checks with longer pauses would not stay below
-that count: in the simulation, a batch of messages from many chains inherits the highest count of them, and participants
-wait for each pause. If a message is lost, the sweep starts the chain again (`overdue.py`).
+16 either: in the simulation, a batch of messages from many chains inherits the highest of their counts. And
+participants wait for each pause. If a message is lost, the sweep starts the chain again (`overdue.py`).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ RETRY_PAUSE = 3  # seconds until the next try if the zone was busy, or if an int
 MAX_ADDRESS_CHECKS = 5  # for one network interface; then the queue delivers the event again
 BEFORE_READY = (ServerState.STARTING, ServerState.NAMING)
 DRAINING_OR_CLOSED = (ServerState.DRAINING, ServerState.CLOSED)
-MAX_SERVERS_PER_CHANGE = 400  # so many fit in one message
+MAX_SERVERS_PER_CHANGE = 400  # as many as one message can name
 MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
 
 def delete_dns_records(platform: Platform, records: Iterable[DnsRecord | None]) -> None:
-    """Delete these DNS records of servers, with the exact values stored, by one change; without any, make no call."""
+    """Delete these DNS records, with exactly these values, by one change. Makes no call if all are None."""
     found = [record for record in records if record is not None]
     if found:
         platform.dns.change(remove=found)
@@ -52,7 +52,7 @@ class DnsRecords:
         self._written = services.written
 
     def tasks_running(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Register the servers of these RUNNING events; return the events that should be delivered again.
+        """Create the DNS records of the servers in these RUNNING events; return the events to deliver again.
 
         One call finds all addresses, and one DNS change creates all records.
         """
@@ -80,7 +80,7 @@ class DnsRecords:
         return again + failed + [event for event, record in named if record.name in unregistered]
 
     def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Ask again in `RETRY_PAUSE` for addresses that EC2 does not know yet; return the events given up on."""
+        """Look up addresses again in `RETRY_PAUSE`, by messages; return the events that have none left to try."""
         soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
             seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
@@ -90,8 +90,8 @@ class DnsRecords:
     def _create(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
         """Create the DNS records of servers in state `naming`; return the servers that cannot have one.
 
-        If the zone is busy, a delayed message asks again. The queue is no alternative: it delivers the events again
-        only after its visibility timeout, and not at all after some receives.
+        If the zone is busy, a delayed message repeats the change. The queue is no alternative: it delivers the events
+        again only after its visibility timeout, and not at all after some receives.
         """
         unregistered: list[Server] = []
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
@@ -101,8 +101,8 @@ class DnsRecords:
             except ServiceBusy:
                 if looked >= MAX_CHECKS:
                     raise
-                again = DnsChanged("", named, looked + 1, unmade=True)
-                self._platform.bus.send_delayed(to_message(again), RETRY_PAUSE)
+                unmade = DnsChanged("", named, looked + 1, unmade=True)
+                self._platform.bus.send_delayed(to_message(unmade), RETRY_PAUSE)
             except RefusedDnsRecords as refused:
                 others = [record for record in batch if record.dns_record not in refused.records]
                 if others:
@@ -140,13 +140,13 @@ class DnsRecords:
         return after.server if after else None
 
     def _record_to_register(self, event: TaskChanged) -> Versioned | None:
-        """Return the record of a running task that has no DNS record yet, else None.
+        """Return the record of a running task's server if it has no DNS record yet; else None.
 
-        Stop the task if its server is closed or draining, or runs another task.
+        Stop the task if its server is closed or draining, or has another task.
         """
         stored = self._repository.owner(event.name)
         if stored is None:
-            return None  # not of this installation
+            return None  # the task is not this installation's
         record = stored.server
         waits = record.name == event.name and record.state not in DRAINING_OR_CLOSED
         if not waits or record.task not in (None, event.task):
@@ -173,7 +173,7 @@ class DnsRecords:
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
         """Mark the servers of changes that are INSYNC `ready`; return the messages that should be delivered again.
 
-        All messages are handled at once, because running tasks wait in the same batch for their DNS records.
+        All messages are handled at once, because running tasks in the same batch wait for their DNS records.
         """
         unmade = [message for message in messages if message.unmade]
         made = [message for message in messages if not message.unmade]
@@ -181,13 +181,13 @@ class DnsRecords:
         again += self._retry_create(unmade) if unmade else []
         try:
             self._complete({named: message.looked for message, _ in in_sync for named in message.servers})
-        except Exception as error:  # noqa: BLE001 - changes for which a next check was sent must not come twice
+        except Exception as error:  # noqa: BLE001 - messages for which the next check was sent must not come again
             failure("servers are not ready yet", error)
             again += [message for message, _ in in_sync]
         return again
 
     def _retry_create(self, unmade: Sequence[DnsChanged]) -> list[DnsChanged]:
-        """Create the DNS records for which the zone was busy, with one change; return the messages that failed."""
+        """Create the DNS records for which the zone was busy, with one change; return the messages to deliver again."""
         wanted = {(named.label, named.attempt): named for message in unmade for named in message.servers}
         waiting, failed = for_each(
             self._platform,
@@ -207,13 +207,13 @@ class DnsRecords:
         return [message for message in unmade if any(named in failed for named in message.servers)]
 
     def _waiting_record(self, named: ServerAttempt) -> Server | None:
-        """The record of a server that is still in state `naming`, else None."""
+        """The record of a server that is still in state `naming`; else None."""
         stored = self._repository.server(named.label)
         waits = stored and stored.server.is_open(named.attempt) and stored.server.state is ServerState.NAMING
         return stored.server if stored and waits else None
 
     def _check(self, message: DnsChanged) -> bool | None:
-        """True if the change is INSYNC. Otherwise schedule another check and return None."""
+        """Return True if the change is INSYNC. Otherwise send the message of the next check and return None."""
         try:
             if not message.change or self._platform.dns.in_sync(message.change):
                 return True
@@ -223,14 +223,14 @@ class DnsRecords:
         return None
 
     def _after_change(self, message: DnsChanged) -> None:
-        """Schedule the first check of a change. With an empty id it is INSYNC already: the servers become ready."""
+        """Send the message of a change's first check. A change without id is INSYNC: its servers become ready now."""
         if message.change:
             self._check_later(message)
         else:
             self._complete(dict.fromkeys(message.servers, message.looked))
 
     def _check_later(self, message: DnsChanged) -> None:
-        """Schedule another check, at most `MAX_CHECKS`; after that the sweep finds the servers."""
+        """Send the message of the next check. After `MAX_CHECKS`, log an error instead: the sweep finds the servers."""
         if message.looked >= MAX_CHECKS:
             logger.error("a DNS change did not become INSYNC in time", extra={"servers": len(message.servers)})
             return
@@ -238,9 +238,9 @@ class DnsRecords:
         self._platform.bus.send_delayed(to_message(again), pause(message.looked))
 
     def _complete(self, servers: Mapping[ServerAttempt, int]) -> None:
-        """Mark these servers ready; delete the DNS records of those that were closed meanwhile.
+        """Mark these servers ready; delete the DNS records of servers that were closed or drained before.
 
-        `servers`: how many checks each has had.
+        `servers` has, by server, the number of checks so far.
         """
         late, failed = for_each(
             self._platform,
@@ -250,11 +250,11 @@ class DnsRecords:
             lambda named: ids.server_name(named.label, named.attempt),
         )
         delete_dns_records(self._platform, [record for _, record in late])
-        if failed:  # the change is INSYNC: only these servers are tried again
+        if failed:  # the next check only tries these servers again, since the change is INSYNC
             self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 
     def _make_ready(self, named: ServerAttempt) -> DnsRecord | None:
-        """Write `ready`, and add a warm server to its pool. If the server was closed, return its DNS record."""
+        """Write `ready`, and mark a warm server ready in its pool. If the server was closed, return its DNS record."""
         name = ids.server_name(named.label, named.attempt)
         made = self._write_ready(named)
         if made:
@@ -263,12 +263,14 @@ class DnsRecords:
         if found is None or found.server.name != name:
             return None
         record = found.server
-        if record.is_warm_server and record.state is ServerState.READY:  # also if the last try was interrupted here
+        if (
+            record.is_warm_server and record.state is ServerState.READY
+        ):  # also if an earlier call ended before this line
             self._pools.mark_ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
     def _write_ready(self, named: ServerAttempt) -> Versioned | None:
-        """Write `ready` if the state is still `naming`. The version written last is tried first, without a read."""
+        """Write `ready` if the state is still `naming`. The version written last is used first, without a read."""
         now = self._platform.now()
         stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)
         return self._repository.update(
@@ -278,5 +280,5 @@ class DnsRecords:
 
 
 def pause(looked: int) -> int:
-    """Seconds until the next check, after `looked` checks. The more checks there were, the longer the pause."""
+    """Seconds until the next check, after `looked` checks: `PAUSES`, then `LONG_PAUSE`."""
     return PAUSES[looked] if looked < len(PAUSES) else LONG_PAUSE

@@ -1,7 +1,7 @@
-"""Which resources of servers are left over, and why. Pure.
+"""Decides which resources of servers are left over, and why. Pure.
 
-The sweep and the commands `stop`, `erase` and `destroy` list what exists (`resources.py`), read the records that own it
-(`hippodrome.model.server.owner`), and decide here. A resource is never left over if its name is no server's name.
+The sweep and the commands `stop`, `erase` and `destroy` list the resources (`resources.py`), read the records that own
+them (`hippodrome.model.server.owner`), and decide here. A resource is never left over if its name is no server's name.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hippodrome.servers.overdue import LOST_AFTER
 from hippodrome.servers.resources import Resources
 
 
-class Why(StrEnum):
+class LeftoverReason(StrEnum):
     """The reason why a resource is left over."""
 
     CLOSED = "its server is closed"
@@ -28,16 +28,16 @@ class Why(StrEnum):
 
 @dataclass(frozen=True)
 class Scope:
-    """What a caller may remove. By default: the resources of closed servers, and of attempts that were replaced."""
+    """The resources that a caller may remove. By default: those of closed servers, and of replaced attempts."""
 
-    closed_by: datetime | None = None  # only of servers closed until this time
-    project_id: str | None = None  # of this project's servers alone
-    without_record: bool = False  # also what no record owns, where only this installation's resources can be
-    labels: frozenset[str] = frozenset()  # servers of an erased participant: all they have
-    names: frozenset[str] = frozenset()  # and the warm servers that were assigned to the participant
+    closed_by: datetime | None = None  # only those of servers that were closed until this time
+    project_id: str | None = None  # only those of this project's servers
+    without_record: bool = False  # also those that no record owns, where only this installation's resources can be
+    labels: frozenset[str] = frozenset()  # the labels of an erased participant's servers, whose resources all go
+    names: frozenset[str] = frozenset()  # the names of the warm servers that were assigned to that participant
 
     def covers(self, owner: Server | None) -> bool:
-        """Whether this server is of the project."""
+        """Whether this server is one of the project's."""
         return self.project_id is None or (owner is not None and owner.project_id == self.project_id)
 
     def erases(self, name: str) -> bool:
@@ -45,47 +45,45 @@ class Scope:
         return name in self.names or (ids.parse_server_name(name) or ("", 0))[0] in self.labels
 
 
-def why_left_over(name: str, owner: Server | None, scope: Scope, *, ours: bool = False) -> Why | None:
-    """Why a resource of this name is left over; None if it is not, or if it is not the caller's to remove.
+def why_left_over(name: str, owner: Server | None, scope: Scope, *, ours: bool = False) -> LeftoverReason | None:
+    """Why a resource of this name is left over; None if it is not, or if it is outside `scope`.
 
-    `owner`: the record that owns the name. A resource without a record may be another installation's, unless it is
-    `ours`: lies where only this installation's resources can be.
+    `owner`: the record that owns the name. `ours`: whether only this installation can have created the resource.
+    Otherwise a resource without a record may be another installation's.
     """
     parsed = ids.parse_server_name(name)
     if parsed is None:
         return None
     if scope.erases(name):
-        return Why.ERASED
+        return LeftoverReason.ERASED
     if not scope.covers(owner):
         return None
     if owner is None:
-        return Why.NO_RECORD if ours and scope.without_record else None
+        return LeftoverReason.NO_RECORD if ours and scope.without_record else None
     if owner.name != name:
-        return Why.REPLACED if owner.attempt >= parsed[1] else None
-    closed = owner.is_closed and (scope.closed_by is None or _closed_by(owner, scope.closed_by))
-    return Why.CLOSED if closed else None
+        return LeftoverReason.REPLACED if owner.attempt >= parsed[1] else None
+    if not owner.is_closed or (scope.closed_by and (owner.closed is None or owner.closed > scope.closed_by)):
+        return None
+    return LeftoverReason.CLOSED
 
 
-def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Why | None:
+def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> LeftoverReason | None:
     """Why the slot of the server of this name is left over; None if it is not.
 
-    Not at once: the server's task may still appear (and is stopped then), or the next attempt may take over the slot.
+    A closed server's slot is left over only after `LOST_AFTER`: before that, a task of the server may still appear (and
+    be stopped), or the next attempt may take the slot over.
     """
     if ids.parse_server_name(name) is None:
         return None
-    if owner is None:  # erased: a server's record is written before it takes its slot
-        return Why.NO_RECORD
-    return Why.CLOSED if owner.closed is not None and now > owner.closed + LOST_AFTER else None
+    if owner is None:  # its participant was erased, since a server's record is written before it takes its slot
+        return LeftoverReason.NO_RECORD
+    return LeftoverReason.CLOSED if owner.closed is not None and now > owner.closed + LOST_AFTER else None
 
 
 def leftovers(found: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
-    """The resources that are left over. `owners`: the records that own them, by the names of resources."""
+    """The resources that are left over. `owners`: the records that own resources, by the resources' names."""
 
     def keep(name: str, *, ours: bool = False) -> bool:
         return why_left_over(name, owners.get(name), scope, ours=ours) is not None
 
     return found.only(keep, lambda name: keep(name, ours=True))
-
-
-def _closed_by(owner: Server, moment: datetime) -> bool:
-    return owner.closed is not None and owner.closed <= moment

@@ -1,7 +1,7 @@
-"""What a sweep does about a server that stays in a state for too long: one rule per state. Pure.
+"""Decides what a sweep does about a server that stays in a state for too long: one rule per state. Pure.
 
-What moves a server to its next state may be lost: a message becomes a dead letter, an ECS event never arrives, or a
-function is interrupted at every receive that its queue allows.
+The event that moves a server to its next state may be lost: a message goes to the dead-letter queue, an ECS event never
+arrives, or a function is interrupted at every receive that its queue allows.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ from enum import StrEnum
 from hippodrome.model.server import Server, ServerState, next_attempt
 from hippodrome.ports import RunningTask
 
-RETRY_AFTER = timedelta(minutes=3)  # a server should be in its next state by then: the message is sent again
-LOST_AFTER = timedelta(minutes=10)  # a server without a task after this time has lost it
-NEVER_RUNS_AFTER = timedelta(minutes=20)  # a task not RUNNING by then has failed; no participant waits longer either
-OVERDUE_AFTER = timedelta(minutes=5)  # after the deadline: its timer must have failed
+RETRY_AFTER = timedelta(minutes=3)  # if a server is not in its next state after this time, its message is sent again
+LOST_AFTER = timedelta(minutes=10)  # a server that has no task after this time has lost it
+NEVER_RUNS_AFTER = timedelta(minutes=20)  # a task that is not RUNNING after this time has failed
+OVERDUE_AFTER = timedelta(minutes=5)  # if a server is open so long after its deadline, its timer has failed
 
 
 class Remedy(StrEnum):
-    """What the sweep does."""
+    """What the sweep does about a server."""
 
-    START = "start"  # send the start message of the same attempt again; it is started once
-    RUNNING = "running"  # tell task_changed that its task runs
-    DNS = "dns"  # create its DNS record again, and check it
+    START = "start"  # send the start message of the same attempt again
+    RUNNING = "running"  # send task_changed the message that the task runs
+    DNS = "dns"  # send task_changed the message to create the DNS record
     STOP = "stop"  # send the stop message again
-    OVERDUE = "overdue"  # send a stop message: its deadline is over
-    LOST = "lost"  # clean up, and replace it if it should be
-    REPLACE = "replace"  # request the next attempt again
+    OVERDUE = "overdue"  # send a stop message, because the deadline is over
+    LOST = "lost"  # clean up, and request the next attempt if there should be one
+    REPLACE = "replace"  # request the next attempt again, and delete the timer
 
 
 Rule = Callable[[Server, RunningTask | None, datetime], Remedy | None]
 
 
 def remedy(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """What to do about this server and its living task, if it has one; None if nothing has to be done."""
+    """The remedy for this server, whose living task is `task`; None if nothing has to be done."""
     if not record.is_closed and now > record.deadline + OVERDUE_AFTER:
         return Remedy.OVERDUE
     return RULES[record.state](record, task, now)
@@ -61,12 +61,12 @@ def _ready(record: Server, task: RunningTask | None, now: datetime) -> Remedy | 
 
 
 def _draining(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """At once: the record does not say since when it drains, and a second stop message does no harm."""
+    """Stop it at once: the record does not say since when it drains, and a second stop message does no harm."""
     return Remedy.STOP
 
 
 def _closed(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """The sweep removes leftovers wherever it finds them; but the next attempt may not have been requested."""
+    """Request the next attempt, whose message may be lost. The sweep removes leftovers of closed servers anyway."""
     if next_attempt(record) is None or record.closed is None:
         return None
     return Remedy.REPLACE if RETRY_AFTER < now - record.closed <= NEVER_RUNS_AFTER else None
@@ -77,7 +77,7 @@ def _without_task(record: Server, now: datetime) -> Remedy | None:
 
 
 def _queued(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """Never in a record: without one, the participant's waiting page asks again."""
+    """Do nothing: no record has this state. Without a record, the participant's waiting page requests the server."""
     return None
 
 

@@ -1,29 +1,25 @@
-"""How a lost server is replaced: by the next attempt of the participant, or of the session, for all its members.
+"""Replaces a lost server by the next attempt of its participant or session.
 
 1. `termination.py` closes the record with the reason why the server ended, and calls `Replacement.request`.
 2. `request` publishes the start message of the next attempt, if `next_attempt` names one.
 3. `start.py` handles that message, and calls `Replacement.write_record`: the next attempt's record replaces the closed
    one. The trial on the new server resumes from the recordings (`trial/recordings/resume.py`).
 
-After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`, like these in
-`model/server.py`). If the message of step 2 is lost, the sweep sends it again (`overdue.py`), and so does the
+After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`). These rules are in
+`model/server.py`. If the message of step 2 is lost, the sweep sends it again (`overdue.py`), and so does the
 participant's next GET (`participants/steps/game.py`).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from hippodrome.model import server
 from hippodrome.model.messages import StartServer, to_message
+from hippodrome.model.project import Project
 from hippodrome.model.server import Server, next_attempt
 from hippodrome.ports import Conflict, Topic
+from hippodrome.servers.services import ServerServices
 from hippodrome.servers.sessions import members_of
-
-if TYPE_CHECKING:  # next_step needs the rules alone, and its zip holds what it imports
-    from hippodrome.model.project import Project
-    from hippodrome.servers.services import ServerServices
-    from hippodrome.storage.repository import Versioned
+from hippodrome.storage.repository import Versioned
 
 
 class Replacement:
@@ -33,7 +29,7 @@ class Replacement:
         self._services = services
 
     def request(self, closed: Server) -> None:
-        """Publish the start message of the next attempt, unless all who play there have finished all game steps."""
+        """Publish the start message of the next attempt, unless all its participants have answered all game steps."""
         following = next_attempt(closed)
         if following is None or self._has_played(closed):
             return
@@ -56,7 +52,7 @@ class Replacement:
         return bool(players) and all(self._has_finished(project, user_id) for user_id in players)
 
     def _players(self, closed: Server) -> list[str]:
-        """The ids of those who play on this server; none if it was started ahead of its session."""
+        """The ids of the participants who play on this server; none if its session is not formed yet."""
         if not closed.is_sessions:
             return [closed.user_id]
         return members_of(self._services.repository, closed.project_id, closed.user_id)

@@ -1,8 +1,8 @@
-"""What exists of the servers: their tasks, DNS records, timers and clusters.
+"""Lists the resources of servers: their tasks, DNS records, timers and clusters.
 
-The sweep and the commands `stop`, `erase` and `destroy` list them here. Each resource carries the name of its server,
-which leads to the record that owns it (`hippodrome.model.server.owner`). List first and read the records afterwards: a
-record is written before its server's resources are created, so no start is missed in between.
+The sweep and the commands `stop`, `erase` and `destroy` use it. Each resource has the name of its server, from which
+the record that owns it is found (`hippodrome.model.server.owner`). Callers must list first and read the records
+afterwards: a record is written before its server's resources are created, so every listed resource has its record.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Resources:
         return bool(self.tasks or self.dns_records or self.timers or self.clusters)
 
     def counts(self) -> dict[str, int]:
-        """How many of each kind were found."""
+        """How many resources of each kind were found, by the kind."""
         return {
             "tasks": len(self.tasks),
             "timers": len(self.timers),
@@ -39,11 +39,11 @@ class Resources:
         }
 
     def kinds(self) -> list[str]:
-        """The kinds of which something was found, in words."""
+        """The kinds of which at least one was found, in the singular."""
         return [kind.removesuffix("s") for kind, number in self.counts().items() if number]
 
     def names(self) -> Iterator[str]:
-        """The names of all these resources. Each may be the name of a server."""
+        """Yield the name of each resource. It may be a server's name."""
         yield from (task.name for task in self.tasks)
         yield from (ids.host_server(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)
@@ -66,7 +66,7 @@ class Resources:
 
 
 def list_resources(platform: Platform) -> Resources:
-    """List all kinds at the same time. Raises what one of the listings raises, since a partial result misleads."""
+    """List the resources of all kinds at the same time. If one listing raises, this raises its error."""
     listings: list[Callable[[], Iterator[Any]]] = [
         platform.tasks.list,
         platform.dns.list,

@@ -1,4 +1,4 @@
-"""What `Start`, `DnsRecords`, `Termination`, `Replacement` and `Sweep` share; they keep nothing themselves."""
+"""The services and caches that `Start`, `DnsRecords`, `Termination`, `Replacement` and `Sweep` share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ServerServices:
         self.slots = Slots(platform)
         self.pools = Pools(platform, self.project_cache)
         self.handovers = Handovers(platform, self.repository, self.slots, self.pools)
-        self.written: dict[tuple[str, int], Versioned] = {}  # records in state `naming`, by label and attempt
+        self.written: dict[tuple[str, int], Versioned] = {}  # the records last written as `naming`, by label, attempt
         self._failures: deque[Cause] = deque()
 
     def failed(self, cause: Cause) -> None:

@@ -1,8 +1,8 @@
-"""The servers of sessions (`project.players`): when a session is over for its members, and what a member's stop means.
+"""Decides when a session (`project.players`) is over, and whether a member's stop message stops its server.
 
-A session owns its server's record, so its server starts, ends and is replaced as others are. A member cannot end it for
-the others: their stop message stops it once all members have reached the stop step. A participant who is no member yet
-leaves the lobby with it.
+A session owns its server's record, so its server starts, ends and is replaced like other servers. A member cannot end
+it for the others: a member's stop message stops it only if all members have reached the stop step. The stop message of
+a participant who is no member yet only makes them leave the lobby.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hippodrome.model.project import Project
 from hippodrome.storage.repository import Repository
 from protocol.session import BadSession, SessionDocument
 
-if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds what it imports
+if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds all modules that it imports
     from hippodrome.servers.services import ServerServices
 
 
@@ -30,13 +30,13 @@ def readable_session(repository: Repository, project_id: str, session_id: str) -
 
 
 def members_of(repository: Repository, project_id: str, session_id: str) -> list[str]:
-    """The ids of those who play in a session; none before it is formed, or if its document cannot be read."""
+    """The ids of the session's members; none before it is formed, or if its document cannot be read."""
     session = readable_session(repository, project_id, session_id)
     return session.user_ids if session else []
 
 
 class Sessions:
-    """Reads the documents that decide about the servers of sessions."""
+    """Reads the documents by which it decides whether servers of sessions are stopped."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -48,10 +48,10 @@ class Sessions:
         return project is not None and project.has_sessions
 
     def stop_of(self, message: StopServer) -> StopServer | None:
-        """The stop of the session's server that a participant's stop message calls for; None if it calls for none.
+        """The stop message for the session's server that follows from a participant's own; None if others still play.
 
-        Their entries in the lobby are deleted, so that no one is matched with them. The message says that its sender
-        has reached the stop step: it is published before the answer that leads there is stored.
+        Deletes the participant's entries in the lobby, so that nobody is matched with them. The participant counts as
+        one who has reached the stop step: the message is published before the answer that leads there is stored.
         """
         project = self._services.project_cache.project(message.project_id)
         if project is None:
@@ -64,7 +64,7 @@ class Sessions:
         return StopServer(project.id, session.id, None, message.reason)
 
     def is_over(self, project: Project, session: SessionDocument, leaves: str = "") -> bool:
-        """Whether all members have reached the stop step. One listing for each member but `leaves`, who has.
+        """Whether all members have reached the stop step. `leaves` is a member who has. One listing for each other one.
 
         False in a project without a stop step: there the trial ends by itself.
         """

@@ -1,16 +1,16 @@
 """`sign_requests`: a server shows its credential and gets presigned requests for its own documents, and no others.
 
-Servers run researchers' code and have no rights on AWS. Here a server asks for access to the bucket: to read the
-certificate, its handover document if it is a warm server, and the recordings of its participant's earlier servers; to
-create the answers of its game steps and its own recordings. The credential is derived from the installation's secret
+Servers run researchers' code and have no rights on AWS. With presigned requests a server may read the certificate, its
+handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create the
+answers of its game steps and its own recordings. The credential is derived from the installation's secret
 (`secret.py`). It is not the token, which the participant's browser knows.
 
-A session's server may read the session's document as well, and create the answers of its members, whom that document
-names; its recordings are the session's. With `matching: match`, as long as it has no members, it may read who waits in
-its project's lobby, and create the groups that the function `match` of agent.py has chosen.
+A session's server may also read the session's document, and create the answers of the members whom that document names.
+Its recordings are the session's. With `matching: match`, as long as it has no members, it may read the question to the
+function `match` of agent.py, and create the document of the answer.
 
-What a server may do follows from its record. After that is closed, the server may still store data for as long as a
-task has to end, so that an answer given before the stop message is not lost.
+A server's rights follow from its record. For some minutes after the record is closed, the server may still store data,
+so that an answer given before the stop message is not lost.
 
     {"server": "s…-1", "credential": "…", "requests": [{"method": "PUT", "key": "…", "size": 9}, …]}
     {"seconds": 60, "requests": [{"method": "PUT", "url": "…", "headers": {…}}, …]}
@@ -52,12 +52,12 @@ from protocol.keys import (
 from protocol.session import is_session_id
 
 VALID_SECONDS = 60  # of a presigned request; S3 checks it when the request begins, and servers send it at once
-STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end once it gets SIGTERM
-MAX_REQUESTS = 20
+STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end after SIGTERM
+MAX_REQUESTS = 20  # in one call
 MAX_BODY = 32 * 1024  # bytes
 MAX_ANSWER = 64 * 1024  # bytes
 MAX_RECORDING = 5 * 1024**3  # bytes; S3 takes no more in one PUT
-MAX_RECORDED = 20 * 1024**3  # bytes of all recordings of one server: what the disk of a Fargate task holds
+MAX_RECORDED = 20 * 1024**3  # bytes of all recordings of one server: the size of a Fargate task's disk
 MAX_RECORDINGS = 2_000  # of one server
 
 _RECORDING = re.compile(r"([A-Za-z0-9_-]{1,64})-(?:trial|episode-[0-9]{4,6})(?:-[1-9][0-9]?)?\.jsonl\.gz")
@@ -75,21 +75,21 @@ class Presigned(NamedTuple):
 
 
 class Signer(Protocol):
-    """Makes presigned requests for single documents, without a call. They have no more rights than the signer.
+    """Makes presigned requests for single documents, without an AWS call. They have no more rights than the signer.
 
-    S3 answers them with 200; 404 if the document does not exist, 412 if it exists already, 409 while another write of
-    it is under way; 403 if the request has expired or differs from the signed one.
+    S3 answers a presigned request with 200; a GET with 404 if the document does not exist; a PUT with 412 if it exists
+    already, and 409 while another write of it is under way; both with 403 if the request has expired or was changed.
     """
 
     def presign_get(self, key: str, seconds: int) -> Presigned:
-        """A GET of the document, valid for so many seconds."""
+        """Return a GET of the document, valid for `seconds`."""
 
     def presign_put(self, key: str, size: int, seconds: int) -> Presigned:
-        """A PUT that creates the document with `size` bytes, valid for so many seconds."""
+        """Return a PUT that creates the document with exactly `size` bytes, valid for `seconds`."""
 
 
 class SigningPlatform(Protocol):
-    """The part of the platform used here. On one machine servers write into the data folder, and nothing is signed."""
+    """The part of the platform that signing needs. On one machine nothing is signed: servers write into its folder."""
 
     @property
     def documents(self) -> Documents: ...
@@ -122,7 +122,7 @@ class SigningRequest(msgspec.Struct, frozen=True):
 
 
 class SigningRefusal(Exception):
-    """An HTTP status and a sentence, which repeats nothing of the request."""
+    """The request is refused with this HTTP status and sentence, which repeats nothing of the request."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -132,11 +132,11 @@ class SigningRefusal(Exception):
 
 @dataclass(frozen=True)
 class ServerAccess:
-    """To whom a server belongs. What it may read and create follows from this alone. Pure.
+    """The owner of a server, and its game steps. The documents that it may read and create follow from these fields.
 
-    `name` is its own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id` and
-    `certificate` are set. `user_id` may be a session's id; then `members` are the ids of those who play there, once the
-    session is formed.
+    `name` is the server's own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id`
+    and `certificate` are set. `user_id` may be a session's id; then `members` are the ids of the session's members,
+    once it is formed. Pure.
     """
 
     name: str
@@ -146,9 +146,9 @@ class ServerAccess:
     attempt: int = 0
     game_steps: Sequence[str] = ()
     closed: datetime | None = None
-    certificate: Sequence[str] = ()  # the keys of its two files
+    certificate: Sequence[str] = ()  # the keys of the certificate's two documents
     members: Sequence[str] = ()
-    may_match: bool = False  # while it has no members
+    may_match: bool = False  # whether it may answer questions to `match` as long as it has no members
 
     @property
     def is_sessions(self) -> bool:
@@ -157,7 +157,7 @@ class ServerAccess:
 
     @property
     def is_unassigned(self) -> bool:
-        """Whether it has no participant yet."""
+        """Whether it is a warm server that is not assigned yet."""
         return not self.user_id
 
     @property
@@ -171,7 +171,7 @@ class ServerAccess:
         return folder(self.project_id, self.user_id)
 
     def is_open(self, now: datetime) -> bool:
-        """Whether it may still get any request signed."""
+        """Whether it may still get any request signed, at this time."""
         return self.closed is None or (not self.is_unassigned and now < self.closed + STORE_AFTER_CLOSE)
 
     def allows(self, wanted: DocumentRequest) -> bool:
@@ -197,7 +197,7 @@ class ServerAccess:
         return self.may_match and self.is_sessions and not self.members and self.closed is None
 
     def _is_groups(self, key: str) -> bool:
-        """Whether it is an answer of the function `match`, which a server without members asks."""
+        """Whether the key is that of an answer of the function `match`, and this server may write one."""
         question = key.removeprefix(groups_folder(self.project_id)).removesuffix(".json")
         is_key = QUESTION_ID.fullmatch(question) is not None and key == groups_key(self.project_id, question)
         return self._is_asked_to_match and is_key
@@ -216,7 +216,7 @@ class ServerAccess:
         return any(key == answer_key(self.project_id, user, step) for user in players for step in self.game_steps)
 
     def _is_earlier(self, key: str) -> bool:
-        """Whether it is a recording of one of the participant's or the session's servers before this one."""
+        """Whether the key is that of a recording of an earlier server of the same participant or session."""
         if not key.startswith(self._recordings):
             return False
         name, _, file = key.removeprefix(self._recordings).partition("/")
@@ -229,7 +229,7 @@ class ServerAccess:
 
 
 def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAccess | None:
-    """The access of the server of this name by its participant's record; None if the record never had that server."""
+    """The access of the server of this name, from its owner's record; None if the record has no such server."""
     common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
     for run in (server.past_attempt(record), *record.earlier):
         if (run.warm_server_name or ids.server_name(record.label, run.attempt)) == name:
@@ -260,9 +260,10 @@ class Signing:
         self._secrets = SecretCache(platform.documents)
 
     def respond(self, request: Request) -> Response:
-        """One read of the record, two for an assigned warm server; for a session's, one of the session's document.
+        """Respond to one HTTP request with presigned requests, or with a status and a sentence.
 
-        And one listing if a recording is announced.
+        One read of the server's record, two for an assigned warm server; one of the session's document, if it is a
+        session's; one listing, if the server wants to create a recording.
         """
         try:
             asked = _read(request)
@@ -274,7 +275,7 @@ class Signing:
         return _json(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
-        """The access of the server that shows this credential. Raises the same `SigningRefusal` for any error."""
+        """The access of the server with this credential. Raises the same `SigningRefusal` for any mistake."""
         refused = SigningRefusal(403, "That is not the credential of a server that may store anything now.")
         label, attempt = ids.parse_server_name(asked.server) or ("", 0)
         secret = self._secrets.find() if label else None

@@ -1,7 +1,7 @@
-"""What `start_server` does: create the record, take a slot if the project has limits, set the timer, run the task.
+"""`start_server`: creates the server's record, takes a slot if the project has limits, sets the timer, runs the task.
 
 With `warmServers` a participant or a session is assigned a warm server instead, if one is ready. In a project with
-sessions the message of a participant starts no server of their own: the lobby is told that they are under way.
+sessions a participant's message starts no server of their own: it tells the lobby that they are under way.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from protocol.session import is_session_id
 
 
 class Start:
-    """Starts servers."""
+    """Handles the messages of the start topic."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -40,17 +40,17 @@ class Start:
         self._repository = services.repository
 
     def handle(self, message: StartServer | KeepWarm) -> None:
-        """Run the requested server, once, however often the message is delivered; or adjust a pool of warm servers."""
+        """Start the requested server, only once even if the message comes again; or adjust a pool of warm servers."""
         if isinstance(message, KeepWarm):
             self._services.pools.adjust(message.keep_warm)
         else:
             self._handle_start(message)
 
     def _handle_start(self, message: StartServer) -> None:
-        # A warm server must run what is registered now; the registration may be seconds old.
+        # A warm server must run the present registration, which may be newer than the cached list.
         fresh = timedelta(0) if ids.is_warm_id(message.user_id) else FRESH
         of_session = is_session_id(message.user_id)
-        fits = _has_sessions if of_session else None
+        fits = (lambda listed: listed.has_sessions) if of_session else None
         project = self._services.project_cache.live_project(message.project_id, fresh, fits=fits)
         if project is None or (of_session and not project.has_sessions):
             self._cancel_start(message)
@@ -63,7 +63,7 @@ class Start:
             project = before
         if of_session:
             project = self._for_session(project, message)
-        self._services.secrets.get_or_create()  # creates it, if there is none, before anything is written that needs it
+        self._services.secrets.get_or_create()  # the secret must exist before anything is written that needs it
         stored = self._create_or_find(project, message)
         if stored is None:
             return
@@ -76,9 +76,9 @@ class Start:
             self._start(project, own)
 
     def _for_session(self, project: Project, message: StartServer) -> Project:
-        """The project as this session runs it, also if another number of players is registered since.
+        """The project as it was registered last for this session's number of players.
 
-        A read of its record if the message does not say for how many it is, as those of replacements.
+        One read of the session's server record if the message does not say the number, as messages of replacements.
         """
         players = message.players
         if not players:
@@ -91,7 +91,7 @@ class Start:
         return found or project
 
     def _cancel_start(self, message: StartServer) -> None:
-        """The project is closed, or has no sessions any more: start nothing, and stop what was already started."""
+        """Start nothing: the project is closed, or has no sessions any more. If the server was started, stop it."""
         logger.warning("start for a project that is not live or has no sessions: dropped")
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING:
@@ -99,9 +99,9 @@ class Start:
             self._platform.bus.publish(Topic.STOP, to_message(stop))
 
     def _assign_warm_server(self, project: Project, stored: Versioned) -> Versioned | None:
-        """Assign a warm server and return None. If there is none, return the record of the server to start.
+        """Assign a warm server and return None; if none is ready, return the record of the server to start.
 
-        Warm servers run on Spot. After two Spot losses a participant's server starts on demand instead.
+        Warm servers run on Spot. After two losses on Spot a participant's server starts on demand instead.
         """
         record = stored.server
         warm = project.warm_servers and record.spot and not record.is_warm_server
@@ -118,7 +118,7 @@ class Start:
     def _start(self, project: Project, stored: Versioned) -> None:
         """Set the timer and run the task. If the task can never run, close the record."""
         record = stored.server
-        # The timer comes first: whatever happens from here on, nothing outlives its deadline.
+        # The timer comes first, so that no resource outlives the deadline even if this function is interrupted.
         stop = StopServer(record.project_id, record.user_id, record.attempt, Reason.DEADLINE)
         self._platform.timers.set(record.name, record.deadline, to_message(stop))
         try:
@@ -136,7 +136,7 @@ class Start:
         logger.info("server starting", extra={"server": record.name})
 
     def _create_or_find(self, project: Project, message: StartServer) -> Versioned | None:
-        """Create or find the record of the attempt to start; None if there is nothing (more) to start."""
+        """Create or find the record of the attempt to start; None if there is nothing to start, or nothing more."""
         new = self._new_record(project, message.user_id, message.attempt)
         try:
             if message.attempt > 1:
@@ -152,7 +152,7 @@ class Start:
         return stored if unfinished else None
 
     def _close_as_full(self, stored: Versioned) -> None:
-        """The project's limits are reached: close the record with the reason `full`, which the waiting page shows."""
+        """Close the record with the reason `full`, which the waiting page shows, because the limits are reached."""
         record, now = stored.server, self._platform.now()
         self._repository.update(stored, lambda r: server.close(r, Reason.FULL, now) if r.owns(record.name) else None)
         if record.is_warm_server:
@@ -213,7 +213,7 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
 
 
 def _own_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """For whom the server is, and when it ends."""
+    """The variables that name the server's owner and deadline."""
     if record.is_warm_server:
         return _warm_environment(project, record, settings)
     deadline = {environment.DEADLINE: str(int(record.deadline.timestamp()))}
@@ -224,19 +224,16 @@ def _own_environment(project: Project, record: Server, settings: Settings) -> di
 
 
 def _plain_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """The front end that needs no token, if the project and the installation want that; never for a warm server."""
+    """The origins of the front end that needs no token, if project and installation allow one; none if warm."""
     allowed = project.plain_clients and settings.plain_clients and not record.is_warm_server
     return {environment.PLAIN_ORIGINS: " ".join(project.front_end)} if allowed and project.front_end else {}
 
 
 def _warm_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """Without a participant. The deadline leaves one who is assigned at the last moment all of maxRuntime.
+    """The variables of a server without an owner.
 
-    It leaves a session the time to wait for its members as well.
+    The deadline leaves all of maxRuntime to a participant who gets the server at the last moment, and to a session the
+    time to wait for its members as well.
     """
     last = record.deadline + lifetime_asked_for(project, settings)
     return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}
-
-
-def _has_sessions(project: Project) -> bool:
-    return project.has_sessions

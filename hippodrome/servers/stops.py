@@ -1,8 +1,8 @@
-"""The messages of the stop topic: for a server, or for all servers of a participant, as HIPPO's messages are.
+"""Handles the messages of the stop topic: for one server, or, as HIPPO sends them, for all servers of a participant.
 
-Whoever may publish to the stop topic may stop any server of the installation, so a message without a project is for all
-its projects. Servers are found by their labels, so this takes a read of the master list, and one of a record for each
-project. A participant's message does not stop the server of a session that others still play on (`sessions.py`).
+A principal that may publish to the stop topic may stop any server of the installation. So a message without a project
+is for all projects. It costs a read of the master list, and for each project a read of one record. A participant's
+message does not stop the server of a session on which others still play (`sessions.py`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from hippodrome.servers.services import ServerServices
 from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 
-MOST_READS = 2_000  # of records in one call, but at least one message is handled; the others come again
+MOST_READS = 2_000  # of records in one invocation, in which at least one message is handled; the others come again
 
 
 class Stops:
-    """What `stop_server` does."""
+    """Handles the messages of `stop_server`."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -41,7 +41,7 @@ class Stops:
             return []
         try:
             projects = self._services.project_cache.ids()
-        except Exception as error:  # noqa: BLE001 - the messages of single servers need no list, and count as handled
+        except Exception as error:  # noqa: BLE001 - the messages for single servers need no list, and are handled
             failure("the list of projects cannot be read", error)
             return list(batch)
         wanted = list(dict.fromkeys(batch))

@@ -1,9 +1,9 @@
-"""`sweep`: delete the resources that no open record owns, and send lost messages again.
+"""`sweep`: deletes the resources that no open record owns, and sends lost messages again.
 
 Resources are listed first and records read afterwards. A record is written before its server's resources are created,
-so a listed resource whose record is closed is a leftover: there is no race, and no age to guess. Three kinds stay:
-those of a server that was closed since the sweep began (the function that closed it deletes them), those whose name is
-no server's name, and those without a record in our bucket (they may be another installation's).
+so a listed resource whose record is closed is a leftover: there is no race, and no need to guess by its age. Resources
+of three kinds stay: those of a server that was closed since the sweep began (the function that closed it deletes them),
+those whose name is no server's name, and those without a record in our bucket (they may be another installation's).
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ T = TypeVar("T")
 
 @dataclass
 class SweepResult:
-    """What one sweep did."""
+    """What one sweep did, counted."""
 
-    tasks: int = 0
-    names: int = 0
+    tasks: int = 0  # resources removed, from here to `clusters`
+    names: int = 0  # DNS records
     timers: int = 0
     clusters: int = 0
-    slots: int = 0
-    warm_servers: int = 0
-    sessions: int = 0  # servers of sessions that no members are matched to, or that all members have left
-    handovers: int = 0
-    overdue: int = 0
-    lost: int = 0
+    slots: int = 0  # slots released that ended servers still held
+    warm_servers: int = 0  # stopped because no pool lists them
+    sessions: int = 0  # stopped servers of sessions that were never formed, or that all members have left
+    handovers: int = 0  # handover documents deleted
+    overdue: int = 0  # servers stopped after their deadline
+    lost: int = 0  # servers cleaned up that had lost their task
     asked: int = 0  # servers for which a message was sent again
-    failed: int = 0
+    failed: int = 0  # actions that failed
 
 
 @dataclass(frozen=True)
 class RunningServers:
-    """This installation's servers that ran when a sweep began."""
+    """The number of this installation's servers that ran when a sweep began, and the age of the oldest."""
 
     count: int = 0
-    oldest: timedelta = timedelta()  # since it was requested
+    oldest: timedelta = timedelta()  # since that server was requested
 
 
 class Sweep:
@@ -77,15 +77,15 @@ class Sweep:
         self._pools = services.pools
         self._lobby = services.lobby
         self._sessions = Sessions(services)
-        self._owners: dict[str, Versioned] = {}  # by resource name
-        self._other_records: list[Versioned] = []  # records that no resource led to
-        self._unread: set[str] = set()  # names
+        self._owners: dict[str, Versioned] = {}  # the records that own resources, by the resources' names
+        self._other_records: list[Versioned] = []  # records of servers without a listed resource
+        self._unread: set[str] = set()  # the names of resources whose records could not be read
         self._result = SweepResult()
         self._begun = platform.now()
         self.running = RunningServers()
 
     def run(self) -> SweepResult:
-        """Remove every leftover; return what was done. A failure is counted, and the sweep goes on."""
+        """Run the sweep; return the counts. A failure is counted, and the sweep goes on."""
         platform = self._platform
         found = resources.list_resources(platform)
         slots, handovers = self._slots_and_handovers()
@@ -107,9 +107,9 @@ class Sweep:
         for project_id, running in slots.items():
             read = [name for name in running.names if name not in self._unread]
             ended = [name for name in read if leftovers.why_slot_left_over(name, owners.get(name), now)]
-            gone = {name: self._record_of(name) for name in ended}
-            if gone:
-                self._try("slots", partial(self._slots.release_forgotten, project_id, gone), len(gone))
+            forgotten = {name: self._record_of(name) for name in ended}
+            if forgotten:
+                self._try("slots", partial(self._slots.release_forgotten, project_id, forgotten), len(forgotten))
         self._check_states({task.name: task for task in found.tasks})
         self._repair_pools()
         self._stop_sessions(self._repair_lobbies())
@@ -117,7 +117,7 @@ class Sweep:
         return self._result
 
     def _slots_and_handovers(self) -> tuple[dict[str, ServerSlots], list[tuple[str, str]]]:
-        """By project, the servers that hold slots; and (project, name) of each handover document.
+        """The slots of servers, by project; and the project and the server's name of each handover document.
 
         Both are empty if the list of projects cannot be read.
         """
@@ -131,23 +131,23 @@ class Sweep:
             return {}, []
 
     def _running_servers(self, tasks: Iterable[RunningTask]) -> RunningServers:
-        """Count the running servers. If a task is of an earlier attempt than its record, its age is a lower bound."""
+        """Count the running servers. If a record is at a later attempt than its task, the age is a lower bound."""
         now = self._platform.now()
         ages = [now - owner.server.requested for task in tasks if (owner := self._owners.get(task.name))]
         return RunningServers(len(ages), max(ages, default=timedelta()))
 
     def _read_owners(self, names: Iterable[str]) -> None:
-        """Read the records that own these names, many at once. What cannot be read counts as not ours, this time."""
+        """Read the records that own these names, many at once. If one cannot be read, its resource stays this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
         found, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
         self._owners, self._unread = dict(found), set(unread)
         self._result.failed += len(unread)
 
     def _read_other_records(self) -> None:
-        """Read records that no resource leads to: a server may have none yet, or none any more.
+        """Read records of servers without a listed resource: a server may have none yet, or none any more.
 
-        A record written some minutes ago may be of a server that makes no progress; one older than any server may live,
-        of a server that was never closed. Each record is read by a few sweeps only, however many there are.
+        If a record was written some minutes ago, its server may make no progress. If it is older than any server may
+        live, its server may never have been closed. Only a few sweeps read each record, even if there are many.
         """
         ages = (RETRY_AFTER, timedelta(minutes=self._platform.settings.max_runtime) + OVERDUE_AFTER)
         known = {stored.server.label for stored in self._owners.values()}
@@ -176,24 +176,24 @@ class Sweep:
         for stored in self._records():
             record = stored.server
             task = tasks.get(record.name)
-            what = remedy(record, task, now)
-            if what is Remedy.LOST:
+            chosen = remedy(record, task, now)
+            if chosen is Remedy.LOST:
                 self._try("lost", partial(self._end_lost, stored, task))
-            elif what is Remedy.OVERDUE:
+            elif chosen is Remedy.OVERDUE:
                 self._try("overdue", partial(self._send_stop, record, Reason.DEADLINE))
-            elif what:
-                logger.warning("a server's message is sent again", extra={"server": record.name, "what": what})
-                self._try("asked", partial(self._send_again, what, record, task))
+            elif chosen:
+                logger.warning("a server's message is sent again", extra={"server": record.name, "what": chosen})
+                self._try("asked", partial(self._send_again, chosen, record, task))
 
     def _end_lost(self, stored: Versioned, task: RunningTask | None) -> None:
         if task:
             self._stop(task)
         self._termination.clean_up_lost(stored, Reason.LOST, Cause.VANISHED)
 
-    def _send_again(self, what: Remedy, record: Server, task: RunningTask | None) -> None:
+    def _send_again(self, chosen: Remedy, record: Server, task: RunningTask | None) -> None:
         """Send the message for this server's next state again. The receiver checks whether it still applies."""
         bus = self._platform.bus
-        match what:
+        match chosen:
             case Remedy.START:
                 start = StartServer(record.project_id, record.user_id, record.attempt)
                 bus.publish(Topic.START, to_message(start))
@@ -221,16 +221,15 @@ class Sweep:
             self._result.failed += 1
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
-            if (
-                record.user_id not in known and record.state is not ServerState.DRAINING
-            ):  # which was sent a stop message already
+            is_stopped = record.state is ServerState.DRAINING  # `_check_states` has sent it a stop message
+            if record.user_id not in known and not is_stopped:
                 self._try("warm_servers", partial(self._send_stop, record, Reason.STOPPED))
 
     def _stop_sessions(self, listed: Mapping[str, Collection[str] | None]) -> None:
-        """Stop the servers of sessions that are not needed. `listed` is what the lobbies list, read after the records.
+        """Stop the servers of sessions that are not needed. `listed`: each lobby's sessions, read after the records.
 
-        A session is in its lobby before its server has a record, and leaves it when its document is written, or when
-        its server is not needed any more.
+        A session is in its lobby before its server has a record. It leaves the lobby when its document is written, or
+        when its server is not needed any more.
         """
         running = [stored.server for stored in self._open() if stored.server.is_sessions]
         unlisted = [
@@ -244,10 +243,7 @@ class Sweep:
         self._add("sessions", len(stopped), len(failed))
 
     def _repair_lobbies(self) -> dict[str, Collection[str] | None]:
-        """Finish what interrupted runs of lobbies have left.
-
-        Return, by project, the sessions that its lobby lists; None if that is not known.
-        """
+        """Repair the lobbies; return, by project, the ids of the sessions in its lobby, or None if unknown."""
         listed: dict[str, Collection[str] | None] = {}
         for project in self._projects_with_sessions():
             try:
@@ -279,7 +275,7 @@ class Sweep:
         return True
 
     def _records(self) -> list[Versioned]:
-        """Every record that was read, once. An assigned warm server is left out: its participant's record owns it."""
+        """Every record that was read, once; without assigned warm servers, which their participants' records own."""
         found = [stored for stored in self._other_records if stored.server.assigned_to is None]
         return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
 
@@ -287,18 +283,21 @@ class Sweep:
         """The records that are not closed."""
         return [stored for stored in self._records() if not stored.server.is_closed]
 
-    def _remove(self, what: str, resources: Iterable[T], act: Callable[[T], object]) -> None:
-        """Remove all these resources, many at once. If one cannot be removed, the next sweep tries again."""
+    def _remove(self, count: str, resources: Iterable[T], act: Callable[[T], object]) -> None:
+        """Call `act` to remove each of these resources, many at once. What fails is tried again by the next sweep.
+
+        `count` is the name of the count in `SweepResult`.
+        """
 
         def one(resource: T) -> bool:
             act(resource)
             return True
 
-        removed, failed = for_each(self._platform, resources, one, f"a leftover could not be removed: {what}")
-        self._add(what, len(removed), len(failed))
+        removed, failed = for_each(self._platform, resources, one, f"a leftover could not be removed: {count}")
+        self._add(count, len(removed), len(failed))
 
     def _end_timer(self, timer: str) -> None:
-        """Delete a timer. It is the last resource of a server to go: what precedes it may have been interrupted too."""
+        """Delete a server's timer. Since it is deleted last, repeat `after_close`, which may have been interrupted."""
         stored = self._owners.get(timer)
         if stored and stored.server.name == timer:
             self._termination.after_close(stored.server)
@@ -306,23 +305,23 @@ class Sweep:
             self._platform.timers.cancel(timer)
 
     def _send_stop(self, record: Server, reason: Reason) -> None:
-        """Send a stop message. It is delivered until all is done; a later sweep might not see a half-ended server."""
+        """Send a stop message, which comes again until the stop is complete: a later sweep might miss such a server."""
         message = StopServer(record.project_id, record.user_id, record.attempt, reason)
         self._platform.bus.publish(Topic.STOP, to_message(message))
 
     def _stop(self, task: RunningTask) -> None:
         self._platform.tasks.stop(task.task, task.cluster, f"{messages.STOP_REASON_PREFIX} left over")
 
-    def _try(self, what: str, act: Callable[[], object], count: int = 1) -> None:
-        """Call `act` and count the result: under `what`, or as failed."""
+    def _try(self, count: str, act: Callable[[], object], number: int = 1) -> None:
+        """Call `act`, which handles `number` servers or resources. Add the number to this count, or to `failed`."""
         try:
             act()
         except Exception as error:  # noqa: BLE001 - the rest of the sweep goes on, and the next sweep tries again
-            failure("a leftover could not be removed", error, what=what)
-            self._add(what, failed=count)
+            failure("a leftover could not be removed", error, what=count)
+            self._add(count, failed=number)
         else:
-            self._add(what, count)
+            self._add(count, number)
 
-    def _add(self, what: str, done: int = 0, failed: int = 0) -> None:
-        setattr(self._result, what, getattr(self._result, what) + done)
+    def _add(self, count: str, done: int = 0, failed: int = 0) -> None:
+        setattr(self._result, count, getattr(self._result, count) + done)
         self._result.failed += failed

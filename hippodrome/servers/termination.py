@@ -1,13 +1,13 @@
-"""How servers end: what `stop_server` does, and `task_changed` for tasks that have ended.
+"""Ends servers: `stop_server` stops them, and `task_changed` cleans up after tasks that have ended.
 
 A server's resources are deleted before its record is closed, so an interrupted termination is repeated. If the server
-ended by itself, two things come later. Its timer is deleted after the closing and what follows from it (`after_close`):
-if that is interrupted, the timer leads the next sweep to it. Its own cluster is deleted once ECS reports STOPPED.
+ended by itself, two resources are deleted later. Its timer is deleted last (`after_close`): if that is interrupted, the
+next sweep finds the timer and repeats it. A cluster of its own is deleted once ECS reports STOPPED.
 
 ECS reports the end of a task twice: when its containers have ended (DEPROVISIONING), and, ten to thirty seconds or more
-later, when its network interface is gone as well (STOPPED). The first event is enough, so that a participant gets the
-next server sooner after a Spot interruption; only a server's own cluster has to wait for the second. Spot's warning two
-minutes ahead is too early: until its end the trial stores the state from which the next server resumes.
+later, when its network interface is deleted as well (STOPPED). The first event is enough, so that a participant gets
+the next server sooner after a Spot interruption; only a server's own cluster has to wait for the second. Spot's warning
+two minutes ahead is too early: until its end the trial stores the state from which the next server resumes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hippodrome.servers.sessions import Sessions
 from hippodrome.storage.errors import RetryLater
 from hippodrome.storage.repository import Versioned
 
-I = TypeVar("I")  # noqa: E741 - the item that a server was found by: a message or an event
+I = TypeVar("I")  # noqa: E741 - the item that led to a server: a message or an event
 ENDED = ("DEPROVISIONING", "STOPPED")  # states in which a task's containers have ended
 STOP_TRIES = 4  # a start writes a record three times (task, address, DNS record); then the queue delivers again
 
@@ -42,11 +42,11 @@ class ServerToClose(NamedTuple):
     stored: Versioned
     reason: Reason
     cause: Cause | None = None  # if it failed
-    deprovisioning: bool = False  # ECS is ending its task (DEPROVISIONING): a cluster of its own cannot be deleted yet
+    deprovisioning: bool = False  # its task is still DEPROVISIONING, so a cluster of its own cannot be deleted yet
 
 
 class Termination:
-    """Ends servers, many with one DNS change."""
+    """Ends servers: many of them with one DNS change."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -54,7 +54,7 @@ class Termination:
         self._repository = services.repository
         self._sessions = Sessions(services)
 
-    # Told to stop
+    # Servers that are told to stop
 
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
         """Stop servers; return the messages that should be delivered again.
@@ -71,10 +71,10 @@ class Termination:
         return again + changed
 
     def _stop_once(self, wanted: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
-        """Stop servers; return the messages that failed, and those whose server's record changed at the same time.
+        """Stop servers; return the messages that failed, and those whose server's record was changed at the same time.
 
-        The latter are repeated at once and from the beginning: the change may have brought a task or an address. The
-        queue would deliver them again only after its visibility timeout.
+        The caller repeats the latter from the beginning: the change may have added a task or an address. The queue
+        would deliver them again only after its visibility timeout.
         """
         found, again = for_each(self._platform, wanted, self._stop_task, "a server is not stopped yet")
         closing = _each_once(found)
@@ -100,10 +100,10 @@ class Termination:
         return ServerToClose(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
 
     def _record_to_stop(self, message: StopServer) -> Versioned | None:
-        """The record of the server to stop; None if it is closed. If there is no record, create a tombstone.
+        """The record of the server to stop; None if it is closed. If there is no record, create a closed one.
 
-        In a project with sessions participants have no record, or one of before it had sessions. Their message may be
-        for their session's server.
+        A start message that comes later finds the closed record. In a project with sessions, participants have no
+        record, or one from before it had sessions; their message may be for their session's server.
         """
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored is not None and stored.server.is_open(message.attempt or stored.server.attempt):
@@ -124,15 +124,15 @@ class Termination:
         return None
 
     def _drain(self, stored: Versioned) -> Versioned | None:
-        """Write `draining`, so that the warm server cannot be assigned any more; None if it is assigned or closed."""
+        """Drain a warm server, so that it cannot be assigned any more; None if it is assigned or closed already."""
         if stored.server.state is ServerState.DRAINING:
             return stored
         return self._repository.update(stored, lambda r: None if r.is_closed else server.draining(r))
 
     def _close_stopped(self, closing: ServerToClose) -> bool:
-        """Close the record of a server whose task is stopped; False if it has changed since it was read and is open.
+        """Close the record of a server whose task is stopped; False if the record was changed meanwhile and is open.
 
-        The timer is deleted last: if this is interrupted and not repeated, the timer leads to the record.
+        The timer is deleted last: if this is interrupted and not repeated, the sweep finds the record by the timer.
         """
         record = closing.stored.server
         if record.has_own_cluster:
@@ -151,10 +151,10 @@ class Termination:
             self._platform.timers.cancel(record.name)
         return True
 
-    # Ended without our asking
+    # Servers that ended by themselves
 
     def tasks_ended(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Clean up after tasks that we did not stop, and replace lost servers; return the events to deliver again."""
+        """Clean up after tasks that ended by themselves; replace lost servers; return the events to deliver again."""
         closing, again = for_each(
             self._platform, events, self._ended_server, "an ended task is not handled yet", lambda event: event.name
         )
@@ -195,7 +195,7 @@ class Termination:
         if over and not deprovisioning and event.cluster == event.name:
             self._platform.tasks.delete_cluster(event.cluster)  # which had to wait for STOPPED
         if record.name != event.name or record.task not in (None, event.task):
-            return None  # of an earlier attempt, or the unwanted one of two tasks for one server
+            return None  # the task is an earlier attempt's, or the unwanted one of two tasks for one server
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
         reason = server.reason_for(ended)
         cause = (
@@ -209,7 +209,7 @@ class Termination:
     def _free_slots(self, closing: Sequence[tuple[I, ServerToClose]]) -> tuple[list[tuple[I, ServerToClose]], list[I]]:
         """Free the slots that these servers hold, with one write per project. A replaced server's slot is kept.
 
-        Returns the servers that may be closed now, and the items that should come again because the write failed.
+        Return the servers that may be closed now, and the items to deliver again because the write failed.
         """
         projects: dict[str, list[Release]] = {}
         for _, one in closing:
@@ -230,10 +230,10 @@ class Termination:
     def _close_ended(self, closing: ServerToClose) -> None:
         """Delete the server's cluster and pool entry, close its record, then call `after_close`.
 
-        The timer is deleted last: if this is interrupted, the timer leads the next sweep to `after_close`.
+        The timer is deleted last: if this is interrupted, the next sweep finds the timer and calls `after_close`.
         """
         record = closing.stored.server
-        if record.is_closed:  # what follows may have been interrupted
+        if record.is_closed:  # an earlier `after_close` may have been interrupted
             self.after_close(record)
             return
         if record.has_own_cluster and not closing.deprovisioning:
@@ -252,7 +252,7 @@ class Termination:
         self.after_close(closed.server if closed else record)
 
     def after_close(self, closed: Server) -> None:
-        """Do what follows the closing of a record: request the next attempt if needed, then delete the timer."""
+        """Request the next attempt of a closed server, or refill the pool of a warm one; then delete the timer."""
         if closed.is_warm_server:
             self._refill_pool(closed)
         else:
@@ -262,16 +262,16 @@ class Termination:
     # Warm servers
 
     def _leave_pool(self, record: Server) -> None:
-        """Remove a warm server from its pool, or release the one that was assigned; before the record is closed."""
+        """Before its record is closed, remove a warm server from its pool, or release an assigned one's handover."""
         if record.is_warm_server:
             self._services.pools.remove(record.project_id, record.user_id)
         else:
             self._services.handovers.release(record)
 
     def _refill_pool(self, closed: Server) -> None:
-        """Replace a warm server at once if its wait is over, if AWS took it back, or if stopping it freed a slot.
+        """Replace a warm server at once if its deadline is over, if AWS took it back, or if stopping it freed a slot.
 
-        The next sweep replaces all others, so that a failing program does not start again and again.
+        In all other cases the next sweep replaces it, so that a failing program does not start again and again.
         """
         if not closed.is_warm_server:
             return
@@ -283,7 +283,7 @@ class Termination:
 
 
 def _each_once(found: Sequence[tuple[StopServer, ServerToClose]]) -> list[tuple[StopServer, ServerToClose]]:
-    """Each server once: the messages of several members may be for the server of their session."""
+    """The list with each server once: several members' messages may be for the server of their session."""
     return list({one.stored.server.name: (message, one) for message, one in reversed(found)}.values())[::-1]
 
 

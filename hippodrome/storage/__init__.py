@@ -1,1 +1,1 @@
-"""Records in documents: the repository, the cache of projects, compare-and-swap, and the installation's secret."""
+"""Stores records in documents: the repository, the cache of projects, compare-and-swap, the installation's secret."""

@@ -1,4 +1,4 @@
-"""Documents that several functions change at once: read, change, write conditionally, and retry on a conflict."""
+"""Changes documents that several functions change at once: read, change, write conditionally; retry on a conflict."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Conflict, Documents
 from hippodrome.storage.errors import RetryLater
 
-TRIES = 40  # for a change: twenty functions may start servers of one project at once
+TRIES = 40  # for one change: twenty functions may start servers of one project at once
 
 R = TypeVar("R", bound=Record)
 
@@ -39,9 +39,9 @@ class SharedDocuments:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
         If `change` returns an equal record, nothing is written: one call instead of two. Raises `RetryLater` after
-        `TRIES` conflicts, and ValueError or RecursionError if the document holds no such record; nothing is written
-        then. With `renew`, such a document is replaced by the change of an empty record, or of `anew`: for what can be
-        rebuilt.
+        `TRIES` conflicts. If the document holds no such record, raises ValueError or RecursionError and writes nothing.
+        With `renew`, which is for data that can be rebuilt, `change` is applied to an empty record then, or to `anew`,
+        and the result replaces the document.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
@@ -65,4 +65,4 @@ class SharedDocuments:
             except Conflict:
                 continue
             return Changed(before, after)
-        raise RetryLater("it keeps changing")
+        raise RetryLater("the document keeps changing")

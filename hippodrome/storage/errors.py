@@ -1,9 +1,9 @@
-"""What storage raises."""
+"""The exception `RetryLater` of storage and the services."""
 
 from __future__ import annotations
 
 
 class RetryLater(Exception):
-    """Not possible yet: the queue should deliver the message again."""
+    """The message cannot be handled now. The queue should deliver it again."""
 
     expected = True  # logged as information, see `log.failure`

@@ -1,4 +1,4 @@
-"""A small cache of projects and step pages. After some seconds it reads a document again, by its ETag."""
+"""Caches projects and step pages. When a cached document is too old, it is read again, by its ETag."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hippodrome.ports import Document, Platform
 if TYPE_CHECKING:
     from hippodrome.storage.secret import SecretCache
 
-FRESH = timedelta(seconds=10)  # a changed master list is seen after at most this time
-PAGE_FRESH = timedelta(minutes=5)  # a changed page is seen by then; at once if the project is registered again
-MAX_DOCUMENTS = 200  # in the cache
+FRESH = timedelta(seconds=10)  # the age at which the cached master list is read again
+PAGE_FRESH = timedelta(minutes=5)  # the same of a page; a registration of its project makes it too old at once
+MAX_DOCUMENTS = 200  # if the cache has so many, it is emptied
 
 
 class _Cached(NamedTuple):
@@ -28,19 +28,19 @@ class ProjectCache:
     """The cache of one running function, which all its requests share."""
 
     def __init__(self, platform: Platform, secrets: SecretCache | None = None) -> None:
-        """If `secrets` is given, projects have their secret."""
+        """With `secrets`, the methods that return one project fill in its secret."""
         self._platform = platform
         self._secrets = secrets
         self._cached: dict[str, _Cached] = {}
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
-        """The registered project, live or not, at most `fresh` old; None if none of that id can be read."""
+        """The registered project, live or not, from a list at most `fresh` old; None if it has no readable entry."""
         found = self._list(fresh).find(project_id)
         return self._secrets.with_secret(found) if found and self._secrets else found
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
-        """All registered projects, without their secrets, at most `fresh` old."""
+        """All registered projects, without their secrets, from a list at most `fresh` old."""
         return self._list(fresh).projects
 
     def ids(self) -> list[str]:
@@ -52,7 +52,7 @@ class ProjectCache:
         found = self.document(MASTER_LIST, fresh)
         if found is None:
             return MasterList()
-        parsed = self._parsed  # another thread may keep another list meanwhile
+        parsed = self._parsed  # read once: another thread may replace it
         if parsed is None or parsed[0] != found.etag:
             listed = read_list(found.body)
             for entry in listed.unreadable:
@@ -67,10 +67,10 @@ class ProjectCache:
     def live_project(
         self, project_id: str, fresh: timedelta = FRESH, *, fits: Callable[[Project], object] | None = None
     ) -> Project | None:
-        """The project, at most `fresh` old, if it is live; else None.
+        """The project, from a list at most `fresh` old, if it is live; else None.
 
-        `fits` tells whether a message or a request can be about the project as it is listed. If not, the list may be
-        older than the message: it is read again, and the project is returned as it is then, whether it fits or not.
+        `fits` says whether a message or a request can belong to the project as it is listed. If not, the cached list
+        may be older than the message: then it is read again, and the project is returned even if it does not fit.
         """
         project = self.project(project_id, fresh)
         if fits and not (project and project.live and fits(project)):
@@ -83,7 +83,7 @@ class ProjectCache:
         return None if found is None else found.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
-        """A document, at most `fresh` old and read for this version of its project; None if it is missing."""
+        """The document, at most `fresh` old and read for this version of its project; None if it is missing."""
         now = self._platform.now()
         kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:

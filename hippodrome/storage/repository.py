@@ -1,4 +1,4 @@
-"""The records of participants and of their servers, in documents (answers: `participants/answers.py`)."""
+"""Reads and writes the records of participants, sessions and servers (answers: `participants/answers.py`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from protocol import session
 from protocol.keys import membership_key, participant_folder, session_key
 from protocol.session import SessionDocument
 
-TRIES = 8  # for a change; then the queue delivers the message again
+TRIES = 8  # for one change; after that the queue delivers the message again
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Versioned:
 
 
 class Repository:
-    """Typed reads and writes over the documents port. A method is one call unless its docstring says otherwise."""
+    """Typed reads and writes over the documents port. A method makes one call unless its docstring says otherwise."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -52,7 +52,7 @@ class Repository:
             return None
 
     def create_participant(self, record: Participant) -> bool:
-        """Write the record of a first visit; return False if there is one already."""
+        """Write the record of a participant's first visit; return False if there is one already."""
         try:
             self._documents.create(participant.participant_key(record.project_id, record.user_id), to_json(record))
         except Conflict:
@@ -62,7 +62,7 @@ class Repository:
     # Sessions (`project.players`)
 
     def membership(self, project_id: str, user_id: str) -> Membership | None:
-        """In which session a participant plays, or that they are unmatched; None as long as neither is decided.
+        """The participant's membership; None as long as it is not decided whether they play or are unmatched.
 
         Raises ValueError or RecursionError if the document cannot be read.
         """
@@ -70,9 +70,9 @@ class Repository:
         return memberships.read(found.body) if found else None
 
     def session_id(self, project: Project, user_id: str) -> str | None:
-        """The id of the session that the participant is a member of; None if there is none. Errors as in `membership`.
+        """The id of the session that the participant is a member of; None if there is none.
 
-        No call in a project without sessions.
+        No call in a project without sessions. Raises the same errors as `membership`.
         """
         membership = self.membership(project.id, user_id) if project.has_sessions else None
         return membership.session if membership else None
@@ -85,11 +85,11 @@ class Repository:
     # Servers
 
     def project_of_own_server(self, project: Project, user_id: str) -> Project | None:
-        """The registration for one player, if the participant still has a server of their own that runs it.
+        """The registration for one player, if the participant still has a server of their own that runs it; else None.
 
-        None if that server has ended for good, or if there never was one. None for a participant with a membership, who
-        plays with others: a function that had not read the registration yet has started the server. No call if one
-        player is registered, or never was. Errors as in `membership`.
+        None too if that server has ended for good, or if the participant has a membership and plays with others (a
+        function that had not read the new registration yet may have started the server). No call if one player is
+        registered, or never was. Raises the same errors as `membership`.
         """
         before = project.for_session(1) if project.has_sessions else None
         record = self.server_of(project.id, user_id) if before else None
@@ -98,7 +98,7 @@ class Repository:
         return None if self.membership(project.id, user_id) else before
 
     def server_of(self, project_id: str, user_id: str) -> Server | None:
-        """The record of the participant's server; None if there is none."""
+        """The record of the server of this participant or session; None if there is none."""
         stored = self.server(ids.server_label(project_id, user_id))
         return stored.server if stored else None
 
@@ -108,18 +108,18 @@ class Repository:
         return Versioned(from_json(found.body, Server), found.etag) if found else None
 
     def owner(self, name: str) -> Versioned | None:
-        """Return the record that owns this resource name, following handovers.
+        """Return the record that owns the resources of this name, following handovers; None if there is none.
 
-        One read, two for an assigned warm server. The record may be of another attempt by now: its `name` tells.
+        One read; two for an assigned warm server. The record may be at another attempt now: compare its `name`.
         """
         return server.owner(name, self.server, lambda stored: stored.server)
 
     def create(self, record: Server) -> Versioned:
-        """Create the record of a participant's servers. Raises `Conflict` if there is one."""
+        """Create the record of a server. Raises `Conflict` if its participant or session has one already."""
         return Versioned(record, self._documents.create(server.key(record.label), to_json(record)))
 
     def save(self, record: Server, etag: str) -> Versioned:
-        """Write the next version. Raises `Conflict` if the present version has another ETag."""
+        """Write the next version of a server's record. Raises `Conflict` if the present version has another ETag."""
         return Versioned(record, self._documents.replace(server.key(record.label), to_json(record), etag))
 
     def update(self, stored: Versioned | None, change: Callable[[Server], Server | None]) -> Versioned | None:

@@ -1,7 +1,7 @@
-"""The installation's secret. Tokens, credentials and the projects' secrets are derived from it, each for one purpose.
+"""The installation's secret, from which tokens, credentials and the projects' secrets are derived.
 
-It lies in one document, which only functions may read. Servers' records and the master list hold nothing that is
-derived from it, so researchers, who may read those, can neither play as a participant, nor store documents as a server,
+It is stored in one document, which only functions may read. Servers' records and the master list hold nothing that is
+derived from it. So researchers, who may read those, can neither play as a participant, nor store documents as a server,
 nor make tickets and links.
 """
 
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
     from hippodrome.model.server import Server
 
 KEY = "_secret.json"
-CACHE_SECONDS = 3600.0  # a secret that an administrator replaces is in use everywhere after this time
-TRIES = 20
+CACHE_SECONDS = 3600.0  # if an administrator replaces the secret, all functions use the new one after this time
+TRIES = 20  # for one change of the document
 
 
 class Secret(Record, frozen=True):
     """`_secret.json`. `projects` holds the secrets that earlier versions kept in the master list; they stay valid."""
 
-    secret: Annotated[str, msgspec.Meta(min_length=32)]  # an emptied one would be known to all
+    secret: Annotated[str, msgspec.Meta(min_length=32)]  # an empty one would be known to everyone
     projects: Mapping[str, str] = msgspec.field(default_factory=dict)
 
     def __repr__(self) -> str:
         return "Secret(…)"
 
     def derive(self, purpose: str, *about: str) -> str:
-        """64 hex digits that only functions can make, different for each purpose and each `about`."""
+        """64 hex digits of an HMAC with the secret, different for each purpose and each `about`."""
         text = "\0".join((purpose, *about))
         return hmac.new(self.secret.encode(), text.encode(), hashlib.sha256).hexdigest()
 
     def credential(self, name: str, nonce: str) -> str:
-        """The credential with which this server gets presigned requests. The participant's browser never sees it."""
+        """The credential with which the server of this name gets presigned requests. No browser ever gets it."""
         return self.derive("credential", name, nonce)
 
     def token(self, server: Server) -> str:
@@ -57,13 +57,13 @@ class Secret(Record, frozen=True):
 
     def project_secret(self, project: Project) -> str:
         """The key that signs the project's tickets, links and completion codes."""
-        own = project.salt in ("", hippo_entry.SALT)  # it may have had a secret before this installation's
-        kept = (project.secret or self.projects.get(project.id)) if own else ""
-        return kept or self.derive("project", project.id, project.salt)
+        is_older = project.salt in ("", hippo_entry.SALT)  # it may have a secret that an earlier version stored
+        stored = (project.secret or self.projects.get(project.id)) if is_older else ""
+        return stored or self.derive("project", project.id, project.salt)
 
 
 class SecretCache:
-    """The installation's secret. Each running function reads it once an hour: one call, then none."""
+    """Reads the installation's secret. Each running function has one cache, which makes one call an hour."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -90,7 +90,7 @@ class SecretCache:
         return found
 
     def token(self, server: Server) -> str:
-        """The token that lets the participant play on this server; empty if there is none. No call without a nonce."""
+        """The token with which the participant plays on this server; "" if it has none. No call without a nonce."""
         if server.token or not server.nonce:
             return server.token
         found = self.find()
@@ -102,14 +102,14 @@ class SecretCache:
             return project
         found = self.find()
         if found and not project.salt and project.id not in found.projects:
-            self._invalidate()  # the project's own may have been added since
+            self._invalidate()  # the project's secret may have been added since the document was read
             found = self.find()
         if found is None:
             raise LookupError(f"{KEY} is gone; the bucket keeps older versions: put the last one in its place")
         return msgspec.structs.replace(project, secret=found.project_secret(project))
 
     def add_project_secrets(self, found: Mapping[str, str]) -> None:
-        """Store secrets of projects that stood in the master list. Raises `Conflict` after `TRIES` conflicts."""
+        """Store projects' secrets that were found in the master list. Raises `Conflict` after `TRIES` conflicts."""
         for _ in range(TRIES if found else 0):
             self.get_or_create()
             document = self._documents.get(KEY)

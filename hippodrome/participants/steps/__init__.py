@@ -1,4 +1,4 @@
-"""How each type of step (`hippodrome/model/step_types.py`) is shown, and what a form does there: one file per type."""
+"""Shows each type of step (`hippodrome/model/step_types.py`), and handles the forms sent there: one file per type."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hippodrome.participants.steps.visit import Visit
 
 
 class StepHandler(Protocol):
-    """One type of step."""
+    """Handles the requests at steps of one type."""
 
     def show(self, visit: Visit) -> Response:
         """Return the response to a GET. Raises `PageError` if the step cannot be shown."""
@@ -25,4 +25,4 @@ class StepHandler(Protocol):
 
 
 HANDLERS: Mapping[str, Callable[[StepServices], StepHandler]] = {"page": PageStep, "game": GameStep}
-"""By the name of the step's type."""
+"""The handler of each type of step, by the type's name."""

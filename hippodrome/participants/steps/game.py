@@ -1,4 +1,4 @@
-"""A step that is played on the participant's server: the waiting page, the game page, and a restart."""
+"""Handles steps that are played on a server: the page for waiting and playing, and requests for another server."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from hippodrome.participants.steps.sources import rendering, source_of
 from hippodrome.participants.steps.visit import Visit
 from hippodrome.ports import Topic
 
-ASK_AGAIN = timedelta(seconds=30)  # if a start message has had no effect after this time, the next GET sends it again
+ASK_AGAIN = timedelta(seconds=30)  # if there is no server after this time, the next GET sends the start message again
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
 
 
 class GameStep:
-    """Implements `StepHandler`. The trial stores the answer; no form does."""
+    """Implements `StepHandler`. The trial stores the answer; a form only requests another server."""
 
     def __init__(self, services: StepServices) -> None:
         self._services = services
@@ -70,12 +70,12 @@ class GameStep:
         return http.html(200, page.html, page.headers)
 
     def _as_it_plays(self, visit: Visit) -> Visit:
-        """The visit with the project as the participant's own server runs it, also if several are registered since."""
+        """The visit, with the registration that the participant's own server runs, if they still have such a server."""
         before = self._services.repository.project_of_own_server(visit.project, visit.user_id)
         return replace(visit, project=before) if before else visit
 
     def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:
-        """Those of the pages that an earlier registration names which have not been removed since."""
+        """Those pages of an earlier registration that still exist."""
         project, cache = visit.project, self._services.project_cache
         return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
 
@@ -95,13 +95,13 @@ class GameStep:
         record = self._services.repository.server_of(visit.project.id, visit.user_id)
         self._request_if_overdue(visit, visit.user_id, record)
         if record is not None and not record.is_closed and record.lacks(visit.step.key):
-            stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # then they may ask for one that fits
+            stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # then they may request one that fits
             self._services.platform.bus.publish(Topic.STOP, to_message(stop))
         since = visit.progress.reached_at(visit.project, visit.step)
         return self._services.state(visit.project, visit.user_id, visit.step, record, since)
 
     def _state_together(self, visit: Visit) -> dict[str, Any]:
-        """The state of the lobby, or of the session's server. Raises `StepAnswered`."""
+        """The state of the lobby, or of the session's server. Raises `StepAnswered` if the participant is unmatched."""
         project, user_id, step = visit.project, visit.user_id, visit.step
         standing = self._shared.visit(project, user_id, step)
         if standing.is_unmatched:
@@ -111,23 +111,23 @@ class GameStep:
         return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))
 
     def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
-        """Send a start message that was lost, for the participant or the session of `players` that owns the server."""
+        """Send a lost start message again. `owner` is the participant's id, or that of the session of `players`."""
         project, step = visit.project, visit.step
         attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:
             self._request_server(project, owner, attempt, players)
 
     def _first_attempt_if_lost(self, visit: Visit) -> int | None:
-        """Return 1 if there should be a server by now, so that its start message was lost; else None."""
+        """Return 1 if there should be a server by now: its start message was lost. Else None."""
         project, step, progress = visit.project, visit.step, visit.progress
         since = progress.reached_at(project, step)
         overdue = progress.has_arrived if since is None else self._services.platform.now() - since > ASK_AGAIN
         return 1 if participant.may_have_server(project, step) and overdue else None
 
     def _overdue_attempt(self, project: Project, step: Step, record: Server) -> int | None:
-        """The attempt to request again, because it is overdue; else None.
+        """The attempt to request again, because it is overdue; None if none is.
 
-        Its message was lost or came while the study was closed, or the project was full and may have a slot now.
+        Its message was lost, or came while the study was closed, or the project was full and may have a slot now.
         """
         if not participant.may_have_server(project, step):
             return None
@@ -143,9 +143,9 @@ class GameStep:
 
 
 def _page_for_program(view: pages.GameView, method: str) -> str:
-    """HIPPO's word for the state, or a page where its front end would wait for ever.
+    """HIPPO's word for the state; a page instead of `wait` if HIPPO's front end would wait without end.
 
-    That front end polls only after a form whose answer says `wait`. After a game it asks once, with a GET.
+    That front end polls only after a form whose response says `wait`. After a game it sends a single GET.
     """
     if view.state["state"] == ServerState.READY:
         return "show_game_page"

@@ -1,4 +1,4 @@
-"""A step that is a researcher's page: shown in the frame, answered by a form."""
+"""Handles steps that are a researcher's page: it is shown in the frame and answered by a form."""
 
 from __future__ import annotations
 

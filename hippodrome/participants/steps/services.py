@@ -17,7 +17,7 @@ from hippodrome.storage.repository import Repository
 
 @dataclass(frozen=True)
 class StepServices:
-    """The services of one running function, which all handlers of steps share."""
+    """The services and caches of one running function for all handlers of steps."""
 
     platform: Platform
     project_cache: ProjectCache
@@ -28,6 +28,6 @@ class StepServices:
     def state(
         self, project: Project, user_id: str, step: Step | None, record: Server | None, since: datetime | None = None
     ) -> dict[str, Any]:
-        """The state of the participant's server, for the waiting page (docs/pages.md)."""
+        """The state of the participant's server as JSON data (docs/pages.md); see `ServerStates.state`."""
         dns, now = self.platform.dns, self.platform.now()
         return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)

@@ -1,4 +1,4 @@
-"""A game step that several participants play together: the lobby first, then the server of their session."""
+"""Handles game steps that several participants play together: first the lobby, then the server of their session."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from protocol.session import member_token
 
 ENDED = "ended"
 UNMATCHED = "unmatched"
-"""A state beside those of a server, as `LOBBY` (docs/pages.md)."""
+"""A state that no server has, like `LOBBY` (docs/pages.md)."""
 
 
 class StepAnswered(Exception):
-    """The step was answered meanwhile, so the next one is due."""
+    """This request has answered the step, so the next step is due."""
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Where a participant stands at the game step: in the lobby, in a session with this server's record, or nowhere."""
+    """A participant's standing at a game step: in the lobby, in a session with its server's `record`, or neither."""
 
     found: LobbyState | NoServerYet | Membership | None
     record: Server | None = None
 
     @property
     def session(self) -> str | None:
-        """The id of their session, or of the server that was started ahead for it."""
+        """The id of the participant's session, which may still change while it waits for a server; None without one."""
         return self.found.session if isinstance(self.found, Membership | NoServerYet) else None
 
     @property
     def players(self) -> int:
-        """How many participants their session is for; 0 without a session, and in documents of earlier versions."""
+        """How many participants the session is for; 0 without a session, and in documents of earlier versions."""
         return self.found.players if isinstance(self.found, Membership | NoServerYet) else 0
 
     @property
     def is_unmatched(self) -> bool:
-        """Whether they were not matched with others."""
+        """Whether the participant is unmatched."""
         return isinstance(self.found, Membership) and self.found.unmatched
 
 
@@ -58,9 +58,10 @@ class SharedGame:
         self._lobby = Lobby(services.platform, services.repository)
 
     def visit(self, project: Project, user_id: str, step: Step) -> Standing:
-        """The participant asks at this step: they wait in the lobby, if it is not decided yet where they play.
+        """Handle a request at this step. Without a membership, the participant waits in the lobby.
 
-        Before the step at which servers start, and from the one at which they stop, there is no lobby: they only wait.
+        Before the step at which servers start, and from the step at which they stop, there is no lobby: then only a
+        membership is looked up.
         """
         if not participant.may_have_server(project, step):
             return self.decided(project, user_id) or Standing(None)
@@ -71,17 +72,17 @@ class SharedGame:
         return self._standing(project, self._lobby.visit(project, user_id, project.group(user_id), answers))
 
     def decided(self, project: Project, user_id: str) -> Standing | None:
-        """Where the participant stands, if it is decided: in a session, or unmatched; else None. Writes nothing."""
+        """The participant's standing if they are in a session or unmatched; else None. Writes nothing."""
         membership = self._services.repository.membership(project.id, user_id)
         return self._standing(project, membership) if membership else None
 
     def state_alone(
         self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
     ) -> dict[str, Any] | None:
-        """The state for a page that was made when one player was registered; None if that never was. A read.
+        """The state for a page that was made when one player was registered; None if one player never was. One read.
 
-        Without a server it says that it has ended: then the page is loaded again, and is the lobby, or that of the
-        session whose member the participant is now.
+        Without a server of the participant's own the state is `ended`: the page is loaded again, and is then the page
+        of the lobby or of the participant's session.
         """
         before = project.for_session(1)
         if before is None:
@@ -91,14 +92,14 @@ class SharedGame:
         return state if record else state | {"state": ENDED}
 
     def leave(self, project: Project, user_id: str) -> None:
-        """The participant has closed the lobby's page."""
+        """Note that the participant has closed the lobby's page."""
         if self._services.repository.membership(project.id, user_id) is None:
             self._lobby.leave(project, user_id)
 
     def state(
         self, project: Project, user_id: str, step: Step | None, standing: Standing, since: datetime | None = None
     ) -> dict[str, Any]:
-        """The state for the page. A member's page gets the member's own token, never the server's."""
+        """The state as JSON data for the page. A member's page gets the member's own token, never the server's."""
         state = self._services.state(project, user_id, step, standing.record, since)
         found = standing.found
         if isinstance(found, LobbyState):
@@ -128,7 +129,7 @@ class SharedGame:
         return Standing(found, self._services.repository.server_of(project.id, standing.session))
 
     def _earlier_answers(self, project: Project, user_id: str, step: Step) -> Mapping[str, Any]:
-        """What the participant answered on the pages before this step; of a field on two pages, the later answer."""
+        """The participant's answers on the pages before this step. Of a field on two pages, the later answer counts."""
         at = project.index(step.key) or 0
         pages = [each for each in project.steps[:at] if not each.type.on_server]
         found: dict[str, Any] = {}
@@ -138,7 +139,7 @@ class SharedGame:
 
 
 def _not_yet_ready(record: Server | None) -> Server | None:
-    """The record of a server that is not the session's for good: nobody is told its address."""
+    """The record of a server that may still go to another session: not ready, so that no page gets its address."""
     if record is None or record.state is not ServerState.READY:
         return record
     return msgspec.structs.replace(record, state=ServerState.NAMING)

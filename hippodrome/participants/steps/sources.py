@@ -1,4 +1,4 @@
-"""A researcher's page for one participant: its text, and the values that it may use."""
+"""Reads a researcher's page for one participant: its text, and the values that it may use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hippodrome.participants.steps.visit import Visit
 
 @dataclass(frozen=True, slots=True)
 class PageSource:
-    """A page's text and its values."""
+    """The text of a step file, and the values for it. `file` is its name without `.html`."""
 
     file: str
     text: str
@@ -40,7 +40,7 @@ def source_of(services: StepServices, visit: Visit, page: Step) -> PageSource:
 
 @contextmanager
 def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
-    """Turn a `FragmentError` of these pages into the `PageError` that says so."""
+    """Turn a `FragmentError`, raised in the body, into the `PageError` of a broken page, and log it."""
     try:
         yield
     except FragmentError as error:

@@ -1,4 +1,4 @@
-"""What `show` of each type of step is given."""
+"""The argument of `StepHandler.show`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hippodrome.model.project import Project, Step
 
 @dataclass(frozen=True)
 class Visit:
-    """A GET of a participant, with the step that is due."""
+    """A participant's request for the page of the step that is due."""
 
     request: Request
     project: Project

@@ -1,1 +1,1 @@
-"""Warm servers (`warmServers`): the pool of a project, and the handover of one to a participant."""
+"""Warm servers (`warmServers`): the pool of a project, and the handover of a warm server to a participant."""

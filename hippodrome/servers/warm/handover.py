@@ -1,8 +1,8 @@
 """Hands a warm server (`warmServers`) over to a participant or a session, in seconds instead of a minute.
 
 `reserve` first writes the warm server's name into the participant's record. `assign` then decides by one
-compare-and-swap on the warm server's own record: from there on no other participant gets it, and it cannot be drained.
-If a handover is interrupted, the next delivery of the start message finds the name in the record and repeats it.
+compare-and-swap on the warm server's own record: after it no other participant gets the server, and it cannot be
+drained. If a handover is interrupted, the next delivery of the start message finds the name and repeats the handover.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ class Handovers:
         self._pools = pools
 
     def reserve(self, project: Project, stored: Versioned) -> Versioned | None:
-        """Write a ready warm server's name into the participant's record, and return it; None if none is ready.
+        """Write a ready warm server's name into the participant's record; return that record, or None if none is ready.
 
-        Four calls, or one if none is ready. Raises `RetryLater` if the record was changed meanwhile, by another
+        Four calls, or one if none is ready. Raises `RetryLater` if the record was changed at the same time, by another
         delivery of the message or by a stop.
         """
         if stored.server.warm_server_name:
             return stored
-        if (taken := self._pools.take(project)) is None:
+        if (found_in_pool := self._pools.take(project)) is None:
             return None
-        warm_id, entry = taken
+        warm_id, entry = found_in_pool
         found = self._repository.server(ids.server_label(project.id, warm_id))
         if found is None or found.server.state is not ServerState.READY:
             return None  # it has ended; the sweep removes it from its pool
@@ -57,7 +57,7 @@ class Handovers:
         return named
 
     def assign(self, project: Project, named: Versioned) -> bool:
-        """Hand over the reserved warm server; False if it ended or another participant got it. About eight calls."""
+        """Hand over the reserved warm server; False if it has ended or is another participant's. About eight calls."""
         record = named.server
         warm_server = self._take_over(record)
         if warm_server is None:
@@ -81,16 +81,16 @@ class Handovers:
         return True
 
     def release(self, record: Server) -> None:
-        """Delete the handover document of the record's warm server, if it has one, before the record is closed."""
+        """Delete the handover document of the record's warm server, if there is one, before the record is closed."""
         if record.warm_server_name:
             self._pools.delete_handover(record.project_id, record.warm_server_name)
             if record.state is ServerState.STARTING:  # the handover was interrupted by a stop
                 self._take_over(record)
 
     def _take_over(self, record: Server) -> Server | None:
-        """Give the warm server's resources to this record, and free its slot: the record holds one of its own.
+        """Give the warm server's resources to this record, and free the warm server's slot; return its closed record.
 
-        None if the warm server ended first, or another participant has it.
+        None if the warm server has ended, or another participant has it. This record holds a slot of its own.
         """
         now, label = self._platform.now(), record.label
         found = self._repository.server(record.warm_server_label)
@@ -112,7 +112,7 @@ class Handovers:
             self._platform.documents.create(handover_key(project.id, record.name), handover.to_json())
 
     def _undo_if_stopped(self, record: Server) -> None:
-        """If the server was stopped during the handover, delete what its termination did not see yet."""
+        """If the server was stopped during the handover, delete the document and the timer that the stop has missed."""
         present = self._repository.server(record.label)
         if present is None or present.server.name != record.name or present.server.is_closed:
             self._pools.delete_handover(record.project_id, record.name)

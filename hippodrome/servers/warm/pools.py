@@ -1,7 +1,7 @@
-"""The pool of a project's warm servers: fill it, take from it, and empty it when the project closes.
+"""Fills the pool of a project's warm servers, takes servers from it, and empties it when the project closes.
 
-The pool only offers warm servers. Each one's own record decides who gets it (`handover.py`), so a pool that is out of
-date after a crash costs one warm server at worst. The sweep calls `repair`, which brings it up to date.
+The pool only offers warm servers. A warm server's own record decides which participant gets it (`handover.py`), so a
+pool that is out of date after a crash costs one warm server at worst. The sweep calls `repair`, which corrects it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from protocol.keys import handover_key, handovers_folder
 
 NO_RECORD_AFTER = timedelta(minutes=5)  # if a requested warm server has no record by then, request it again
 NOT_READY_AFTER = timedelta(minutes=20)  # if a warm server is not ready by then, stop it
-ATTEMPT = 1  # the only one of a warm server
+ATTEMPT = 1  # the only attempt of a warm server
 
 
 class Pools:
@@ -39,13 +39,13 @@ class Pools:
         self._shared = SharedDocuments(platform.documents)
 
     def take(self, project: Project) -> tuple[str, WarmServer] | None:
-        """Take a ready warm server out of the pool: its id and entry. None if there is none. Two calls, else one."""
+        """Take a ready warm server out of the pool; return its id and entry. Two calls. None, after one, if none is."""
         pool = self._change(project.id, lambda pool: pool.without_first(project.version)).before
         first = pool.first(project.version)
         return (first, pool.warm_servers[first]) if first else None
 
     def put_back(self, project: Project, warm_id: str, warm_server: WarmServer) -> None:
-        """Return a warm server that was taken and is not needed. Two calls."""
+        """Put back a warm server that was taken and is not needed. Two calls."""
         self._change(project.id, lambda pool: pool.with_returned(warm_id, warm_server))
 
     def mark_ready(self, project_id: str, warm_id: str) -> None:
@@ -53,7 +53,7 @@ class Pools:
         self._change(project_id, lambda pool: pool.with_ready([warm_id]))
 
     def remove(self, project_id: str, warm_id: str) -> None:
-        """Remove this warm server. Two calls, or one if the pool does not list it."""
+        """Remove this warm server from the pool. Two calls, or one if the pool does not list it."""
         self._change(project_id, lambda pool: pool.without([warm_id]))
 
     def request_adjustment(self, project_id: str) -> None:
@@ -63,8 +63,8 @@ class Pools:
     def adjust(self, project_id: str) -> None:
         """Bring the pool to its configured size: request new warm servers, or stop some.
 
-        The pool is written first. If the rest is interrupted, `repair` requests again what has no record, and the sweep
-        stops what is in no pool.
+        The pool is written first. If the rest is interrupted, `repair` requests the warm servers without a record
+        again, and the sweep stops the warm servers that are in no pool.
         """
         settings, now = self._platform.settings, self._platform.now()
         project = self._project_cache.project(project_id, fresh=timedelta(0))
@@ -86,8 +86,8 @@ class Pools:
     def repair(self, repository: Repository) -> Collection[str]:
         """Repair all pools after lost messages; return the ids of all warm servers in them.
 
-        One listing, and for each pool a read, a message, and a read for each warm server. If a pool cannot be read, the
-        others are repaired first, then the error is raised.
+        One listing; for each pool a read and a message; for each warm server a read. If a pool cannot be read, the
+        others are repaired before the error is raised.
         """
         configured = self._projects_with_warm_servers()
         known: set[str] = set()
@@ -106,12 +106,12 @@ class Pools:
                 self._repair(project_id, pool, repository)
             if pool.warm_servers or project_id in configured:
                 self.request_adjustment(project_id)
-        if unread:  # else the caller would stop these pools' warm servers
+        if unread:  # without the error, the caller would stop the warm servers of these pools
             raise unread[0]
         return known
 
     def handovers(self) -> Iterator[tuple[str, str]]:
-        """Project id and server name of each handover document. A listing for each project with a pool."""
+        """Yield the project's id and the server's name of each handover document. One listing for each pool."""
         for project_id in sorted(self._projects_with_warm_servers() | self._projects_with_pool()):
             for entry in self._platform.documents.list(handovers_folder(project_id)):
                 name = entry.key.rpartition("/")[2].removesuffix(".json")

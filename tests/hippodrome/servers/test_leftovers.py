@@ -11,7 +11,7 @@ from hippodrome.model import ids, server
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Address, DnsRecord, RunningTask
 from hippodrome.servers import leftovers
-from hippodrome.servers.leftovers import Scope, Why, why_left_over, why_slot_left_over
+from hippodrome.servers.leftovers import LeftoverReason, Scope, why_left_over, why_slot_left_over
 from hippodrome.servers.overdue import LOST_AFTER
 from hippodrome.servers.resources import Resources
 from tests.hippodrome.model.test_server import LABEL, LATER, NOW, WARM_SERVER, claimed
@@ -30,48 +30,68 @@ STOP_MAZE = Scope(project_id="maze", without_record=True)
 STOP_OTHER = Scope(project_id="other", without_record=True)
 ERASE = Scope(labels=frozenset({LABEL}), names=frozenset({WARM_NAME}))
 
-TABLE: list[tuple[str, str, Server | None, bool, dict[str, Why | None]]] = [
-    ("of an open server", SECOND, OPEN, True, {"ERASE": Why.ERASED}),
+TABLE: list[tuple[str, str, Server | None, bool, dict[str, LeftoverReason | None]]] = [
+    ("of an open server", SECOND, OPEN, True, {"ERASE": LeftoverReason.ERASED}),
     (
         "of a closed server",
         SECOND,
         CLOSED,
         False,
-        {"SWEEP": Why.CLOSED, "STOP": Why.CLOSED, "STOP_MAZE": Why.CLOSED, "ERASE": Why.ERASED},
+        {
+            "SWEEP": LeftoverReason.CLOSED,
+            "STOP": LeftoverReason.CLOSED,
+            "STOP_MAZE": LeftoverReason.CLOSED,
+            "ERASE": LeftoverReason.ERASED,
+        },
     ),
     (
         "of the attempt before",
         FIRST,
         OPEN,
         False,
-        {"SWEEP": Why.REPLACED, "EARLY": Why.REPLACED, "STOP": Why.REPLACED, "STOP_MAZE": Why.REPLACED}
-        | {"ERASE": Why.ERASED},
+        {
+            "SWEEP": LeftoverReason.REPLACED,
+            "EARLY": LeftoverReason.REPLACED,
+            "STOP": LeftoverReason.REPLACED,
+            "STOP_MAZE": LeftoverReason.REPLACED,
+        }
+        | {"ERASE": LeftoverReason.ERASED},
     ),
-    ("of an attempt to come", THIRD, OPEN, True, {"ERASE": Why.ERASED}),
-    ("of an attempt after a closed one", THIRD, CLOSED, True, {"ERASE": Why.ERASED}),
+    ("of an attempt to come", THIRD, OPEN, True, {"ERASE": LeftoverReason.ERASED}),
+    ("of an attempt after a closed one", THIRD, CLOSED, True, {"ERASE": LeftoverReason.ERASED}),
     (
         "of the attempt that was given up for a warm server",
         SECOND,
         ON_WARM,
         False,
-        {"SWEEP": Why.REPLACED, "EARLY": Why.REPLACED, "STOP": Why.REPLACED, "STOP_MAZE": Why.REPLACED}
-        | {"ERASE": Why.ERASED},
+        {
+            "SWEEP": LeftoverReason.REPLACED,
+            "EARLY": LeftoverReason.REPLACED,
+            "STOP": LeftoverReason.REPLACED,
+            "STOP_MAZE": LeftoverReason.REPLACED,
+        }
+        | {"ERASE": LeftoverReason.ERASED},
     ),
-    ("of an assigned warm server", WARM_NAME, ON_WARM, True, {"ERASE": Why.ERASED}),
+    ("of an assigned warm server", WARM_NAME, ON_WARM, True, {"ERASE": LeftoverReason.ERASED}),
     (
         "of a warm server whose participant's server is closed",
         WARM_NAME,
         OFF_WARM,
         False,
-        {"SWEEP": Why.CLOSED, "STOP": Why.CLOSED, "STOP_MAZE": Why.CLOSED, "ERASE": Why.ERASED},
+        {
+            "SWEEP": LeftoverReason.CLOSED,
+            "STOP": LeftoverReason.CLOSED,
+            "STOP_MAZE": LeftoverReason.CLOSED,
+            "ERASE": LeftoverReason.ERASED,
+        },
     ),
-    ("without a record, where another installation's may lie", FIRST, None, False, {"ERASE": Why.ERASED}),
+    ("without a record, where another installation's may lie", FIRST, None, False, {"ERASE": LeftoverReason.ERASED}),
     (
         "without a record, where only ours are",
         FIRST,
         None,
         True,
-        {"STOP": Why.NO_RECORD, "ERASE": Why.ERASED},
+        {"STOP": LeftoverReason.NO_RECORD, "ERASE": LeftoverReason.ERASED},
     ),
     ("of no server's name", "www", None, True, {}),
     ("of no server's name, with a record", "www", CLOSED, True, {}),
@@ -81,7 +101,7 @@ TABLE: list[tuple[str, str, Server | None, bool, dict[str, Why | None]]] = [
 @pytest.mark.parametrize("scope", ["SWEEP", "EARLY", "STOP", "STOP_MAZE", "STOP_OTHER", "ERASE"])
 @pytest.mark.parametrize(("name", "owner", "ours", "whys"), [row[1:] for row in TABLE], ids=[row[0] for row in TABLE])
 def test_why_a_resource_is_left_over(
-    name: str, owner: Server | None, ours: bool, whys: dict[str, Why | None], scope: str
+    name: str, owner: Server | None, ours: bool, whys: dict[str, LeftoverReason | None], scope: str
 ) -> None:
     assert why_left_over(name, owner, globals()[scope], ours=ours) is whys.get(scope)
 
@@ -93,7 +113,7 @@ def test_a_resource_may_be_another_installations_unless_it_is_said_to_be_ours() 
 def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None:
     undated = msgspec.structs.replace(CLOSED, closed=None)
     assert why_left_over(SECOND, undated, SWEEP) is None
-    assert why_left_over(SECOND, undated, STOP) is Why.CLOSED
+    assert why_left_over(SECOND, undated, STOP) is LeftoverReason.CLOSED
 
 
 @pytest.mark.parametrize(
@@ -101,14 +121,14 @@ def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None
     [
         (SECOND, OPEN, timedelta(days=1), None),
         (SECOND, CLOSED, LOST_AFTER, None),
-        (SECOND, CLOSED, LOST_AFTER + timedelta(seconds=1), Why.CLOSED),
+        (SECOND, CLOSED, LOST_AFTER + timedelta(seconds=1), LeftoverReason.CLOSED),
         (FIRST, OPEN, timedelta(days=1), None),
-        (FIRST, CLOSED, LOST_AFTER + timedelta(seconds=1), Why.CLOSED),
-        (SECOND, None, timedelta(0), Why.NO_RECORD),
+        (FIRST, CLOSED, LOST_AFTER + timedelta(seconds=1), LeftoverReason.CLOSED),
+        (SECOND, None, timedelta(0), LeftoverReason.NO_RECORD),
         ("www", None, timedelta(days=1), None),
     ],
 )
-def test_why_a_slot_is_left_over(name: str, owner: Server | None, after: timedelta, why: Why | None) -> None:
+def test_why_a_slot_is_left_over(name: str, owner: Server | None, after: timedelta, why: LeftoverReason | None) -> None:
     assert why_slot_left_over(name, owner, LATER + after) is why
 
 
