@@ -59,23 +59,23 @@ def test_a_group_that_cannot_play_is_left_out_and_told(bad: list[str]) -> None:
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 SHOWN = [
     textwrap.dedent(block)
-    for name in ("agent.md", "sessions.md")
-    for block in re.findall(r"^ {4}def match\((?:.*\n|\n)(?:(?: {4}.*)?\n)+", (DOCS / name).read_text(), re.MULTILINE)
+    for block in re.findall(
+        r"^ {4}def match\((?:.*\n|\n)(?:(?: {4}.*)?\n)+", (DOCS / "sessions.md").read_text(), re.MULTILINE
+    )
 ]
-WHO = [("0", "no", "seeker", 0), ("9", "no", "seeker", 0), ("1", "yes", "guide", 1), ("9.5", "yes", "guide", 1)]
+WHO = [("0", "seeker", 0), ("9", "seeker", 0), ("1", "guide", 1), ("9.5", "guide", 1)]
 PEOPLE = [
-    {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "opinion": opinion, "role": role}}
-    for name, (skill, opinion, role, group) in zip("abcd", WHO, strict=True)
+    {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "role": role}}
+    for name, (skill, role, group) in zip("abcd", WHO, strict=True)
 ]
 CHOSEN = {
-    "opinion": [["a", "c"], ["b", "d"]],
     "skill": [["a", "c"], ["b", "d"]],
     "group": [["a", "c"], ["b", "d"]],
     "role": [["c", "a"], ["d", "b"]],
 }
 
 
-def test_the_docs_show_four_functions() -> None:
+def test_the_docs_show_three_functions() -> None:
     assert len(SHOWN) == len(CHOSEN)
 
 
