@@ -1,1 +1,1 @@
-"""The ports on one machine, and the web server of `make run`: what the functions stand on where there is no AWS."""
+"""Studies on one machine: the commands `make run`, `try`, `check` and `new`, and what replaces AWS there."""

@@ -1,4 +1,4 @@
-"""`python -m local [FOLDER]`: hold a study on this machine."""
+"""`python -m local [FOLDER]`: run a study on this machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from local.activity.log import ActivityLog
 from local.backend import files
 from local.backend.processes import end_everything
 from local.publish import NotPublished
-from local.study import OTHERS, Study, near
+from local.study import OTHERS, Study, from_here
 from local.web import server
 from local.web.access import origin_of
 
@@ -30,21 +30,21 @@ ROOT = ".hippodrome"
 def main(
     folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
     *,
-    port: Annotated[int, typer.Option(help="The next free one is taken if it is in use; 0 for any.")] = 8000,
+    port: Annotated[int, typer.Option(help="If it is in use, the next free one is taken. 0: any free one.")] = 8000,
     data: Annotated[Path, typer.Option(help="Where answers and recordings are kept.")] = Path("data"),
     host: Annotated[
-        str, typer.Option(help="127.0.0.1 or localhost: a study is held for this machine only.")
+        str, typer.Option(help="127.0.0.1 or localhost: a study runs for this machine only.")
     ] = server.HOST,
     origin: Annotated[
         list[str] | None,
         typer.Option(
-            help="Let the pages of this origin ask, too, such as another front end at http://localhost:3000. "
+            help="Answer pages of this origin too, such as another front end at http://localhost:3000. "
             "May be given several times.",
             show_default=False,
         ),
     ] = None,
     tls: Annotated[
-        bool, typer.Option("--tls", help="Pages by https, and servers by names below localhost, with TLS.")
+        bool, typer.Option("--tls", help="Serve pages by https, and servers by TLS at names below localhost.")
     ] = False,
     names: Annotated[
         str | None,
@@ -52,14 +52,14 @@ def main(
             help="With --tls: `hash`, or `userId` to name servers after participants' ids.", show_default=False
         ),
     ] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; those there are moved aside.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; earlier data are moved aside.")] = False,
 ) -> None:
-    """Hold the study of FOLDER on this machine, and print its link."""
-    os.umask(0o077)  # answers are personal data: the files of this process and of its servers are their owner's alone
+    """Run the study of FOLDER on this machine, and print its link."""
+    os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
     activity_log = ActivityLog()
     if host not in ("127.0.0.1", "localhost"):
         activity_log.show(
-            f"A study cannot be held at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
+            f"A study cannot run at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
             "so participants could not play on another machine. Leave --host out (with make: HOST=)."
         )
         raise typer.Exit(1)
@@ -75,39 +75,38 @@ def main(
             "(with make: TLS=1 NAMES=userId)."
         )
         raise typer.Exit(1)
-    held = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
+    new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
     try:
-        _hold_study(folder, port, data, fresh, activity_log=activity_log, study_of=held)
-    except files.InUse as other:
-        activity_log.show(
-            f"A study is already held with the data in {data}{_at(str(other))}.", "End it there with Ctrl-C first."
-        )
+        _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study)
+    except files.InUse as error:
+        at = f", at {error}" if str(error) else ""
+        activity_log.show(f"A study already runs with the data in {data}{at}.", "End it there with Ctrl-C first.")
     except NotPublished as error:
-        activity_log.show("The study cannot be held yet:", *(f"  {problem}" for problem in error.problems))
+        activity_log.show("The study cannot run yet:", *(f"  {problem}" for problem in error.problems))
     except server.NoPort as error:
         activity_log.show(f"{error}.")
     except OSError as error:
-        activity_log.show(f"The study cannot be held with the data in {data}: {_words(error)}.", _remedy(error))
+        activity_log.show(f"The study cannot run with the data in {data}: {_reason(error)}.", _remedy(error))
     else:
         return
     raise typer.Exit(1)
 
 
-def _hold_study(
-    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, study_of: Callable[..., Study]
+def _run_study(
+    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, new_study: Callable[..., Study]
 ) -> None:
-    """Hold it until the process is asked to end. Raises OSError and what `study_of` raises."""
+    """Run the study until a signal ends it. Raises InUse, OSError, and the errors of `Study`."""
     root = data.resolve().parent / ROOT
     state = root / data.resolve().name
     root.mkdir(parents=True, exist_ok=True)
     hold = files.Hold(root / f"{state.name}.lock")
-    if root.stat().st_mode & OTHERS:  # of a version that let others read it
+    if root.stat().st_mode & OTHERS:  # an earlier version let other users read it
         root.chmod(0o700)
     if fresh:
         _move_aside(data.resolve(), state, activity_log)
-    _more_files()
+    _allow_more_files()
     with _signals() as ended, function_log(state / "logs", activity_log):
-        study = study_of(folder, data, state, port, activity_log)
+        study = new_study(folder, data, state, port, activity_log)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()
@@ -125,7 +124,7 @@ _REMEDIES = {
 _ELSEWHERE = "Put the data where you may write with DATA=FOLDER, or change who may write there."
 
 
-def _words(error: OSError) -> str:
+def _reason(error: OSError) -> str:
     return (error.strerror or str(error)).rstrip(".")
 
 
@@ -133,12 +132,8 @@ def _remedy(error: OSError) -> str:
     return _REMEDIES.get(error.errno or 0, _ELSEWHERE)
 
 
-def _at(note: str) -> str:
-    return f", at {note}" if note else ""
-
-
 def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
-    """End the servers of the study, and move data and state into the folder `earlier`: this run begins with none."""
+    """End the study's servers, and move its data and state into the folder `earlier`, so that this run begins anew."""
     end_everything(state)
     place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for folder, name in ((data, "data"), (state, "state")):
@@ -146,11 +141,11 @@ def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
             place.mkdir(parents=True, exist_ok=True)
             folder.rename(place / name)
     if (place / "data").exists():
-        activity_log.show(f"Earlier data are in {near(place / 'data')} now.")
+        activity_log.show(f"Earlier data are in {from_here(place / 'data')} now.")
 
 
-def _more_files() -> None:
-    """Each server takes a few handles; macOS allows 256 until asked for more."""
+def _allow_more_files() -> None:
+    """Raise this process's limit of open files: each server takes a few, and macOS allows 256 by default."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = 8192 if hard == resource.RLIM_INFINITY else min(8192, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -160,22 +155,22 @@ def _more_files() -> None:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[int]:
-    """A handle from which a byte can be read once the process is asked to end. Asked twice, it ends at once.
+    """A handle from which a byte can be read once a signal asks the process to end. The third signal ends it at once.
 
     Python writes the byte as the signal arrives (`set_wakeup_fd`), in any thread. The handler runs later, in the main
-    thread, which the signal does not wake if another thread got it, or if it was just about to read.
+    thread: the signal does not wake that thread if another one got it, or if it was just about to read.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    asked = []
+    signals = []
 
-    def ask(number: int, _frame: object) -> None:
-        asked.append(number)
-        if len(asked) > 2:  # servers that live on are found and ended at the next start
+    def count(number: int, _frame: object) -> None:
+        signals.append(number)
+        if len(signals) > 2:  # the next start takes over the servers that still run
             os._exit(1)
 
     woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield reader
     finally:

@@ -1,4 +1,4 @@
-"""`python -m local.new FOLDER TEMPLATE`: begin a study of one's own with a copy of an example."""
+"""`python -m local.new FOLDER TEMPLATE`: begin a study of your own with a copy of an example."""
 
 from __future__ import annotations
 
@@ -20,16 +20,15 @@ from hippodrome.model import ids
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = "examples"
-OF_A_STUDY = ("config.yml", "agent.py", "steps", "requirements.txt")
-"""What belongs to the study at the top, whose folder holds Hippodrome too."""
-README = "README.md"
+STUDY_FILES = ("config.yml", "agent.py", "steps", "requirements.txt")
+"""What belongs to the example study in Hippodrome's own folder, and is copied."""
 LEFT_OUT = shutil.ignore_patterns("data", "data-*", "erased-*.json", "__pycache__", "*.pyc", ".*")
-"""Data, caches and hidden files, wherever they lie in a template."""
+"""Leaves out data, caches and hidden files, wherever they lie in a template."""
 
 _ID = ("project", "id")
 _ID_LINE = re.compile(r"(?P<key>\s*id:\s*)[^#\s]+(?P<comment>.*)", re.DOTALL)
 _LINK = re.compile(r"\]\((\.\./[^)#\s]+)")
-_NO_LETTERS = re.compile(r"[^A-Za-z0-9_-]+")
+_NOT_IN_AN_ID = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 class NotMade(Exception):
@@ -59,34 +58,34 @@ def templates(root: Path = ROOT) -> dict[str, StudyTemplate]:
 
 
 def listing(known: Mapping[str, StudyTemplate]) -> str:
-    """The templates, a line for each."""
+    """The templates in words, a line for each."""
     width = max(map(len, known), default=0)
     return "\n".join(["There are these templates:", *(f"  {name:{width}}  {known[name].title}" for name in known)])
 
 
 def make_study(template: StudyTemplate, folder: Path) -> str:
-    """Copy the template to `folder`, with an id of its own that is made of the folder's name; the id.
+    """Copy the template to `folder`, and give the copy a project id made from the folder's name. Returns the id.
 
-    Raises NotMade if the folder holds something already, if its name makes no id, or if it cannot be written.
+    Raises NotMade if the folder is not empty, if its name makes no id, or if it cannot be written.
     """
     project_id = _id_of(folder)
-    _refuse_what_is_there(template, folder)
+    _check_folder(template, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _copy(template, folder)
-        _name(folder, project_id)
-        _lead(template, folder)
+        _write_id(folder, project_id)
+        _adapt_paths(template, folder)
     except OSError as error:
         raise NotMade(f"{folder} cannot be written: {error.strerror or error}") from None
     return project_id
 
 
 def what_next(folder: Path) -> str:
-    """The commands with which a new study is looked at, tried and changed."""
+    """What to do with a new study: the commands, and the files to change."""
     given = f"PROJECT={shlex.quote(str(folder))}"
     lines = [
         "Next:",
-        f"  make run {given}     holds it on this machine; open the link and take part",
+        f"  make run {given}     runs it on this machine; open the link and take part",
         f"  make check {given}   finds mistakes in what you change",
         f"  make try {given}     sends simulated participants through it",
         "Change config.yml (title, researcher, steps, game), steps/ (the pages) and agent.py (game and agent).",
@@ -94,7 +93,8 @@ def what_next(folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _refuse_what_is_there(template: StudyTemplate, folder: Path) -> None:
+def _check_folder(template: StudyTemplate, folder: Path) -> None:
+    """Raise NotMade unless the folder is empty or does not exist, and lies outside of the template."""
     there, inside = folder.resolve(), template.folder.resolve()
     if folder.exists() and not folder.is_dir():
         raise NotMade(f"{folder} is a file; name a folder that does not exist yet")
@@ -108,7 +108,7 @@ def _copy(template: StudyTemplate, folder: Path) -> None:
     if not template.at_top:
         shutil.copytree(template.folder, folder, ignore=LEFT_OUT, dirs_exist_ok=True)
         return
-    for name in OF_A_STUDY:
+    for name in STUDY_FILES:
         source = template.folder / name
         if source.is_dir():
             shutil.copytree(source, folder / name, ignore=LEFT_OUT)
@@ -116,8 +116,8 @@ def _copy(template: StudyTemplate, folder: Path) -> None:
             shutil.copy(source, folder / name)
 
 
-def _name(folder: Path, project_id: str) -> None:
-    """Write the id into config.yml; its comments stay."""
+def _write_id(folder: Path, project_id: str) -> None:
+    """Write the id into config.yml, and leave the rest of the file as it is. Raises NotMade if the id has no line."""
     source = read_source(folder)
     file = source.layout.config
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -129,32 +129,33 @@ def _name(folder: Path, project_id: str) -> None:
     file.write_text("".join(lines), encoding="utf-8")
 
 
-def _lead(template: StudyTemplate, folder: Path) -> None:
-    """Let the commands and links in README.md and config.yml lead to the new folder, and to Hippodrome from there."""
+def _adapt_paths(template: StudyTemplate, folder: Path) -> None:
+    """In README.md and config.yml, let commands name the new folder and links lead from there to Hippodrome's files."""
     example = re.compile(rf"(?<![\w/]){EXAMPLES}/{re.escape(template.folder.name)}(?=[/\s`,.;:)]|$)")
-    for file in (folder / README, folder / OF_A_STUDY[0]):
+    for file in (folder / "README.md", folder / "config.yml"):
         if template.at_top or not file.is_file():
             continue
         text = example.sub(lambda _: shlex.quote(str(folder)), file.read_text(encoding="utf-8"))
-        text = _LINK.sub(lambda link: f"]({_from(folder, template.folder / link[1])}", text)
+        text = _LINK.sub(lambda link: f"]({_relative(template.folder / link[1], folder)}", text)
         file.write_text(text, encoding="utf-8")
 
 
-def _from(folder: Path, target: Path) -> str:
-    """The path of a target as a link in the folder has it."""
+def _relative(target: Path, folder: Path) -> str:
+    """The path of `target` as a link in a file of `folder` has it."""
     return Path(os.path.relpath(target.resolve(), folder.resolve())).as_posix()
 
 
 def _id_of(folder: Path) -> str:
-    """The folder's name with dashes for what an id cannot have. Raises NotMade if that is no id."""
+    """The folder's name with dashes in place of characters that no id has. Raises NotMade if that is no id."""
     name = folder.resolve().name
-    found = _NO_LETTERS.sub("-", name).strip("-_")[:64]
+    found = _NOT_IN_AN_ID.sub("-", name).strip("-_")[:64]
     if not ids.is_project_id(found) or found.upper() == "SSL":
-        raise NotMade(f'of the folder\'s name "{name}" no project id can be made; use letters, digits and dashes')
+        raise NotMade(f'no project id can be made from the folder\'s name "{name}"; use letters, digits and dashes')
     return found
 
 
 def _source(folder: Path) -> ConfigSource | None:
+    """The folder's config.yml; None if it cannot be read or has no project id."""
     try:
         source = read_source(folder)
     except ConfigErrors:
@@ -167,7 +168,7 @@ def _text(source: ConfigSource, path: tuple[str, ...]) -> str:
 
 
 def main(
-    folder: Annotated[str, typer.Argument(help="The folder of the new study; it must be empty or not there.")] = "",
+    folder: Annotated[str, typer.Argument(help="The folder of the new study; it must be empty or not exist.")] = "",
     template: Annotated[str, typer.Argument(help="The name of the study to copy.")] = "",
 ) -> None:
     """Copy the study TEMPLATE to FOLDER, give it an id of its own, and say what to do next."""
@@ -185,7 +186,7 @@ def main(
     except NotMade as refusal:
         sys.stdout.write(f"{refusal}\n")
         raise typer.Exit(1) from None
-    sys.stdout.write(f"Made {folder} of {template}; its project id is {project_id}.\n{what_next(Path(folder))}\n")
+    sys.stdout.write(f"Made {folder} from {template}; its project id is {project_id}.\n{what_next(Path(folder))}\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Ids of participants with which one researcher can play in all places of a game (`project.players`). Pure."""
+"""Participants' ids with which one researcher can play in all places of a game (`project.players`). Pure."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ MOST_TRIED = 10_000
 def user_ids(
     project_id: str, players: int, matching: str | dict[str, Any], groups: int, new: Callable[[int], str]
 ) -> list[str]:
-    """An id for each place, made by `new` of a number, so that `matching` by groups lets them play together.
+    """An id for each of the `players`, such that `matching` by groups lets them play together.
 
-    With `group` all are of one group; with `mixed` their groups differ, as far as there are as many.
+    With `group` all ids belong to one group; with `mixed` they belong to different groups, as far as there are enough.
+    `new` makes an id from a number. There are fewer ids than players if `MOST_TRIED` of them do not suffice.
     """
     made = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):
@@ -35,9 +36,9 @@ def user_ids(
 
 
 def advice(matching: str | dict[str, Any]) -> str:
-    """What the researcher has to answer, if answers say who plays together; else nothing."""
+    """What the researcher has to answer, if participants are matched by an answer; otherwise empty."""
     if not isinstance(matching, dict):
         return ""
     how, field = next(iter(matching.items()))
     answers = "the same answer" if how == "same" else "a different answer"
-    return f"Give {answers} to the question {field} in each."
+    return f"Give {answers} to the question {field} in each window."

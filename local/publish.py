@@ -20,7 +20,7 @@ CHANGED = (
 
 
 class NotPublished(Exception):
-    """The project cannot be published; `problems` are sentences."""
+    """The project cannot be published; `problems` are sentences for the researcher."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -32,7 +32,7 @@ def publish(
 ) -> Config:
     """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`.
 
-    `subdomain` is taken instead of the project's. `say` hears what the change means for those who take part already.
+    `subdomain` replaces the project's. `say` gets a sentence if steps have changed and participants have begun.
     """
     try:
         config = read_project(folder)
@@ -40,7 +40,7 @@ def publish(
         raise NotPublished([str(problem) for problem in errors.diagnostics]) from None
     for file in [*step_files(folder), *config.own_pages]:
         _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
-    # Whatever the project says of AWS is meant for there: here its servers are processes.
+    # On this machine servers are processes, also if the project says that they run on AWS.
     registration = {**config.registration(), "useAWS": False}
     if subdomain is not None:
         registration["subdomain"] = subdomain
@@ -54,11 +54,11 @@ def publish(
 
 
 def _changed(documents: Documents, config: Config) -> str:
-    """Which steps have another page than they had for participants who have begun, in words; empty if none has."""
+    """The steps whose page is another one now, in words; empty if there are none, or if no participant has begun."""
     found = documents.get(MASTER_LIST)
     try:
         before = read_list(found.body).find(config.project.id) if found else None
-    except (ValueError, RecursionError):  # the registration says so
+    except (ValueError, RecursionError):  # the registration below reports a list that cannot be read
         return ""
     if before is None:
         return ""
@@ -70,14 +70,14 @@ def _changed(documents: Documents, config: Config) -> str:
 
 
 def step_files(folder: Path) -> list[Path]:
-    """Pages, and the pictures and the like beside them."""
+    """The files of the pages' folder, sorted: pages, and pictures and the like; no hidden ones."""
     pages = layout.pages_folder(folder)
     found = pages.iterdir() if pages else ()
     return sorted(file for file in found if file.is_file() and not file.name.startswith("."))
 
 
 def _put(documents: Documents, key: str, body: bytes) -> None:
-    """Write the document unless it says the same already."""
+    """Write the document, unless it has this content already."""
     while True:
         found = documents.get(key)
         if found and found.body == body:

@@ -1,4 +1,4 @@
-"""A study that is held on this machine: its platform, its web server, and what its researcher is told."""
+"""A study that runs on this machine: its platform, its web server, and the lines that its researcher reads."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FUNCTIONS = {
 
 
 class Study:
-    """A study that is held on this machine."""
+    """A study that runs on this machine."""
 
     def __init__(
         self,
@@ -49,10 +49,10 @@ class Study:
         tls: bool = False,
         names: str | None = None,
     ) -> None:
-        """Publish it and take a port. Raises `NotPublished` and `NoPort`.
+        """Publish the project in `folder` and take a port. Raises `NotPublished`, `NoPort`, and OSError.
 
-        With `tls` pages are https, and servers have names below localhost: by `names`, hash or userId, or as the
-        project says.
+        With `tls`, pages are served by https, and servers have names below localhost. `names` ("hash" or "userId") says
+        how servers are named; None: as the project says.
         """
         self._data = data
         self._state = state
@@ -62,7 +62,7 @@ class Study:
         self._authority = Authority(state.parent / "tls") if tls else None
         names_listener = listen(NAMES_PORT) if tls else None
         named_port: int | None = names_listener.getsockname()[1] if names_listener else None
-        _end_others(state, named_port)
+        _end_servers_of_other_addresses(state, named_port)
         self._platform = LocalPlatform(
             data,
             state,
@@ -83,21 +83,21 @@ class Study:
         self._watch = Watch(folder, self._config, self._platform.publish, self._published, activity_log.say)
 
     def start(self) -> None:
-        """Let participants in."""
-        self._activity_log.study(step.key for step in self._config.steps)
+        """Start the servers' threads and the web server, print the link, and watch the project's files."""
+        self._activity_log.set_steps(step.key for step in self._config.steps)
         self._platform.start()
         self.server.start()
         if self._names is not None:
             self._names.start()
         self._banner()
-        going_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
-        if going_on:
-            self._activity_log.say(f"{going_on} server(s) of the last run play on")
+        playing_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
+        if playing_on:
+            self._activity_log.say(f"{playing_on} server(s) of the last run play on")
         self._watch.start()
         self._activity_log.follow(self._platform.tasks, self._platform.documents.folder)
 
     def close(self) -> None:
-        """End everything."""
+        """End the servers and the web server. The data stay, and the next run goes on with them."""
         running = len(self._platform.tasks.playing())
         self._activity_log.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
         self._watch.close()
@@ -109,8 +109,8 @@ class Study:
         self._activity_log.show(f"Ended. The data are in {self._data}.")
 
     def _published(self, changed: Config) -> None:
-        self._activity_log.study(step.key for step in changed.steps)
-        installed.use(self._platform)  # functions forget the pages they have kept
+        self._activity_log.set_steps(step.key for step in changed.steps)
+        installed.use(self._platform)  # the functions forget the pages that they have cached
         if not changed.project.live:
             self._activity_log.warn(_NOT_LIVE)
 
@@ -125,11 +125,11 @@ class Study:
             Text(""),
             Text.assemble("  Link   ", (own, "bold green")),
             Text(f"  Data   {self._data}"),
-            Text(f"  Logs   {near(self._state / 'logs')}"),
+            Text(f"  Logs   {from_here(self._state / 'logs')}"),
             *self._how_to_trust(),
             *self._how_to_play_together(link),
             Text(""),
-            Text(f"  {_ONE_EACH if project.signed_links else _WHOEVER} Ctrl-C ends everything."),
+            Text(f"  {_FOR_ONE if project.signed_links else _FOR_ALL} Ctrl-C ends everything."),
         ]
         if self._port and not url.endswith(f":{self._port}"):
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
@@ -138,14 +138,14 @@ class Study:
         if self._data.stat().st_mode & OTHERS:
             lines.append(Text(f"  {_OPEN.format(data=self._data)}", "yellow"))
         if project.use_aws:
-            lines.append(Text("  useAWS is true: on this machine servers are processes all the same.", "yellow"))
+            lines.append(Text("  useAWS is true, but on this machine servers are processes.", "yellow"))
         self._activity_log.show(*lines, Text(""))
 
     def _how_to_trust(self) -> list[Text]:
-        """With TLS: where servers are, and how the browser accepts their certificates."""
+        """With TLS: at which port servers have names, and which certificate the browser must trust."""
         if self._names is None or self._authority is None:
             return []
-        shown = _TLS.format(port=self._names.port, file=near(self._authority.certificate))
+        shown = _TLS.format(port=self._names.port, file=from_here(self._authority.certificate))
         lines = [Text(line) for line in shown.splitlines()]
         if self._names.port != NAMES_PORT:
             text = f"  Port {NAMES_PORT} is in use; HIPPO's front end looks for servers there and nowhere else."
@@ -153,32 +153,32 @@ class Study:
         return lines
 
     def _how_to_play_together(self, link: str) -> list[Text]:
-        """With `players`: a link for each of them, so that one researcher can play in all places."""
+        """With `players`: a link for each place, so that one researcher can play in all of them."""
         project = self._config.project
         if not project.has_sessions:
             return []
         run = secrets.token_hex(2)
-        names = own_places.user_ids(
+        user_ids = own_places.user_ids(
             project.id,
             project.players,
             project.matching,
             self._config.groups,
             lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
         )
-        more = [self._signed(name) if project.signed_links else f"&userId={name}" for name in names]
-        said = _TOGETHER.format(
+        queries = [self._signed(each) if project.signed_links else f"&userId={each}" for each in user_ids]
+        text = _TOGETHER.format(
             places="both" if project.players == 2 else f"all {project.players}", patience=f"{project.patience:g}"
         )
         advice = own_places.advice(project.matching)
         return [
             Text(""),
-            *(Text(line) for line in said.splitlines()),
+            *(Text(line) for line in text.splitlines()),
             *([Text(f"  {advice}")] if advice else []),
-            *(Text(f"    {link}{each}", "green") for each in more),
+            *(Text(f"    {link}{each}", "green") for each in queries),
         ]
 
     def _signed(self, user_id: str) -> str:
-        """The rest of this participant's signed link."""
+        """What is appended to the study's link to make this participant's signed link."""
         project_id = self._config.project.id
         project = ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
@@ -195,28 +195,28 @@ _TLS = """\
 _TOGETHER = """\
   To play in {places} places yourself, open these links in windows side by side: a page that is hidden counts as away.
   Come to the game in each within {patience} seconds of the others (`patience`):"""
-_WHOEVER = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
-_ONE_EACH = "signedLinks is true: this link is one person's; each start makes another."
+_FOR_ALL = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
+_FOR_ONE = "signedLinks is true: this link is for one participant; each start prints another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
 _NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
 
 
 def _new_id() -> str:
-    """An id of a participant."""
+    """A new participant's id."""
     return secrets.token_hex(12)
 
 
-def near(path: Path) -> Path:
-    """The path as seen from here, if it is below."""
+def from_here(path: Path) -> Path:
+    """The path relative to the working directory, if it lies below it."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 
-def _end_others(state: Path, named_port: int | None) -> None:
-    """End servers of an earlier run whose pages know another address. Raises OSError."""
-    file, present = state / "named-port", str(named_port or "")
+def _end_servers_of_other_addresses(state: Path, named_port: int | None) -> None:
+    """End the servers of an earlier run if browsers can no longer reach them at their addresses. Raises OSError."""
+    file, now = state / "named-port", str(named_port or "")
     state.mkdir(parents=True, exist_ok=True)
     before = file.read_text() if file.exists() else ""
-    if before != present:
+    if before != now:
         end_everything(state)
-        file.write_text(present)
+        file.write_text(now)

@@ -1,4 +1,4 @@
-"""Watches the project's files while the study is held, and publishes what changes."""
+"""Watches the project's files while the study runs, and publishes it again when one changes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from local.backend.retry import message_for
 from local.check.project import check_project
 from local.publish import NotPublished, step_files
 
-LOOK = 0.5  # seconds; a change is published when two looks in a row see the same
+LOOK = 0.5  # seconds between looks; a change is complete when two looks in a row see the same
 Seen = Mapping[str, tuple[int, int]]
 Say = Callable[[str], None]
 
 
 class Watch:
-    """Looks at the project's files, and publishes what changes. `published` is told of each time.
+    """Looks at the project's files, and publishes the project again when one changes.
 
-    `config` is the project as it was published; `publish` does it again, and raises NotPublished.
+    `config` is the project as it was published last. `publish` publishes it again and returns it, or raises
+    NotPublished; `published` is called with what it returns.
     """
 
     def __init__(
@@ -38,15 +39,15 @@ class Watch:
         self._publish_all = publish
         self._published = published
         self._say = say
-        self._held_back = False  # the study goes on as it was
-        self._refused = ""  # what this machine refused when a change was to be published
-        self._wrong: set[Diagnostic] = set()  # what is known to be wrong with pages and agent.py
+        self._held_back = False  # the last change was not published
+        self._refused = ""  # the error of this machine that kept a change from being published
+        self._wrong: set[Diagnostic] = set()  # the problems of pages and agent.py at the last check
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="watch", daemon=True)
         self._known = self._look()
 
     def start(self) -> None:
-        """Say what is wrong with the pages, and go on looking."""
+        """Show the problems of pages and agent.py, and begin to look for changes."""
         self._check()
         self._thread.start()
 
@@ -60,7 +61,7 @@ class Watch:
         while not self._closed.wait(LOOK):
             try:
                 seen = self._look()
-            except OSError:  # what cannot be seen is not gone: the next look sees it
+            except OSError:  # a file that cannot be seen now is not gone
                 continue
             if seen == last != self._known:  # the change is complete
                 before, self._known = self._known, seen
@@ -71,10 +72,10 @@ class Watch:
 
     def _changed(self, changed: list[str]) -> None:
         for name in changed:
-            gone = "" if name in self._known else " is gone"
-            later = ": servers that start from now on run it" if name.endswith(".py") and not gone else ""
-            self._say(f"{name}{gone or ' changed'}{later}")
-        warm = self._config.project.warm_servers  # those that wait run what was there when they started
+            exists = name in self._known
+            later = ": servers that start from now on run it" if name.endswith(".py") and exists else ""
+            self._say(f"{name}{' changed' if exists else ' is gone'}{later}")
+        warm = self._config.project.warm_servers  # warm servers run the code with which they started
         if warm or not all(name.endswith(".py") for name in changed):
             self._publish()
         if not self._held_back:
@@ -90,7 +91,7 @@ class Watch:
             self._say("The study goes on as it was, because of this:")
             for problem in error.problems:
                 self._say(f"  {problem}")
-        except OSError as error:  # a full disk, or a file that vanishes while it is read: the next look tries again
+        except OSError as error:  # such as a full disk: the next look tries again
             self._refused = message_for(error)
             if self._refused != refused:
                 self._say(f"The study goes on as it was. {self._refused}")
@@ -102,10 +103,10 @@ class Watch:
                 self._say("The project is fine again, and the study goes on as it says now")
 
     def _check(self, changed: Collection[str] = ()) -> None:
-        """Say what is wrong with the pages and agent.py: what is new, and what concerns these files."""
+        """Show the problems of pages and agent.py that are new or concern the changed files."""
         try:
             found = check_project(self._folder, self._config)
-        except Exception as error:  # noqa: BLE001 - the study is held all the same
+        except Exception as error:  # noqa: BLE001 - the study goes on
             self._say(f"The pages could not be checked: {type(error).__name__}: {error}")
             return
         for problem in found:
@@ -116,13 +117,13 @@ class Watch:
             self._say("No mistakes are left")
 
     def _look(self) -> Seen:
-        """When each file of the project changed last, and its size. Raises OSError if that cannot be seen."""
+        """By file of the project: when it changed last (ns), and its size. Raises OSError if that cannot be seen."""
         seen = {}
-        files = [self._folder / name for name in layout.config_names()] + _gone_or(lambda: step_files(self._folder))
+        files = [self._folder / name for name in layout.config_names()] + _if_there(lambda: step_files(self._folder))
         code = layout.agent_folder(self._folder)
-        files += _gone_or(lambda: [code / name for name in names(code, ".py")])
+        files += _if_there(lambda: [code / name for name in names(code, ".py")])
         for file in files:
-            for status in _gone_or(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
+            for status in _if_there(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
                 seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
         return seen
 
@@ -131,8 +132,8 @@ def _mistaken(problems: Iterable[Diagnostic]) -> bool:
     return any(not problem.remark for problem in problems)
 
 
-def _gone_or(look: Callable[[], list[Any]]) -> list[Any]:
-    """What is there; nothing if it vanishes meanwhile."""
+def _if_there(look: Callable[[], list[Any]]) -> list[Any]:
+    """What `look` returns; an empty list if the file or folder does not exist."""
     try:
         return look()
     except (FileNotFoundError, NotADirectoryError):

@@ -1,1 +1,1 @@
-"""What the researcher's terminal shows while a study is held."""
+"""What the researcher's terminal shows while a study runs."""

@@ -1,4 +1,4 @@
-"""What the functions log: a line of the terminal for each warning and error, and all of it in a file."""
+"""The functions' log: all of it goes to a file, and the terminal shows its warnings and errors, a line each."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TextIO
 from hippodrome.log import logger
 from local.activity.log import ActivityLog
 
-_REFUSALS = {"OSError", *(kind.__name__ for kind in OSError.__subclasses__())} - {"ConnectionError", "TimeoutError"}
-_TOLD = ("server closed", "the project is full")  # the server's record says the same, with its participant
+_OS_ERRORS = {"OSError", *(kind.__name__ for kind in OSError.__subclasses__())} - {"ConnectionError", "TimeoutError"}
+_SHOWN_BY_RECORD = ("server closed", "the project is full")  # the terminal shows this by the server's record
 
 
-class Complaints(logging.Handler):
-    """Shows what the functions log as warnings and errors, in a line each; all of it is in their log."""
+class TerminalHandler(logging.Handler):
+    """Shows the warnings and errors of the functions' log in the terminal, a line each."""
 
     def __init__(self, activity_log: ActivityLog) -> None:
         super().__init__(logging.WARNING)
@@ -24,17 +24,17 @@ class Complaints(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         types = getattr(record, "error", ())
-        if any(name in _REFUSALS for name in types):
-            return  # it has been told in one sentence what this machine refuses
-        if record.getMessage() in _TOLD:
+        if any(name in _OS_ERRORS for name in types):
+            return  # `Retry` says in a sentence what this machine refuses
+        if record.getMessage() in _SHOWN_BY_RECORD:
             return
-        self._activity_log.warn(complaint(record.getMessage(), vars(record)))
+        self._activity_log.warn(log_line(record.getMessage(), vars(record)))
 
 
-def complaint(message: str, fields: Mapping[str, object]) -> str:
-    """What a function logged, in a line."""
-    told = [f"{key} {_plain(fields[key])}" for key in ("file", "line", "server", "error", "where") if key in fields]
-    return f"{message} ({', '.join(told)})" if told else message
+def log_line(message: str, fields: Mapping[str, object]) -> str:
+    """A record of the functions' log in a line: its message, and where and why, as far as `fields` say so."""
+    details = [f"{key} {_plain(fields[key])}" for key in ("file", "line", "server", "error", "where") if key in fields]
+    return f"{message} ({', '.join(details)})" if details else message
 
 
 def _plain(value: object) -> str:
@@ -43,24 +43,24 @@ def _plain(value: object) -> str:
 
 @contextlib.contextmanager
 def function_log(logs: Path, activity_log: ActivityLog) -> Iterator[None]:
-    """What the functions log goes to a file instead of the terminal, which gets their complaints in words."""
+    """Within the block, the functions log to a file in `logs`; the terminal shows their warnings and errors."""
     logs.mkdir(parents=True, exist_ok=True)
     handler = logger.registered_handler
-    complaints = Complaints(activity_log)
+    terminal = TerminalHandler(activity_log)
     with (logs / "functions.log").open("a") as file:
         log = _Log(file)
         assert isinstance(handler, logging.StreamHandler)
         before = handler.setStream(log)
-        logging.getLogger(logger.name).addHandler(complaints)
+        logging.getLogger(logger.name).addHandler(terminal)
         try:
             yield
         finally:
-            logging.getLogger(logger.name).removeHandler(complaints)
+            logging.getLogger(logger.name).removeHandler(terminal)
             handler.setStream(before)
 
 
 class _Log:
-    """A log file that is left incomplete when the disk is full, which the terminal has said already."""
+    """A log file that lacks lines if the disk is full: `Retry` has said so in the terminal."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

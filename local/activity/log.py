@@ -1,7 +1,7 @@
-"""What the researcher's terminal shows: one line for each thing that happens to a participant.
+"""What the researcher's terminal shows: one line for each event of a participant.
 
-It reads most of this from the documents as they are written. Servers write in processes of their own, so it looks at
-the folders of those that run. Ids are shortened, and answers are never shown.
+Most lines are made from documents as this process writes them. Servers write in processes of their own, so the log
+looks for new documents in the folders of those that run. Ids are shortened, and answers are never shown.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from local.backend.task_record import folder_of
 from local.backend.tasks import ProcessTasks
 
 LOOK = 0.5  # seconds
-HELD = 0.8  # seconds for which a server's line is held back: the participant's line that caused it comes first
-SHOWN = 6  # characters of an id
+HOLD_BACK = 0.8  # seconds for which a server's line waits for the participant's line that caused it
+ID_CHARACTERS = 6  # as many of an id are shown
 
 _SESSION = re.compile(r"[^/]+/sessions/([^/]+)/session\.json")
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
-_GONE = {
+_REASONS = {
     "stopped": "stopped",
     "deadline": "maxRuntime was over",
     "ended": "the trial ended",
@@ -51,18 +51,18 @@ class ActivityLog:
                 sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
         self._console = console or Console(highlight=False, soft_wrap=True)
         self.named = False
-        """Whether browsers find servers by their names."""
+        """Whether browsers find servers by their names (`TLS=1`)."""
         self._lock = threading.Lock()
         self._states: dict[str, tuple[int, str]] = {}
-        self._told: set[str] = set()
+        self._shown: set[str] = set()  # keys of answers, and ids of sessions
         self._last_step = ""
-        self._held: dict[str, tuple[threading.Timer, str]] = {}  # by participant
+        self._held: dict[str, tuple[threading.Timer, str]] = {}  # lines that are held back, by participant
         self._looking = threading.RLock()
         self._watched: dict[str, WatchedServer] = {}
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
 
-    # Lines
+    # Showing lines
 
     def show(self, *lines: Text | str) -> None:
         """Show lines as they are."""
@@ -82,22 +82,22 @@ class ActivityLog:
         """Show something that happens to a participant."""
         self._line(_short(user_id), text, style)
 
-    def _later(self, user_id: str, text: str) -> None:
+    def _hold_back(self, user_id: str, text: str) -> None:
         """Hold back a server's line, so that the participant's line which caused it comes first.
 
         A message is sent before the document that causes it is written, so a server may be faster than the answer.
         """
-        self._now(user_id)
-        timer = threading.Timer(HELD, self._now, [user_id])
+        self._show_held(user_id)
+        timer = threading.Timer(HOLD_BACK, self._show_held, [user_id])
         timer.daemon = True
         with self._lock:
             self._held[user_id] = (timer, text)
         try:
             timer.start()
-        except RuntimeError:  # this machine gives no more threads
-            self._now(user_id)
+        except RuntimeError:  # the system gives no more threads
+            self._show_held(user_id)
 
-    def _now(self, user_id: str) -> None:
+    def _show_held(self, user_id: str) -> None:
         """Show the line that is held back, if there is one."""
         with self._lock:
             timer, text = self._held.pop(user_id, (None, ""))
@@ -107,19 +107,19 @@ class ActivityLog:
 
     def _line(self, who: str, text: str, style: str = "") -> None:
         line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
-        line.append(f"{who:<{SHOWN + 1}}  ", "cyan" if who else "")
+        line.append(f"{who:<{ID_CHARACTERS + 1}}  ", "cyan" if who else "")
         line.append(text, style)
         self.show(line)
 
-    # What is written
+    # What this process writes
 
-    def study(self, steps: Iterable[str]) -> None:
-        """Set the keys of the steps, in order. An answer to the last but one brings a participant to the end."""
+    def set_steps(self, steps: Iterable[str]) -> None:
+        """Set the keys of the steps, in order. A participant who answers the last but one comes to the end."""
         keys = list(steps)
         self._last_step = keys[-2] if len(keys) > 1 else ""
 
     def wrote(self, key: str, body: bytes) -> None:
-        """Show what it means that this document was written."""
+        """Show the event that this document tells of, if it tells of one."""
         found = _PERSON.fullmatch(key)
         together = _SESSION.fullmatch(key)
         record = _json(body) if found or together or key.startswith("_servers/") else {}
@@ -132,7 +132,7 @@ class ActivityLog:
             self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
             self.participant(found[1], "arrived" if group is None else f"arrived, group {group}")
-            self._now(found[1])
+            self._show_held(found[1])
         elif together:
             self._plays_together(together[1], record)
         elif found and found[2] == "session":
@@ -143,11 +143,11 @@ class ActivityLog:
             self._answer(key, found[1], record)
 
     def _plays_together(self, session_id: str, record: dict[str, Any]) -> None:
-        """Show who plays with whom, once. The lines of their server have the session's id."""
+        """Show the members of a session, once. Later lines of their server have the session's id."""
         with self._lock:
-            if session_id in self._told:
+            if session_id in self._shown:
                 return
-            self._told.add(session_id)
+            self._shown.add(session_id)
         members = sorted(record.get("members", ()), key=lambda each: each.get("seat", 0))
         names = ", ".join(_short(str(each.get("userId"))) for each in members)
         lacking = int(record.get("players", 0)) - len(members)
@@ -155,22 +155,22 @@ class ActivityLog:
         self.participant(session_id, f"{names} {'play together' if len(members) > 1 else 'plays'}{rest}")
 
     def _forget(self, folder: str) -> None:
-        """Forget the answers of a participant who arrives: they have none yet, if the data was deleted."""
+        """Forget which answers of an arriving participant were shown: if their data were deleted, they answer again."""
         with self._lock:
-            self._told = {key for key in self._told if not key.startswith(folder)}
+            self._shown = {key for key in self._shown if not key.startswith(folder)}
 
     def _answer(self, key: str, user_id: str, record: dict[str, Any]) -> None:
         with self._lock:
-            if key in self._told:
+            if key in self._shown:
                 return
-            self._told.add(key)
+            self._shown.add(key)
         step, page = str(record.get("step", "?")), str(record.get("page", ""))
         kind = type_of(page)
         done = "played" if kind.on_server else "answered"
         self.participant(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
         if step == self._last_step:
             self.participant(user_id, "came to the end of the study", "green")
-        self._now(user_id)
+        self._show_held(user_id)
 
     def _server(self, record: dict[str, Any]) -> None:
         try:
@@ -186,22 +186,22 @@ class ActivityLog:
         if ids.is_warm_id(user_id):
             self._warm_server(record, state)
         elif state == "starting" and attempt == 1:
-            self._later(user_id, "server starting")
+            self._hold_back(user_id, "server starting")
         elif state == "starting":
             self.participant(user_id, f"server starting, attempt {attempt}")
         elif state == "ready":
-            self._now(user_id)
+            self._show_held(user_id)
             which = "has a warm server" if record.get("spare") else "server ready"
-            # A name may be the id of a person.
+            # A server's name may be a participant's id, so it is not shown.
             where = "its name, port " if self.named else f"ws://{record.get('host')}:"
             self.participant(user_id, f"{which} at {where}{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
-            text = f"server gone ({_GONE.get(reason, reason)})"
+            text = f"server gone ({_REASONS.get(reason, reason)})"
             if reason == "stopped" and not self._closed.is_set():
-                self._later(user_id, text)
+                self._hold_back(user_id, text)
                 return
-            self._now(user_id)
+            self._show_held(user_id)
             self.participant(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     def _warm_server(self, record: dict[str, Any], state: str) -> None:
@@ -212,14 +212,14 @@ class ActivityLog:
         elif state == "closed" and reason == "full":
             self.say("no slot for another warm server just now: maxServers or maxServerHours is reached")
         elif state == "closed" and reason != "taken":
-            text = f"a warm server is gone ({_GONE.get(reason, reason)})"
+            text = f"a warm server is gone ({_REASONS.get(reason, reason)})"
             (self.say if reason in ("stopped", "deadline") else self.warn)(text)
 
     # What servers write
 
     def follow(self, tasks: ProcessTasks, data: Path) -> None:
-        """Follow the running servers until `close`. Lines from before this run are not shown again."""
-        self._look(tasks, data, anew=False)
+        """Follow the running servers until `close`. Lines that they wrote before this call are not shown."""
+        self._look(tasks, data, whole_log=False)
         self._thread = threading.Thread(target=self._look_on, args=[tasks, data], name="activity", daemon=True)
         self._thread.start()
 
@@ -228,7 +228,7 @@ class ActivityLog:
         if self._thread:
             self._thread.join(2)
         for user_id in [*self._held]:
-            self._now(user_id)
+            self._show_held(user_id)
 
     def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
         while not self._closed.wait(LOOK):
@@ -237,23 +237,24 @@ class ActivityLog:
         with contextlib.suppress(OSError):
             self._look(tasks, data)
 
-    def _look(self, tasks: ProcessTasks, data: Path, anew: bool = True) -> None:
-        there = {task.name: task for task in tasks.playing()}
+    def _look(self, tasks: ProcessTasks, data: Path, whole_log: bool = True) -> None:
+        """Show the servers' new lines. `whole_log`: also earlier lines of servers that were not known."""
+        running = {task.name: task for task in tasks.playing()}
         with self._looking:
-            for name, task in there.items():
+            for name, task in running.items():
                 watched = self._watched.get(name)
                 if watched is None:
-                    self._watched[name] = WatchedServer(task, data, tasks.log(name), anew)
+                    self._watched[name] = WatchedServer(task, data, tasks.log(name), whole_log)
                 elif task.folder and watched.folder != task.folder:  # a warm server has been assigned
                     self._tell(watched)
                     watched.assign(task.folder)
             for name, watched in list(self._watched.items()):
                 self._tell(watched)
-                if name not in there:
+                if name not in running:
                     del self._watched[name]
 
     def _reserved(self, warm_server: str, folder: str) -> None:
-        """A participant or session gets this warm server: by the next look their game may be over."""
+        """Follow this warm server for the participant or session that gets it; by the next look it may have ended."""
         with self._looking:
             watched = self._watched.get(warm_server)
             if watched is not None and watched.folder != folder:
@@ -261,7 +262,7 @@ class ActivityLog:
                 watched.assign(folder)
 
     def _catch_up(self, folder: str) -> None:
-        """Show first what the participant's server has written, so that the lines are in order."""
+        """Show the new lines of this folder's server, so that they stand before the one that follows."""
         with self._looking:
             for watched in self._watched.values():
                 if watched.folder == folder:
@@ -270,12 +271,12 @@ class ActivityLog:
     def _tell(self, watched: WatchedServer) -> None:
         for key, body in watched.answers():
             self._answer(key, key.split("/")[2], _json(body))
-        for text in watched.complaints():
+        for text in watched.errors():
             self.participant(watched.user_id, text, "yellow")
 
 
 def _short(user_id: str) -> str:
-    return user_id if len(user_id) <= SHOWN else f"{user_id[:SHOWN]}…"
+    return user_id if len(user_id) <= ID_CHARACTERS else f"{user_id[:ID_CHARACTERS]}…"
 
 
 def _json(body: bytes) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What participants' servers write: their answers, and the errors in their logs."""
+"""What running servers write: answers, and errors in their logs."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ _ERROR = re.compile(r"(?:\S+:\d+: )?(?:\w+\.)*(?P<kind>\w+): (?P<text>.*)")
 
 
 class WatchedServer:
-    """A server that runs: which answers of its participant, or of its session's members, are there already.
+    """A running server: finds new answers of its participant or its session's members, and new errors in its log.
 
-    And how far its log has been read.
+    `whole_log`: also errors that are in the log already.
     """
 
-    def __init__(self, task: TaskRecord, data: Path, log: Path, anew: bool) -> None:
+    def __init__(self, task: TaskRecord, data: Path, log: Path, whole_log: bool) -> None:
         self._data = data
         self._log = log
-        self._read = 0 if anew else _size(log)
-        self._rest = b""
-        self._errors = Errors(log)
+        self._read = 0 if whole_log else _size(log)
+        self._rest = b""  # the beginning of a line that is not written to its end
+        self._reader = ErrorReader(log)
         self.assign(task.folder)
 
     def assign(self, folder: str) -> None:
-        """From now on it is the server of this participant or session: what is answered by now is not of its game."""
+        """Make it the server of this participant or session. Answers that exist by now are not of its game."""
         self.folder = folder
         self.user_id = folder.rpartition("/")[2]
-        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # of those who play
+        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # of the participants
         self._known = self._keys()
-        self._said: set[str] = set()
+        self._returned: set[str] = set()
 
     def answers(self) -> list[tuple[str, bytes]]:
-        """Answers that were not there at the last look, with their keys."""
+        """New answers since the last call: their keys, with their content."""
         if not self._folders:
             self._find_members()
             return []
@@ -50,8 +50,8 @@ class WatchedServer:
                 self._known.add(key)
         return found
 
-    def complaints(self) -> list[str]:
-        """What the server's log says of errors, each thing once: where it says so, and the error's own words."""
+    def errors(self) -> list[str]:
+        """New errors in the server's log, each text once: the logged line, and the exception in its own words."""
         try:
             with self._log.open("rb") as log:
                 log.seek(self._read)
@@ -61,14 +61,14 @@ class WatchedServer:
         self._read += len(new)
         *lines, self._rest = (self._rest + new).split(b"\n")
         found = []
-        for text in filter(None, (_anew(line) or self._errors.read(line) for line in lines)):
-            if text not in self._said:
-                self._said.add(text)
+        for text in filter(None, (_begins_anew(line) or self._reader.read(line) for line in lines)):
+            if text not in self._returned:
+                self._returned.add(text)
                 found.append(text)
         return found
 
     def _keys(self) -> set[str]:
-        """The answers that are there now."""
+        """The keys of the answers that exist now."""
         with contextlib.suppress(OSError):
             return {f"{folder}/answers/{path.name}" for folder in self._folders for path in self._answers(folder)}
         return set()
@@ -77,7 +77,7 @@ class WatchedServer:
         return (self._data / folder / "answers").glob("[!.]*.json")
 
     def _find_members(self) -> None:
-        """Look whether the session is formed. Answers that are there by then are not those of its game."""
+        """Look whether the session has been formed. Answers of its members that exist by then are not of its game."""
         with contextlib.suppress(OSError, BadSession):
             found = session.parse((self._data / self.folder / "session.json").read_bytes())
             project, ids = self.folder.partition("/")[0], [member.user_id for member in found.members if member.user_id]
@@ -85,7 +85,7 @@ class WatchedServer:
             self._known = self._keys()
 
 
-class Errors:
+class ErrorReader:
     """Finds the errors in a server's log, which is read a line at a time."""
 
     def __init__(self, log: Path) -> None:
@@ -93,7 +93,7 @@ class Errors:
         self._in_traceback = False
 
     def read(self, raw: bytes) -> str:
-        """What this line says of an error: that there is one, or its own words, indented; otherwise nothing."""
+        """The text to show for this line: a logged error, or the exception below a traceback, indented; else ""."""
         line = raw.decode("utf-8", "replace").rstrip()
         if " ERROR " in line[:40]:
             self._in_traceback = False
@@ -107,13 +107,13 @@ class Errors:
 
 
 def _advice(line: str) -> str:
-    """What `make check` says about an error of this kind, from the last line of its traceback."""
+    """The advice of `make check` for an error, by the last line of its traceback."""
     found = _ERROR.match(line)
     return remedy(found["kind"], found["text"]) if found else ""
 
 
-def _anew(raw: bytes) -> str:
-    """What to say if the trial could not play a lost server's game again up to where it was; otherwise nothing."""
+def _begins_anew(raw: bytes) -> str:
+    """What to show if the line says that a lost server's game could not be resumed where it was; otherwise ""."""
     if b" WARNING the episode cannot go on where it was" not in raw:
         return ""
     left = "something in agent.py is left to chance" if b"(Diverged)" in raw else "agent.py failed at that"
@@ -122,10 +122,10 @@ def _anew(raw: bytes) -> str:
 
 def last_error(log: Path) -> str:
     """The words of the last error in a server's log; empty if there is none."""
-    errors = Errors(log)
+    reader = ErrorReader(log)
     try:
         with log.open("rb") as lines:
-            found = [text for text in map(errors.read, lines) if text]
+            found = [text for text in map(reader.read, lines) if text]
     except OSError:
         return ""
     return found[-1].strip() if found else ""

@@ -1,7 +1,7 @@
 """A certificate authority of this machine, for `make run TLS=1`. Browsers that trust it trust names below localhost.
 
-Its certificate allows it no other names (RFC 5280, 4.2.1.10), so whoever has its key can imitate no other site.
-Each name gets a certificate of its own: browsers and OpenSSL take no `*.localhost`.
+Its certificate allows it no other names (RFC 5280, 4.2.1.10), so its key is of no use to imitate other sites.
+Each name gets a certificate of its own: browsers and OpenSSL do not accept `*.localhost`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 825
 NAME_DAYS = 90
-"""A certificate is made anew at each start, so no run needs one for longer."""
-_BACK = timedelta(hours=1)  # for a clock that is set back
+"""Days for which a name's certificate is valid. Each start makes new ones, so no run needs them for longer."""
+_BACKDATED = timedelta(hours=1)  # certificates stay valid if the clock is set back
 _COMMON_NAME = "Hippodrome on this machine"
 
 
 class Authority:
-    """The authority in `folder`; it is made if there is none, or if it ends too soon. Raises OSError."""
+    """The authority in `folder`, made anew if there is none, or if it ends within NAME_DAYS. Raises OSError."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.certificate = folder / "authority.pem"
-        """What a browser must trust."""
+        """The file of the certificate that a browser must trust."""
         self._key_file = folder / "authority.key"
         self._folder = folder
         found = self._load()
         self._own, self._key = found if found is not None else self._make()
 
     def context(self, *names: str) -> ssl.SSLContext:
-        """A server's side of TLS with a new certificate for these names and addresses."""
+        """A TLS context for a server, with a new certificate for these names and addresses."""
         chain, key = self._certify(names)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory(dir=self._folder) as place:  # readable by its owner alone
@@ -63,7 +63,7 @@ class Authority:
         return made.public_bytes(serialization.Encoding.PEM), _pem(key)
 
     def _load(self) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None:
-        """The authority that lies there, if it can be used."""
+        """The authority in the folder; None if there is none, or if it is damaged or ends within NAME_DAYS."""
         try:
             own = x509.load_pem_x509_certificate(self.certificate.read_bytes())
             key = serialization.load_pem_private_key(self._key_file.read_bytes(), None)
@@ -118,13 +118,13 @@ def _builder(subject: x509.Name, days: int) -> x509.CertificateBuilder:
         x509.CertificateBuilder()
         .subject_name(subject)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACK)
+        .not_valid_before(now - _BACKDATED)
         .not_valid_after(now + timedelta(days=days))
     )
 
 
 def general_name(name: str) -> x509.GeneralName:
-    """The name or the address, as it stands in a certificate."""
+    """A DNS name or an IP address as certificates hold it."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:

@@ -1,9 +1,9 @@
 """Queues on disk, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
 
-A message is a file from before `publish` returns until its function has succeeded. Its name counts how often it was
-received, so that a message that kills the process is given up too. A message that failed because of this machine (a
-full disk, no more files) is never given up: it comes again until it succeeds. Only the process that holds the state
-folder writes here.
+A message is stored as a file before `publish` returns; the file is removed once its function has succeeded. The file's
+name counts how often the message was received, so that a message that kills the process is given up too. A message that
+failed because of this machine (a full disk, no more files) is never given up: it is delivered again until it succeeds.
+Only the process that has locked the state folder writes here.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ from protocol import disk
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
 
-LATEST = 900  # seconds, as SQS
+LONGEST_DELAY = 900  # seconds, as SQS
 TASK = "task"  # the queue of `task_changed`: ECS events, and what `send_delayed` delays
 QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
 WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
 RETRY = (1, 2, 6, 24)
-"""Seconds until a message comes again; after one more receive it is dead. A server stops within their sum."""
+"""Seconds until a message that failed is delivered again: after the first failure, the second, and so on.
+
+After one more failure it is put aside. A server stops within their sum.
+"""
 
 
 @dataclass(order=True)
@@ -74,16 +77,17 @@ class _Queue:
         """Load the messages that an earlier process left; each is delivered when it is due. Raises OSError."""
         for name in files.names(self._folder, ".json"):
             path = self._folder / name
-            kept = files.read_json(path)
+            stored = files.read_json(path)
             try:
                 id_, received = name.removesuffix(".json").rsplit(".", 1)
-                queued = _QueuedMessage(kept["due"], kept["sent"], id_, kept["body"], int(received))
+                queued = _QueuedMessage(stored["due"], stored["sent"], id_, stored["body"], int(received))
             except (TypeError, KeyError, ValueError):
                 self._say(f"a message in {path} cannot be read")
                 continue
             heapq.heappush(self._waiting, queued)
 
     def put(self, message: Mapping[str, Any], seconds: float = 0) -> None:
+        """Store a message; it is due in so many seconds. Raises OSError."""
         now = time.time()
         body = json.dumps(message, separators=(",", ":"))
         queued = _QueuedMessage(now + seconds, now, str(uuid.uuid4()), body)
@@ -99,7 +103,7 @@ class _Queue:
 
     @property
     def idle(self) -> bool:
-        """No message that is due waits, and no handler runs."""
+        """Whether no due message waits and no handler runs."""
         with self._changed:
             due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
             return not due and not self._busy
@@ -110,11 +114,12 @@ class _Queue:
             return self._changed.wait_for(lambda: self.idle, max(0.0, until - time.monotonic()))
 
     def take_all(self) -> list[Any]:
+        """Remove all messages, and return them in the order in which they are due."""
         with self._changed:
-            several, self._waiting = sorted(self._waiting), []
-        for queued in several:
+            taken, self._waiting = sorted(self._waiting), []
+        for queued in taken:
             (self._folder / queued.file).unlink(missing_ok=True)
-        return [json.loads(queued.body) for queued in several]
+        return [json.loads(queued.body) for queued in taken]
 
     def stop(self, until: float) -> None:
         """Deliver nothing more; wait for running handlers, at most until `until` (monotonic)."""
@@ -128,7 +133,7 @@ class _Queue:
         while batch := self._take():
             try:
                 self._deliver(batch)
-            except Exception as error:  # noqa: BLE001 - the queue must go on: a full disk, a folder taken away
+            except Exception as error:  # noqa: BLE001 - the queue must go on, even with a full disk or without its folder
                 self._retry.report(error)
                 self._again(batch, counts=False)
             finally:
@@ -137,7 +142,7 @@ class _Queue:
                     self._changed.notify_all()
 
     def _take(self) -> list[_QueuedMessage]:
-        """The next messages that are due, at most a batch; waits for them. Empty if the queue is closed."""
+        """Wait for messages that are due, and return at most a batch of them; empty once the queue is stopped."""
         with self._changed:
             while self._open:
                 wait = self._waiting[0].due - time.time() if self._waiting else None
@@ -153,18 +158,19 @@ class _Queue:
         return []
 
     def _deliver(self, batch: Sequence[_QueuedMessage]) -> None:
+        """Call the function with these messages; remove those that succeeded, and deliver the others again later."""
         batch = [queued for queued in batch if self._count(queued)]
         if not batch:
             return
         failed = self._call(batch)
-        # If this machine refused something lately, even in another function, the failure may come of it: not counted.
+        # If this machine refused something lately, the failure may come of that, even in another function.
         counts = not self._retry.reported_within(RETRY[-1])
         self._again([queued for queued in batch if queued.id in failed], counts=counts)
         done = [queued for queued in batch if queued.id not in failed]
         self._again([queued for queued in done if not self._remove(queued)], counts=False)
 
     def _remove(self, queued: _QueuedMessage) -> bool:
-        """Remove the file of a message that has been handled; if that fails, the message comes again."""
+        """Remove the file of a message that has been handled; return False if this machine refuses that."""
         try:
             (self._folder / queued.file).unlink(missing_ok=True)
         except OSError as error:
@@ -191,14 +197,14 @@ class _Queue:
         try:
             answer = self.handler({"Records": [_record(queued, self.name) for queued in batch]}, None)
             failed = {item["itemIdentifier"] for item in (answer or {}).get("batchItemFailures") or ()}
-        except Exception:  # noqa: BLE001 - as SQS: whatever it was, the batch comes again
+        except Exception:  # noqa: BLE001 - as with SQS, the batch is delivered again after any error
             self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
             return everything
         return failed if failed <= everything else everything
 
-    def _again(self, several: Sequence[_QueuedMessage], *, counts: bool) -> None:
-        """Deliver these again later. If failures count, a message that has failed too often is put aside."""
-        for queued in several:
+    def _again(self, failed: Sequence[_QueuedMessage], *, counts: bool) -> None:
+        """Deliver these again later. With `counts`, put a message aside that has been received too often."""
+        for queued in failed:
             if counts and queued.received > len(RETRY) and self._put_aside(queued):
                 continue
             queued.due = time.time() + RETRY[min(max(0, queued.received - 1), len(RETRY) - 1)]
@@ -207,6 +213,7 @@ class _Queue:
                 self._changed.notify()
 
     def _put_aside(self, queued: _QueuedMessage) -> bool:
+        """Move the message's file to the folder `dead`; return False if this machine refuses that."""
         try:
             disk.make_folder(self._dead)
             (self._folder / queued.file).rename(self._dead / queued.file)
@@ -224,7 +231,7 @@ class FolderBus:
     def __init__(
         self, state: Path, handlers: Mapping[str, Handler], say: Say = print, retry: Retry | None = None
     ) -> None:
-        """Raises OSError if messages cannot be read or kept there."""
+        """Raises OSError if messages cannot be read or stored in `state`."""
         self.retry = retry or Retry(say)
         self._queues = {
             name: _Queue(
@@ -242,8 +249,8 @@ class FolderBus:
         self._queues[topic.value].put(message)
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        if not 0 <= seconds <= LATEST:
-            raise ValueError(f"a message can be delivered 0 to {LATEST} seconds later, not {seconds}")
+        if not 0 <= seconds <= LONGEST_DELAY:
+            raise ValueError(f"a message can be delivered 0 to {LONGEST_DELAY} seconds later, not {seconds}")
         self._queues[TASK].put(message, seconds)
 
     def emit(self, event: Mapping[str, Any]) -> None:
@@ -259,12 +266,14 @@ class FolderBus:
         """Wait until everything that is due has been handled; return whether it has."""
         until = time.monotonic() + seconds
         quiet = 0
-        while quiet < len(self._queues) and time.monotonic() < until:  # one may feed the others
+        while (
+            quiet < len(self._queues) and time.monotonic() < until
+        ):  # a queue's function may publish to the other queues
             quiet = sum(queue.drain(until) and queue.idle for queue in self._queues.values())
         return quiet == len(self._queues)
 
     def take(self, queue: str) -> list[Any]:
-        """Remove all messages from a queue, also those that are not due, and return them: for tests."""
+        """Remove all messages from a queue, due or not, and return them. For tests."""
         return self._queues[queue].take_all()
 
     def close(self, seconds: float = 5.0) -> None:
@@ -275,6 +284,7 @@ class FolderBus:
 
 
 def _record(queued: _QueuedMessage, queue: str) -> dict[str, Any]:
+    """The message as a record of an SQS event."""
     sent = str(int(queued.sent * 1000))
     return {
         "messageId": queued.id,

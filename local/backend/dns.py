@@ -1,4 +1,4 @@
-"""DNS records of servers in a file: this machine has no DNS of its own. Browsers connect to the address, or by TLS."""
+"""Servers' DNS records in a file. Browsers do not look names up in it: `local/web/names.py` does, with TLS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class FileDns:
     """Implements `hippodrome.ports.Dns`. A change is in sync at once."""
 
     def __init__(self, state: Path, retry: Retry | None = None, *, named: bool = False) -> None:
-        """`named`: browsers find servers by their names (`local/web/names.py`), not by their addresses."""
+        """`named`: browsers connect to servers' names (`local/web/names.py`), not to their addresses."""
         self.retry = retry or Retry()
         self._file = state / "names.json"
         self._lock = state / "locks" / "names"

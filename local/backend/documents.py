@@ -1,11 +1,11 @@
-"""Documents as files of a folder, whose names are the keys.
+"""Documents as files: a document's key is its path below the folder.
 
 A file appears whole or not at all: it is written under `scratch` and then linked (create) or renamed (replace) to its
-place. Trial servers create their documents in the same folder in the same way, from processes of their own; names that
-begin with a dot are theirs and ours while a file is unfinished, and no documents.
+place. Trial servers create their documents in the same folder in the same way, from processes of their own. Files whose
+names begin with a dot are unfinished, and no documents.
 
-One thing differs from S3: on a file system that ignores case (macOS as it is delivered), keys that differ in nothing
-else are the same document.
+One thing differs from S3: on a file system that ignores case (the default of macOS), keys that differ only in case are
+the same document.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Written = Callable[[str, bytes], None]
 class FolderDocuments:
     """Implements `hippodrome.ports.Documents`. ETags are MD5 in quotation marks, as S3's.
 
-    `written` is told of each document that this process writes, after it is in its place and on the disk.
+    `written` is called with the key and the body of each document that this process writes, once it is on the disk.
     """
 
     def __init__(self, folder: Path, state: Path, written: Written | None = None, retry: Retry | None = None) -> None:
-        """Raises OSError if documents cannot be kept there."""
+        """Raises OSError if documents cannot be stored in `folder`."""
         self.folder = folder.resolve()
         self.retry = retry or Retry()
         self._written = written
@@ -57,21 +57,21 @@ class FolderDocuments:
             self._try()
 
     def prepare(self) -> None:
-        """Make the folders, also again after they were deleted."""
+        """Make the folders that do not exist: at the start, and after they were deleted. Raises OSError."""
         for path in (self.folder, self._locks, self._scratch):
             disk.make_folder(path)
 
     def tidy(self) -> None:
-        """Remove what a process that died left unfinished. Only while no other process writes here."""
+        """Remove files that a process left unfinished when it died. Call it only while no other process writes here."""
         with contextlib.suppress(OSError):
             for name in os.listdir(self._scratch):
                 disk.remove_if_possible(self._scratch / name)
 
     def _try(self) -> None:
-        """Write a document in the way of all others. Raises OSError now, and not when a participant waits."""
+        """Write and remove a file as documents are written. Raises OSError if that fails."""
         place = self.folder / f".{secrets.token_hex(8)}.new"
         try:
-            disk.create(place, b"Can documents be kept here?", self._scratch)
+            disk.create(place, b"Can documents be stored here?", self._scratch)
         except OSError as error:
             if error.errno in _NO_LINKS:
                 raise OSError(error.errno, "this file system has no hard links") from error
@@ -91,7 +91,7 @@ class FolderDocuments:
         return known if known and known.etag == etag else Document(body, etag)
 
     def create(self, key: str, body: bytes) -> str:
-        """Raises ValueError for a key that cannot be a file."""
+        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
         path = self._writable(key)
         disk.make_folder(path.parent)
         try:
@@ -102,7 +102,7 @@ class FolderDocuments:
         return _etag(body)
 
     def replace(self, key: str, body: bytes, etag: str) -> str:
-        """Raises ValueError for a key that cannot be a file."""
+        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
         path = self._writable(key)
         with self._lock(key):
             present = self.get(key)
@@ -113,7 +113,7 @@ class FolderDocuments:
         return _etag(body)
 
     def put(self, key: str, body: bytes) -> None:
-        """Raises ValueError for a key that cannot be a file."""
+        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
         path = self._writable(key)
         with self._lock(key):
             disk.make_folder(path.parent)
@@ -121,7 +121,7 @@ class FolderDocuments:
         self._tell(key, body)
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Lazily, a folder at a time. What comes and goes meanwhile may be seen or not."""
+        """Lists lazily, a folder at a time. Documents that come or go meanwhile may be listed or not."""
         folder, _, start = prefix.rpartition("/")
         path = self._path(folder) if folder else self.folder
         if path is not None:
@@ -136,7 +136,7 @@ class FolderDocuments:
                 path.unlink()
             except (FileNotFoundError, NotADirectoryError):
                 return
-            except (IsADirectoryError, PermissionError):  # macOS says the second of a folder
+            except (IsADirectoryError, PermissionError):  # macOS raises PermissionError for a folder
                 if not path.is_dir():
                     raise
 
@@ -164,7 +164,10 @@ class FolderDocuments:
 
 
 def _walk(folder: Path, prefix: str, start: str) -> Iterator[Entry]:
-    """The documents below, in the order of their keys' bytes: a folder sorts as if its name ended with a slash."""
+    """The documents below `folder` whose first name there begins with `start`, in the order of their keys' bytes.
+
+    A folder sorts as if its name ended with a slash.
+    """
     try:
         found = [
             (os.fsencode(entry.name + "/" if entry.is_dir() else entry.name), entry)

@@ -1,4 +1,4 @@
-"""Records of ours as files, and locks. What must outlive a power cut is written by `protocol/disk.py`."""
+"""Records of local mode as JSON files, and locks. `protocol/disk.py` writes files so that they survive a power cut."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ PRIVATE = 0o600
 
 
 def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
-    """Write a whole JSON file, and bring it to the disk. Raises OSError.
+    """Write a JSON file as a whole, and bring it to the disk. Raises OSError.
 
-    Without `durable`, a power cut may bring the earlier file back.
+    Without `durable`, a power cut may bring back the earlier content.
     """
     disk.replace(path, json.dumps(data, indent=1).encode(), durable=durable)
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
+    """The content of a JSON file; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
     try:
         return json.loads(path.read_bytes())
     except (FileNotFoundError, ValueError):
@@ -32,9 +32,9 @@ def read_json(path: Path) -> Any:
 
 
 def names(folder: Path, suffix: str = "") -> list[str]:
-    """The sorted names of a folder's files that end so; without unfinished ones. Raises OSError.
+    """The sorted names in a folder that end with `suffix`, without those of unfinished files. Raises OSError.
 
-    `Path.glob` is not used, because it takes a folder that cannot be read for an empty one.
+    `Path.glob` would take a folder that cannot be read for an empty one.
     """
     return sorted(name for name in os.listdir(folder) if name.endswith(suffix) and not name.startswith("."))
 
@@ -50,7 +50,7 @@ def exists(path: Path) -> bool:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock against every other thread and process. Released by the system if the process dies."""
+    """Hold an exclusive lock against every other thread and process. The system releases it if the process dies."""
     handle = os.open(path, os.O_RDWR | os.O_CREAT, PRIVATE)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
@@ -60,7 +60,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 class InUse(Exception):
-    """Another process holds the lock; the text is what it wrote there."""
+    """Another process holds the lock; the text is the note that it left."""
 
 
 class Hold:
@@ -85,7 +85,3 @@ class Hold:
         with contextlib.suppress(OSError):
             os.ftruncate(self._handle, 0)
             os.pwrite(self._handle, note.encode(), 0)
-
-    def release(self) -> None:
-        """Release the lock."""
-        os.close(self._handle)

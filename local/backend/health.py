@@ -1,4 +1,4 @@
-"""Whether a server that was started listens."""
+"""Finds out whether a server that was started answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from local.backend.task_record import HOST
 
 
 def port_in(log: Path) -> int | None:
-    """The port that the server has written down as the first thing."""
+    """The port that the server has written into its log; None if it has not yet. Raises OSError."""
     try:
         text = log.read_bytes()
     except FileNotFoundError:

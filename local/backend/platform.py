@@ -2,10 +2,10 @@
 
 The state folder holds everything that is not data:
 
-    queue/ dead/        messages on their way, and those given up
-    timers/ tasks/ names.json clusters/      what EventBridge Scheduler, ECS and Route 53 would know
-    logs/ spool/        what servers say, and recordings that are being written
-    locks/ scratch/     of documents
+    queue/ dead/                             messages that are not handled yet, and those given up
+    timers/ tasks/ clusters/ names.json      what EventBridge Scheduler, ECS and Route 53 know on AWS
+    logs/ spool/                             logs of functions and servers, and recordings that are being written
+    locks/ scratch/                          locks of documents, and documents that are being written
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from local.publish import NotPublished, publish
 from protocol import disk
 
 DOMAIN = "localhost"
-_OURS = ("queue", "tasks", "timers")  # only this process writes there, so unfinished files are left over
-_KEPT = (KEY, MASTER_LIST)  # what cannot be made again as it was
+_OURS = ("queue", "tasks", "timers")  # folders in which only this process writes
+_KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
-LOOK = 0.5  # seconds between looks whether the data are still there
-START_RETRY_SECONDS = 5.0  # seconds in which a start is tried again that this machine refuses
+LOOK = 0.5  # seconds between looks whether the data still exist
+START_RETRY_SECONDS = 5.0  # seconds for which `start` tries again what this machine refuses
 
 HANDLERS: Mapping[str, Handler] = {
     "start": start_server.handler,
@@ -72,9 +72,9 @@ class LocalPlatform:
         subdomain: str | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        """`named_port`: where browsers find servers by their names, by TLS; None: at the servers' own ports.
+        """`named_port`: the port at which browsers find all servers by their names, with TLS.
 
-        `subdomain`: how servers are named, whatever the project says.
+        None: each server has its own port. `subdomain` says how servers are named, instead of the project's.
         """
         self._state = state
         self._project = project_folder
@@ -108,11 +108,11 @@ class LocalPlatform:
         self._guard: threading.Thread | None = None
 
     def publish(self) -> Config:
-        """Register the project, and copy its pages. Raises NotPublished."""
+        """Register the project, and copy its pages to the documents. Raises NotPublished."""
         return publish(self._project, self.documents, self._subdomain, self._say)
 
     def port_of(self, name: str) -> int | None:
-        """The port of the server with this DNS name; None if no server has it."""
+        """The port of the server with this DNS name; None if there is no such server."""
         label, _, domain = name.partition(".")
         return self.tasks.port_of(label) if domain == DOMAIN and self.dns.has(name) else None
 
@@ -123,11 +123,11 @@ class LocalPlatform:
         return [act() for act in acts]
 
     def start(self) -> None:
-        """Go on where the last process was cut off. Raises OSError if that is impossible."""
+        """Continue where the last process ended. Raises OSError if this machine refuses that."""
         installed.use(self)
         self.documents.tidy()
-        for left in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
-            disk.remove_if_possible(left)
+        for unfinished in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
+            disk.remove_if_possible(unfinished)
         kept = {key: self.documents.get(key) for key in _KEPT}
         self._guard = threading.Thread(target=self._look_after, args=[kept], name="guard", daemon=True)
         threads = [partial(start, thread) for thread in (self._sweeper, self._guard)]
@@ -136,7 +136,7 @@ class LocalPlatform:
             self.retry.run(step, seconds=START_RETRY_SECONDS)
 
     def close(self, seconds: float = 5.0) -> None:
-        """End every server, and see their ends through the functions; what is left is done at the next start."""
+        """End every server, and let the functions handle that; what they leave, the next start handles."""
         self._closed.set()
         self.timers.close()
         self.tasks.close(seconds)
@@ -144,41 +144,47 @@ class LocalPlatform:
         self.bus.close(2)
         installed.use(None)
 
-    # The data folder, which the researcher may delete while the study is held
+    # The data folder, which the researcher may delete while the study runs
 
     def _look_after(self, kept: dict[str, Document | None]) -> None:
-        """Notice when the registration, the pages or the records are gone; then publish the study again."""
-        known, last, told = frozenset[str](), frozenset[str](), False
+        """Look whether the registration, the pages or the records were deleted; if so, publish the study again.
+
+        `kept` are the documents of `_KEPT`, as they were at the start.
+        """
+        known, last, warned = frozenset[str](), frozenset[str](), False
         while not self._closed.wait(LOOK):
             try:
                 kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
-                seen = self._signs()
-            except OSError as error:  # what cannot be seen is not gone
+                seen = self._existing()
+            except OSError as error:  # nothing was deleted, as far as can be seen
                 self.retry.report(error)
                 continue
-            gone = known - seen
-            if gone and seen == last:  # the deletion is complete
-                if not told:
-                    self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or what the study needs of it.")
+            deleted = known - seen
+            if deleted and seen == last:  # the deletion is complete
+                if not warned:
+                    self._say(
+                        f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or files in it that the study needs."
+                    )
                 try:
-                    self._begin_again(kept, servers="_servers" in gone)
-                    known, told = self._signs(), False
+                    self._begin_again(kept, servers="_servers" in deleted)
+                    known, warned = self._existing(), False
                 except Exception as error:  # noqa: BLE001 - the next look tries again
-                    if not told:
-                        self._say(f"The study cannot be published again (yet): {_words(error)}")
-                    told = True
-            elif not gone:
+                    if not warned:
+                        self._say(f"The study cannot be published again (yet): {_reason(error)}")
+                    warned = True
+            elif not deleted:
                 known = seen
             last = seen
 
-    def _signs(self) -> frozenset[str]:
-        """What is there while all is well. Raises OSError if that cannot be seen."""
+    def _existing(self) -> frozenset[str]:
+        """Those of the study's documents and folders in the data that exist. Raises OSError if that cannot be seen."""
         folder = self.documents.folder
         projects = files.names(folder) if files.exists(folder) else []
         wanted = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
         return frozenset(name for name in wanted if files.exists(folder / name))
 
     def _begin_again(self, kept: Mapping[str, Document | None], *, servers: bool) -> None:
+        """Publish the study again. `servers`: their records were deleted, so they are ended."""
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
         for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid
@@ -186,12 +192,13 @@ class LocalPlatform:
                 with contextlib.suppress(Conflict):
                     self.documents.create(key, document.body)
         self.publish()
-        installed.use(self)  # functions forget what they have kept
+        installed.use(self)  # the functions forget what they have cached
         self._say("The study was published again and goes on. Answers that were deleted do not come back.")
         if ended:
             self._say(f"{ended} server(s) whose records were deleted have been ended.")
 
     def _sweep(self) -> None:
+        """Call the function `sweep` now and then, as EventBridge does."""
         handler = self._handlers.get("sweep")
         wait = SWEEP_FIRST
         while handler and not self._closed.wait(wait):
@@ -202,11 +209,12 @@ class LocalPlatform:
                 self._say(f"the sweep failed: {type(error).__name__}: {error}")
 
 
-def _words(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     return "; ".join(error.problems) if isinstance(error, NotPublished) else f"{type(error).__name__}: {error}"
 
 
 def _scheduled(now: datetime) -> dict[str, Any]:
+    """The event of an EventBridge schedule."""
     return {
         "version": "0",
         "id": "local",

@@ -1,7 +1,7 @@
-"""The processes of servers: each below a shell that waits for it and writes down its exit status.
+"""The processes of servers: a shell starts each of them, waits for it, and writes its exit status to a file.
 
-Both carry the mark `-X hippodrome={state folder}/{name}` in their command line, by which they are found again. A
-process id alone proves nothing: the system assigns it again.
+Shell and server carry the mark `-X hippodrome={state folder}/tasks/{name}` in their command lines, by which they are
+found again. A process id alone proves nothing: the system assigns it again.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import psutil
 from hippodrome.ports import Refused
 
 SHELL = '"$@" & echo $! > "$0.pid"; wait $!; status=$?; echo $status > "$0.exit"; exit $status'
-"""Writes the process id of its command to `{$0}.pid` and the exit status to `{$0}.exit`."""
+"""Runs the command of its arguments; writes its process id to the file `{$0}.pid`, its exit status to `{$0}.exit`."""
 
-# What the system says of a command that cannot be run, however often it is tried.
+# Errors of a command that can never be run, however often it is tried.
 _REFUSED = (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.ENOEXEC, errno.E2BIG, errno.EINVAL)
 
 
 def spawn(
     command: Sequence[str], notes: Path, log: Path, *, mark: str, folder: Path, environment: Mapping[str, str]
 ) -> subprocess.Popen[bytes]:
-    """Start the shell with the command, in a session of its own.
+    """Start the shell with the command, in a session of its own. It writes the files `notes` + ".pid" and ".exit".
 
     Raises `Refused` if the command can never be run, and OSError if it may be later.
     """
@@ -51,7 +51,7 @@ def spawn(
 
 
 def mark_of(state: Path, name: str) -> str:
-    """What is in the command line of a server's processes."""
+    """The mark in the command lines of a server's processes."""
     return f"hippodrome={state.resolve() / 'tasks' / name}"
 
 
@@ -69,13 +69,13 @@ def marked(state: Path) -> dict[str, list[psutil.Process]]:
 
 
 def end_everything(state: Path) -> None:
-    """Kill whatever servers of this state folder there are."""
+    """Kill all servers of this state folder."""
     for processes in marked(state).values():
         kill(processes)
 
 
 def process_of(pid: int | None, mark: str) -> psutil.Process | None:
-    """The process of that id, if it is the one that carries the mark."""
+    """The process with that id, if it carries the mark; otherwise None."""
     if pid is None:
         return None
     try:
@@ -86,7 +86,7 @@ def process_of(pid: int | None, mark: str) -> psutil.Process | None:
 
 
 def child_of(shell: int | None, mark: str) -> psutil.Process | None:
-    """The server that this shell has started, if its id could not be written down."""
+    """The server below this shell, for the case that its id could not be written down; None if there is none."""
     try:
         children = psutil.Process(shell).children() if shell else []
     except psutil.Error:
@@ -104,7 +104,7 @@ def is_shell(process: psutil.Process) -> bool:
 
 
 def kill(processes: Sequence[psutil.Process]) -> None:
-    """Kill processes that carry a mark, and what they have started: each server leads a group of its own."""
+    """Kill the process groups of these processes: a server's group holds its shell and all that it has started."""
     for process in processes:
         with contextlib.suppress(psutil.Error, OSError):
             kill_group(os.getpgid(process.pid) if process.is_running() else None)

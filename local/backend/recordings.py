@@ -14,7 +14,7 @@ from protocol.keys import with_number
 
 
 def unfinished(spool: Path, task: TaskRecord) -> Sequence[Path]:
-    """The task's recordings in the spool that belong into the data folder. Raises OSError."""
+    """The task's recordings in the spool that belong in the data folder. Raises OSError."""
     if not (task.kept and task.folder):
         return []
     folder = spool / f"{task.folder}/trials/{task.server or task.name}"
@@ -22,14 +22,14 @@ def unfinished(spool: Path, task: TaskRecord) -> Sequence[Path]:
 
 
 def move_to_data(spool: Path, data: Path, task: TaskRecord) -> None:
-    """Put the task's unfinished recordings where they belong. Raises OSError; may be called again."""
+    """Move the task's unfinished recordings to the data folder. Raises OSError; it may then be called again."""
     for recording in unfinished(spool, task):
         place = data / recording.relative_to(spool)
         _move(recording, place.with_name(place.name.removesuffix(".part")))
 
 
 def _move(file: Path, place: Path) -> None:
-    """Move a recording, also to another file system; nothing is overwritten. May be interrupted, and done again."""
+    """Move a recording without overwriting a file, even to another file system. Can be called again if interrupted."""
     disk.make_folder(place.parent)
     for number in count(1):
         numbered = place.with_name(with_number(place.name, number))
@@ -37,6 +37,6 @@ def _move(file: Path, place: Path) -> None:
             disk.move(file, numbered)
         except FileExistsError:
             if not filecmp.cmp(file, numbered, shallow=False):
-                continue  # another recording of that name
+                continue  # another recording has that name
         break
     file.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
-"""What this machine refuses (a full disk, no more open files) is tried again, and told in one sentence.
+"""Tries again what this machine refuses (a full disk, no more open files), and says so in one sentence.
 
-Nothing that local mode does for a participant ends with an error of the operating system: the code that meets one tries
-again, with growing pauses, until it works.
+Nothing that local mode does for a participant ends with an error of the operating system: the code that gets one tries
+again, with growing pauses, until it succeeds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 FIRST, LONGEST = 0.05, 10.0  # seconds between two attempts
-SILENCE = 60.0  # seconds until the same is told again
+SILENCE = 60.0  # seconds until the same sentence is said again
 
 _FULL = "The disk is full: please make room"
 _FILES = "This machine cannot open more files: please close programs, or raise the limit (`ulimit -n`)"
@@ -40,45 +40,45 @@ P = TypeVar("P")
 
 
 class Retry:
-    """Tries again, and tells what this machine refuses: one sentence a minute, without names of files.
+    """Tries again, and says what this machine refuses: each sentence once a minute at most.
 
-    Names of files hold participants' ids.
+    The sentences name no files, since file names contain participants' ids.
     """
 
     def __init__(self, say: Say = print) -> None:
         self._say = say
         self._lock = threading.Lock()
-        self._told: dict[str, float] = {}
+        self._said_at: dict[str, float] = {}
         self._last = -math.inf
 
     def report(self, error: BaseException) -> None:
-        """Tell of it, and remember when it was."""
+        """Say what this machine refused, and remember when."""
         text = message_for(error)
         with self._lock:
             now = self._last = time.monotonic()
-            if now < self._told.get(text, -SILENCE) + SILENCE:
+            if now < self._said_at.get(text, -SILENCE) + SILENCE:
                 return
-            self._told[text] = now
+            self._said_at[text] = now
         self._say(text)
 
     def reported_within(self, seconds: float) -> bool:
-        """Whether this machine has refused something within so many seconds."""
+        """Whether this machine has refused something within the last `seconds`."""
         return time.monotonic() < self._last + seconds
 
     def run(
         self, act: Callable[[], T], wait: Callable[[float], object] = time.sleep, seconds: float | None = None
     ) -> T | None:
-        """The result of `act`, tried again until it works.
+        """Call `act` until it succeeds, and return its result.
 
-        Gives up, with None, when `wait` (a pause of so many seconds) returns True; or, if `seconds` are given, raises
-        the last error when they are over.
+        `wait` pauses for so many seconds; if it returns True, this gives up and returns None. If `seconds` are given,
+        the last error is raised when they are over.
         """
         until = None if seconds is None else time.monotonic() + seconds
         pause = FIRST
         while True:
             try:
                 return act()
-            except Exception as error:  # whatever it is, the server must not be lost sight of
+            except Exception as error:  # any error: a server must be followed to its end
                 self.report(error)
                 if until is not None and time.monotonic() + pause > until:
                     raise
@@ -88,49 +88,50 @@ class Retry:
 
 
 def message_for(error: BaseException) -> str:
-    """What the machine refuses, and what to do about it."""
+    """The sentence for the researcher: what this machine refuses, and what to do about it."""
     number = getattr(error, "errno", None)
     words = _WORDS.get(number or 0)
     if words is None:
-        what = (isinstance(error, OSError) and error.strerror) or type(error).__name__
-        words = f"This machine refused something ({what})"
+        reason = (isinstance(error, OSError) and error.strerror) or type(error).__name__
+        words = f"This machine refused something ({reason})"
     return f"{words}. Nothing is lost: it is tried again until it works."
 
 
 def reports_errors(port: type[P]) -> type[P]:
-    """Decorate the class of a port: an OSError of a public method is reported to `retry`, and raised again."""
+    """Decorates the class of a port: an OSError of a public method is reported to `self.retry` and raised again."""
     for name, method in list(vars(port).items()):
         if not name.startswith("_") and inspect.isfunction(method):
-            setattr(port, name, _listing(method) if inspect.isgeneratorfunction(method) else _telling(method))
+            wrap = _reporting_generator if inspect.isgeneratorfunction(method) else _reporting
+            setattr(port, name, wrap(method))
     return port
 
 
-def _telling(method: Callable[..., T]) -> Callable[..., T]:
+def _reporting(method: Callable[..., T]) -> Callable[..., T]:
     @functools.wraps(method)
-    def told(self: Any, *args: Any, **options: Any) -> T:
+    def reporting(self: Any, *args: Any, **options: Any) -> T:
         try:
             return method(self, *args, **options)
         except OSError as error:
             self.retry.report(error)
             raise
 
-    return told
+    return reporting
 
 
-def _listing(method: Callable[..., Iterator[T]]) -> Callable[..., Iterator[T]]:
+def _reporting_generator(method: Callable[..., Iterator[T]]) -> Callable[..., Iterator[T]]:
     @functools.wraps(method)
-    def told(self: Any, *args: Any, **options: Any) -> Iterator[T]:
+    def reporting(self: Any, *args: Any, **options: Any) -> Iterator[T]:
         try:
             yield from method(self, *args, **options)
         except OSError as error:
             self.retry.report(error)
             raise
 
-    return told
+    return reporting
 
 
 def start_thread(target: Callable[..., object], *args: object, name: str) -> threading.Thread:
-    """A daemon thread that runs. Raises OSError (EAGAIN) if this machine gives no more threads."""
+    """Start a daemon thread, and return it. Raises OSError (EAGAIN) if this machine gives no more threads."""
     thread = threading.Thread(target=target, args=args, name=name, daemon=True)
     start(thread)
     return thread

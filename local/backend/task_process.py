@@ -1,10 +1,10 @@
 """One task: the process of its server, followed from its start to its end.
 
-Things are written in an order in which no process leaks: the intent, then the process, then its id; an event, then that
-it was sent. If this process is killed in between, the event is repeated.
+No process is lost, even if `make run` is killed: the task's record is written before its process begins, and again with
+the process id. An event is sent before the record says so; if `make run` is killed in between, it is sent again.
 
-Each server has a thread that follows it. If the machine refuses something, the thread tries again until it works
-(`retry.py`). So it notices the end of each server, even with a full disk, or with a data folder on another file system.
+Each server has a thread that follows it. If this machine refuses something, the thread tries again until it succeeds
+(`retry.py`). So it notices the end of each server, even with a full disk.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from local.backend.task_record import HOST, KILLED, TaskFolder, TaskRecord, even
 from protocol import disk, environment, handover
 
 START_TIMEOUT = 120.0  # seconds in which a server must listen
-RESCUE_TIMEOUT = 10.0  # seconds for which a server's end is held back while its recordings cannot be moved
+RESCUE_TIMEOUT = 10.0  # seconds for which the event of a server's end waits for its recordings to be moved
 
 _AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it needs no credentials
 
@@ -42,7 +42,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Shared:
-    """What all servers of a study share: the folders, how a server is run, and who is told of it."""
+    """What all servers of a study share: folders, the command that runs them, and functions to report to."""
 
     state: Path
     logs: Path
@@ -56,11 +56,11 @@ class Shared:
     say: Say
     retry: Retry
     lock: threading.RLock = field(default_factory=threading.RLock)
-    closed: threading.Event = field(default_factory=threading.Event)  # this process ends
+    closed: threading.Event = field(default_factory=threading.Event)  # this process is ending
 
     @property
     def agent_folder(self) -> Path:
-        """Where agent.py is."""
+        """The folder of agent.py."""
         return layout.agent_folder(self.project).resolve()
 
     def log(self, name: str) -> Path:
@@ -88,33 +88,33 @@ class Shared:
 
 
 class TaskProcess:
-    """A task, its process, and the thread that follows it."""
+    """A task with its process, and the thread that follows it."""
 
     def __init__(self, task: TaskRecord, shared: Shared) -> None:
         self.task = task
         self.begun = threading.Event()  # there is a process, or there will be none
-        self.gone = threading.Event()  # the process is gone and the event is sent
-        self.forgotten = threading.Event()  # its file is not written any more
-        self.silent = False  # no more events: its record is gone, and a new server may have its name
+        self.gone = threading.Event()  # the process is gone and its last event is sent
+        self.forgotten = threading.Event()  # its file is removed, and not written any more
+        self.silent = False  # it sends no events: the server's record was deleted, and a new server may have its name
         self.unsaved = False  # the task has changed since it was saved
         self._shared = shared
         self._child: subprocess.Popen[bytes] | None = None
         self._ending: threading.Thread | None = None
         self._exit_code: int | None = None
-        self._over = False  # its process is gone; the event that says so may not have been sent yet
+        self._over = False  # the process is gone; its last event may not have been sent yet
 
     @property
     def lives(self) -> bool:
-        """Whether it counts as running. As in ECS's lists, it does not once it was asked to stop."""
+        """Whether it counts as running. As in ECS's lists, a task does not once it was asked to stop."""
         return not self._over and self.task.status != "STOPPED" and self.task.asked is None
 
-    # What the port does with it
+    # What `ProcessTasks` calls
 
     def begin(self, request: TaskRequest) -> None:
-        """Start the process and the thread that follows it, which waits for `begun`.
+        """Start the process, and a thread that follows it once the caller has set `begun`.
 
-        If one of them cannot be started, there is neither. Raises `Refused` if the command can never be run, OSError if
-        it may be possible later.
+        If one of them cannot be started, neither runs. Raises `Refused` if the command can never be run, OSError if it
+        may be possible later.
         """
         self._save()
         self._shared.files.remove_notes(self.task.name)
@@ -124,21 +124,21 @@ class TaskProcess:
         except BaseException:
             self.forgotten.set()
             self.begun.set()
-            # If the file stays, the next start sees that no process began.
+            # If the file stays, `ProcessTasks.start` sees by it that no process began.
             disk.remove_if_possible(self._shared.files.file(self.task.name))
             raise
-        # From here on there is a process, and nothing may fail. The thread saves the rest.
+        # The process runs now, so nothing may fail here: the thread saves its id.
         self.task, self.unsaved = replace(self.task, pid=self._child.pid), True
 
     def take_up(self) -> None:
-        """Follow the process that an earlier `make run` has started, or send its end."""
+        """Follow the process that an earlier `make run` has started; if it has ended, send the event of its end."""
         self._follow()
         self.begun.set()
 
-    def end(self, reason: str, until: float, *, surely: bool = False) -> None:
+    def end(self, reason: str, until: float, *, even_unsaved: bool = False) -> None:
         """Send SIGTERM; send SIGKILL at `until` (monotonic). Returns at once.
 
-        Raises OSError if the reason cannot be saved; then no signal is sent. With `surely` it is sent all the same.
+        Raises OSError if the reason cannot be saved; then no signal is sent. With `even_unsaved`, SIGTERM is sent even then.
         """
         with self._shared.lock:
             if self.task.status == "STOPPED":
@@ -148,7 +148,7 @@ class TaskProcess:
                 self._see_out_later(until)
                 self._save(asked=self.task.asked or reason)
             except OSError:
-                if not surely:
+                if not even_unsaved:
                     raise
                 self.task, self.unsaved = replace(self.task, asked=self.task.asked or reason), True
                 try:
@@ -157,7 +157,7 @@ class TaskProcess:
                     self.kill_at_once()
 
     def kill_at_once(self) -> None:
-        """Send SIGKILL, if the process lives or that cannot be seen."""
+        """Send SIGKILL, unless the process is known to have ended."""
         try:
             lives = self._lives()
         except OSError:
@@ -166,12 +166,12 @@ class TaskProcess:
             kill_group(self.task.pid)
 
     def forget(self) -> None:
-        """Remove its file, which is not written again. Raises OSError."""
+        """Remove its file, and do not write it again. Raises OSError."""
         self.forgotten.set()
         self._shared.files.file(self.task.name).unlink(missing_ok=True)
 
     def read_handover(self) -> None:
-        """Save to whom a warm server was assigned, if it was. Raises OSError if that cannot be read or saved."""
+        """If it is a warm server that has been assigned, save to whom. Raises OSError if that is refused."""
         with self._shared.lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = self.task
             if task.handover_key and not task.folder and not self.forgotten.is_set():
@@ -200,18 +200,18 @@ class TaskProcess:
         start_thread(self._life, name=f"task {self.task.name}")
 
     def _life(self) -> None:
-        """Follow a process from its start to its end: send an event for each change, and save that it was sent."""
+        """Follow the process from its start to its end: send an event for each change, and save that it was sent."""
         self.begun.wait()
         if self.task.status != "STOPPED":
             self._retry(self._see_start)
             self._retry(self._wait)
             self._rescue_in_time()
-            self._retry(self._tell_end)
+            self._retry(self._send_end)
         self._retry(self._clear)
         self.gone.set()
 
     def _retry(self, act: Callable[[], T], seconds: float | None = None) -> T | None:
-        """The result of `act`, tried again until it works; None if this process ends or the server is forgotten."""
+        """Call `act` until it succeeds, and return its result; None if `make run` ends or the server is forgotten."""
 
         def over() -> bool:
             return self._shared.closed.is_set() or self.forgotten.is_set()
@@ -222,17 +222,18 @@ class TaskProcess:
         return None if over() else self._shared.retry.run(act, wait, seconds)
 
     def _see_start(self) -> None:
+        """Send the events PROVISIONING and RUNNING, if they have not been sent. Raises OSError."""
         if self.task.version == 0:
-            self._tell()
+            self._send()
         elif self.unsaved:
             self._save()
-        if self.task.asked:  # by a process that was killed before it had ended the server
+        if self.task.asked:  # by an earlier `make run` that was killed before the server had ended
             self.end(self.task.asked, time.monotonic() + self._shared.stop_timeout)
         if self.task.status == "PROVISIONING" and self._listens():
-            self._tell(status="RUNNING", started=now())
+            self._send(status="RUNNING", started=now())
 
     def _listens(self) -> bool:
-        """Wait until the server answers; return False if it is gone. Kill it after `START_TIMEOUT`. Raises OSError."""
+        """Wait until the server answers; return False if it ends. Kill it after `START_TIMEOUT`. Raises OSError."""
         until = time.monotonic() + START_TIMEOUT
         while self._lives():
             port = port_in(self._log)
@@ -252,59 +253,63 @@ class TaskProcess:
         return process_of(self.task.pid, self._mark) is not None
 
     def _wait(self) -> None:
-        """Wait until it is gone; then kill what it has left running, as the end of a container does."""
+        """Wait until it ends; then kill what it has left running, as the end of a container does."""
         process = self._child or process_of(self.task.pid, self._mark)
         if process:
             process.wait()
             kill_group(process.pid)
 
-    def _tell_end(self) -> None:
+    def _send_end(self) -> None:
+        """Send the event STOPPED, if it has not been sent. Raises OSError."""
         if self.task.status == "STOPPED":  # the event was sent, but that is not saved yet
             self._save()
             return
         self._exit_code = self._find_exit_code()
         self._over = True  # before the event is sent: its receiver must not find the task in `list`
-        self._tell(status="STOPPED", stopped=now())
+        self._send(status="STOPPED", stopped=now())
 
     def _find_exit_code(self) -> int | None:
+        """The server's exit code; None if no process began. Raises OSError."""
         note = self._shared.files.note(self.task.name, "exit")
         if note.isdecimal():
             return int(note)
         if self._child and self._child.returncode is not None and self._child.returncode >= 0:
-            return self._child.returncode  # the shell's, which is that of the server: it could not write it down
+            return self._child.returncode  # the shell exits with the server's code, and could not write its note
         return KILLED if self.task.pid else None  # the shell was killed with it
 
     def _clear(self) -> None:
-        """Do what is left when the event of its end has been sent."""
+        """Move the recordings that are left, and remove the notes of the shell. Raises OSError."""
         try:
             self._rescue()
             self._shared.files.remove_notes(self.task.name)
         finally:
-            self.gone.set()  # no caller waits for what cannot be done at once
+            self.gone.set()  # no caller waits until all that succeeds
 
     # Its end
 
     def _see_out_later(self, until: float) -> None:
+        """Start the thread that ends the server, if none does so already. Raises OSError."""
         if not (self._ending and self._ending.is_alive()):
             self._ending = start_thread(self._see_out, until, name=f"end {self.task.name}")
 
     def _see_out(self, until: float) -> None:
+        """Send SIGTERM, and SIGKILL at `until`."""
         with self._shared.lock:  # held by `end` until the reason is saved
             if not self.task.asked:
                 return
-        self._retry(lambda: self._ask_soon(until))
+        self._retry(lambda: self._terminate_soon(until))
         if not self.gone.wait(max(0.0, until - time.monotonic())):
             self._retry(self._kill)
 
-    def _ask_soon(self, until: float) -> None:
+    def _terminate_soon(self, until: float) -> None:
         """Send SIGTERM to the server as soon as there is one."""
         while not self.gone.is_set() and time.monotonic() < until:
-            if self._ask():
+            if self._terminate():
                 break
             self.gone.wait(0.02)  # the shell has not started it yet
 
-    def _ask(self) -> bool:
-        """Send SIGTERM to the server; return whether it is there. Raises OSError."""
+    def _terminate(self) -> bool:
+        """Send SIGTERM to the server; return False if it has not begun. Raises OSError."""
         note, mark = self._shared.files.note(self.task.name, "pid"), self._mark
         server = process_of(int(note), mark) if note.isdecimal() else child_of(self.task.pid, mark)
         if server is None:
@@ -320,7 +325,10 @@ class TaskProcess:
     # Its recordings
 
     def _rescue_in_time(self) -> None:
-        """Move the recordings before the end is sent: the next server resumes from them. Give up in time."""
+        """Move the recordings before the event of the end is sent, since the next server resumes from them.
+
+        Give up after RESCUE_TIMEOUT: the participant must not wait for it.
+        """
         try:
             self._retry(self._rescue, RESCUE_TIMEOUT)
         except Exception:  # noqa: BLE001 - `_clear` tries again
@@ -332,17 +340,18 @@ class TaskProcess:
         self.read_handover()
         recordings.move_to_data(self._shared.spool, self._shared.data, self.task)
 
-    # What is written down
+    # Its record and its events
 
     def _save(self, **changes: Any) -> None:
-        """Write the changed task to disk, then use it. Raises OSError."""
+        """Write the changed task to its file, then keep it here. Raises OSError."""
         with self._shared.lock:
             task = replace(self.task, **changes)
             if not self.forgotten.is_set():
                 self._shared.files.save(task)
             self.task, self.unsaved = task, False
 
-    def _tell(self, **changes: Any) -> None:
+    def _send(self, **changes: Any) -> None:
+        """Send the event of the changed task, then save the task. Raises OSError."""
         task = replace(self.task, version=self.task.version + 1, **changes)
         if not self.silent:
             self._shared.emit(event(task, self._exit_code))

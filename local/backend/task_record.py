@@ -1,4 +1,4 @@
-"""What is kept on the disk of each task, and the ECS events that tell of it."""
+"""The record of a task on the disk, and the ECS events that are made from it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KILLED = 137
 
 @dataclass(frozen=True)
 class TaskRecord:
-    """A task as it is kept on the disk."""
+    """A task: a server of one participant or session, as it is stored."""
 
     name: str
     cluster: str
@@ -32,16 +32,16 @@ class TaskRecord:
     created: str
     pid: int | None = None  # of the shell, which leads the process group
     port: int | None = None
-    status: str = "PROVISIONING"  # the last status that was told
+    status: str = "PROVISIONING"  # ECS's word, as in the last event
     version: int = 0
     started: str | None = None
     stopped: str | None = None
-    asked: str | None = None  # why it was asked to stop
-    folder: str = ""  # the participant's or the session's, below data and spool; empty until a warm server has one
-    server: str = ""  # the name of its recordings' folder, if not its own
+    asked: str | None = None  # the reason for which it was asked to stop; None if it was not
+    folder: str = ""  # the participant's or session's, below data and spool; empty until a warm server is assigned
+    server: str = ""  # the name of its folder of recordings; empty: its own name
     handover_key: str = ""  # of a warm server's handover; stored as `warm_server`
-    kept: bool = False  # whether recordings belong into the data folder
-    claim: str = ""  # a hash of its token: which server of that name it is
+    kept: bool = False  # whether its recordings belong in the data folder
+    claim: str = ""  # a hash of its token, by which servers of the same name differ
 
     @property
     def arn(self) -> str:
@@ -53,7 +53,7 @@ class TaskRecord:
 
     @classmethod
     def of(cls, request: TaskRequest, id_: str) -> TaskRecord:
-        """The task that is requested, before it has a process."""
+        """The record of a requested task that has no process yet."""
         return cls(
             name=request.name,
             cluster=request.cluster,
@@ -67,18 +67,18 @@ class TaskRecord:
 
 
 class TaskFolder:
-    """The folder of the tasks' files: of each its record, and the notes of its shell (`processes.SHELL`)."""
+    """The folder with the tasks' files: for each task its record, and the notes of its shell (`processes.SHELL`)."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def save(self, task: TaskRecord) -> None:
-        """Keep the record. Raises OSError."""
-        # After a power cut every process is gone: to know that there was one is enough to tell its end.
+        """Write the record. Raises OSError."""
+        # After a power cut every process is gone: the first version suffices to send the event of its end.
         files.write_json(self.file(task.name), _to_json(task), durable=task.version == 0)
 
     def load(self) -> Iterator[TaskRecord]:
-        """The records that can be read. Raises OSError."""
+        """Read the records; those that cannot be parsed are left out. Raises OSError."""
         for name in files.names(self.path, ".json"):
             try:
                 yield _from_json(files.read_json(self.path / name))
@@ -86,19 +86,19 @@ class TaskFolder:
                 continue
 
     def note(self, name: str, kind: str) -> str:
-        """What the shell has written ("pid" or "exit"); empty if it has not. Raises OSError."""
+        """The shell's note of this kind ("pid" or "exit"); empty if there is none. Raises OSError."""
         try:
             return self.file(name, kind).read_text().strip()
         except FileNotFoundError:
             return ""
 
     def remove_notes(self, name: str) -> None:
-        """Remove what the shell has written. Raises OSError."""
+        """Remove the shell's notes. Raises OSError."""
         for kind in ("pid", "exit"):
             self.file(name, kind).unlink(missing_ok=True)
 
     def file(self, name: str, kind: str = "json") -> Path:
-        """A file of the task's: its record ("json"), or a note."""
+        """The path of a task's record ("json") or of a note."""
         return self.path / f"{name}.{kind}"
 
 
@@ -108,7 +108,7 @@ def _to_json(task: TaskRecord) -> dict[str, Any]:
 
 
 def _from_json(stored: Any) -> TaskRecord:
-    """The stored record. Raises TypeError if this is no record."""
+    """The record from its stored form. Raises TypeError if this is none."""
     fields = dict(**stored)
     handover = fields.pop("warm_server", "")
     return TaskRecord(**fields, handover_key=handover)
@@ -149,8 +149,8 @@ def event(task: TaskRecord, exit_code: int | None = None) -> dict[str, Any]:
             detail |= {"stopCode": "TaskFailedToStart", "stoppedReason": "The process could not be started"}
         else:
             killed = ": the process was killed" if exit_code == KILLED else ""
-            said = f"Essential container in task exited{killed}"
-            detail |= {"stopCode": "EssentialContainerExited", "stoppedReason": said}
+            reason = f"Essential container in task exited{killed}"
+            detail |= {"stopCode": "EssentialContainerExited", "stoppedReason": reason}
         if exit_code is not None:
             detail["containers"][0]["exitCode"] = exit_code
     return {
@@ -167,33 +167,33 @@ def event(task: TaskRecord, exit_code: int | None = None) -> dict[str, Any]:
 
 
 def claim_of(request: TaskRequest) -> str:
-    """A hash of the server's token: which of the servers of that name it is."""
+    """A hash of the server's token, by which servers of the same name differ."""
     return hashlib.sha256(request.environment.get(environment.TOKEN, "").encode()).hexdigest()[:16]
 
 
 def folder_of(project_id: str, owner: str) -> str:
-    """Where everything of a server's participant lies, or of its session if that is the `owner`."""
+    """The folder of the `owner`, a participant or a session: relative to the data, without a slash at its end."""
     return owner_folder(project_id, owner).rstrip("/")
 
 
-def _folder(told: Mapping[str, str]) -> str:
-    """As `folder_of`; empty for a warm server."""
-    owner = told.get(environment.SESSION) or told.get(environment.USER_ID)
-    return folder_of(told.get(environment.PROJECT_ID, ""), owner) if owner else ""
+def _folder(variables: Mapping[str, str]) -> str:
+    """The folder of the server's participant or session; empty for a warm server."""
+    owner = variables.get(environment.SESSION) or variables.get(environment.USER_ID)
+    return folder_of(variables.get(environment.PROJECT_ID, ""), owner) if owner else ""
 
 
 def _handover_key(request: TaskRequest) -> str:
     """The key of a warm server's handover; empty for any other server."""
-    told = request.environment
-    if told.get(environment.WARM_SERVER) != "on":
+    variables = request.environment
+    if variables.get(environment.WARM_SERVER) != "on":
         return ""
-    return handover_key(told.get(environment.PROJECT_ID, ""), told.get(environment.SERVER, ""))
+    return handover_key(variables.get(environment.PROJECT_ID, ""), variables.get(environment.SERVER, ""))
 
 
-def _kept(told: Mapping[str, str]) -> bool:
-    """Whether the project wants recordings kept (`s3upload`)."""
+def _kept(variables: Mapping[str, str]) -> bool:
+    """Whether the project keeps recordings (`s3upload`)."""
     try:
-        return json.loads(told[environment.TRIAL]).get("s3upload") is not False
+        return json.loads(variables[environment.TRIAL]).get("s3upload") is not False
     except (KeyError, ValueError, AttributeError):
         return False
 

@@ -1,7 +1,7 @@
 """Servers as processes of this machine, and their ECS events.
 
-Each server is `python -m trial` in a process of its own. `task_process.py` follows one from its start to its end; here
-are all of them. The next `make run` finds each again by its file on the disk (`task_record.py`).
+Each server is `python -m trial` in a process of its own. `task_process.py` follows one from its start to its end; this
+module has the list of all. The next `make run` finds each server again by its file (`task_record.py`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from local.backend.task_record import HOST, TaskFolder, TaskRecord, claim_of
 from protocol import disk
 
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, the default of ECS and of `STOP_SECONDS` (on AWS: 120)
-KEPT_TASKS, KEPT_LOGS = 200, 50  # the most that are kept of servers that are gone
+KEPT_TASKS, KEPT_LOGS = 200, 50  # the most records and logs of stopped servers that are kept
 
 PYTHON_TRIAL = (sys.executable, "-P", "-m", "trial")  # -P: a project's random.py must not stand in for Python's
 
@@ -45,9 +45,9 @@ class ProcessTasks:
         retry: Retry | None = None,
         named_port: int | None = None,
     ) -> None:
-        """`named_port`: the one port at which browsers find all servers by their names (`local/web/names.py`).
+        """`named_port`: the port at which browsers find all servers by their names (`local/web/names.py`).
 
-        Raises OSError if the files of servers cannot be read or written in `state`.
+        None: each server has its own port. Raises OSError if the files of servers cannot be read or written in `state`.
         """
         self.retry = retry or Retry(say)
         self.logs = state / "logs"
@@ -71,7 +71,7 @@ class ProcessTasks:
         for folder in (self._files.path, self.logs, self._shared.spool, self._clusters):
             disk.make_folder(folder)
         self._lock = self._shared.lock
-        self._live: dict[str, TaskProcess] = {}  # by name; also those that are gone
+        self._servers: dict[str, TaskProcess] = {}  # by name; also servers that have stopped
         self._closing = False
         self._load()
 
@@ -79,48 +79,48 @@ class ProcessTasks:
 
     def run(self, request: TaskRequest) -> str:
         claim = claim_of(request)
-        known = self._live.get(request.name)
-        if known and known.task.claim not in ("", claim):  # its record was deleted with the data, and is a new one
+        known = self._servers.get(request.name)
+        if known and known.task.claim not in ("", claim):  # a server of another record, which was deleted with the data
             self.forget([request.name])
         with self._lock:
             if self._closing:
                 raise RuntimeError("local mode is ending: no server is started any more")
-            known = self._live.get(request.name)
+            known = self._servers.get(request.name)
             if known:
                 return known.task.arn
             id_ = hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32]
             task = TaskRecord.of(request, id_)
-            live = TaskProcess(task, self._shared)
-            live.begin(request)
-            self._live[request.name] = live
-            live.begun.set()
+            server = TaskProcess(task, self._shared)
+            server.begin(request)
+            self._servers[request.name] = server
+            server.begun.set()
         return task.arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
-        live = next((one for one in self._all() if one.task.arn == task), None)
-        if live:
-            live.end(reason, time.monotonic() + self._shared.stop_timeout)
+        server = next((one for one in self._all() if one.task.arn == task), None)
+        if server:
+            server.end(reason, time.monotonic() + self._shared.stop_timeout)
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
         wanted = set(interfaces)
         return {
             task.interface: Address(HOST, self._named_port or task.port)
-            for task in (live.task for live in self._all() if live.lives)
+            for task in (server.task for server in self._all() if server.lives)
             if task.interface in wanted and task.port
         }
 
     def port_of(self, label: str) -> int | None:
         """The port of the newest server with this name, or of the participant with this id in lower case."""
-        there = [live.task for live in self._all() if live.lives and live.task.port]
-        named = [task for task in there if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())]
+        listening = [server.task for server in self._all() if server.lives and server.task.port]
+        named = [task for task in listening if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())]
         return max(named, key=lambda task: task.created).port if named else None
 
     def find(self, name: str, cluster: str) -> str | None:
-        live = self._live.get(name)
-        return live.task.arn if live and live.lives and live.task.cluster == cluster else None
+        server = self._servers.get(name)
+        return server.task.arn if server and server.lives and server.task.cluster == cluster else None
 
     def list(self) -> Iterator[RunningTask]:
-        for task in (live.task for live in self._all() if live.lives):
+        for task in (server.task for server in self._all() if server.lives):
             runs = task.status == "RUNNING"
             yield RunningTask(task.arn, task.cluster, task.name, task.interface if task.port else None, runs)
 
@@ -136,34 +136,34 @@ class ProcessTasks:
     def clusters(self) -> Iterator[str]:
         yield from files.names(self._clusters)
 
-    # What local mode does with it
+    # What local mode calls beside the port
 
     def start(self) -> None:
-        """Take over the servers of an earlier process: follow those that still run, and send the end of the others.
+        """Take over the servers of an earlier process: follow those that still run, and send the others' last events.
 
         Raises OSError; it may then be called again.
         """
         found = marked(self._state)
-        for live in self._all():
-            if live.begun.is_set():  # already taken up
-                found.pop(live.task.name, None)
+        for server in self._all():
+            if server.begun.is_set():  # an earlier call has taken it up
+                found.pop(server.task.name, None)
                 continue
-            if live.task.status == "STOPPED":
-                if live.unfinished:
-                    live.take_up()
+            if server.task.status == "STOPPED":
+                if server.unfinished:
+                    server.take_up()
                 continue
-            processes = found.pop(live.task.name, [])
+            processes = found.pop(server.task.name, [])
             shell = next((p for p in processes if is_shell(p)), None)
-            never = live.task.pid is None and not processes and not self._files.note(live.task.name, "exit")
-            if never:
-                # The intent was written, but no process began. The message that requested it comes again.
-                self._forget(live)
+            never_began = server.task.pid is None and not processes and not self._files.note(server.task.name, "exit")
+            if never_began:
+                # The record was written, but no process began. The message that requested it is delivered again.
+                self._forget(server)
                 continue
             if not shell:
                 kill(processes)
-            elif shell.pid != live.task.pid:
-                live.task, live.unsaved = replace(live.task, pid=shell.pid), True
-            live.take_up()
+            elif shell.pid != server.task.pid:
+                server.task, server.unsaved = replace(server.task, pid=shell.pid), True
+            server.take_up()
         for leaked in found.values():
             kill(leaked)
         with contextlib.suppress(OSError):
@@ -173,44 +173,44 @@ class ProcessTasks:
         """End every server now, SIGTERM first; return when all are gone, at the latest a second after `seconds`."""
         with self._lock:
             self._closing = True
-            going = [live for live in self._all() if live.task.status != "STOPPED"]
+            going = [server for server in self._all() if server.task.status != "STOPPED"]
         until = time.monotonic() + seconds
-        for live in going:
-            live.end("local mode was ended", until, surely=True)
-        for live in going:
-            live.gone.wait(max(0.0, until - time.monotonic()))
-        for live in going:
-            if not live.gone.is_set():
-                live.kill_at_once()
+        for server in going:
+            server.end("local mode was ended", until, even_unsaved=True)
+        for server in going:
+            server.gone.wait(max(0.0, until - time.monotonic()))
+        for server in going:
+            if not server.gone.is_set():
+                server.kill_at_once()
         until = time.monotonic() + 1
-        for live in going:
-            live.gone.wait(max(0.0, until - time.monotonic()))
+        for server in going:
+            server.gone.wait(max(0.0, until - time.monotonic()))
         self._shared.closed.set()
 
     def forget(self, names: Sequence[str] | None = None) -> int:
         """End these servers (None: all) at once and remove their files; return how many were running.
 
-        For servers whose records are gone: nothing else would stop them, and their names are free again.
+        For servers whose records were deleted: nothing else stops them, and new servers may get their names.
         """
-        going = [live for live in self._all() if names is None or live.task.name in names]
-        playing = [live for live in going if live.task.status != "STOPPED"]
-        for live in playing:
-            live.silent = True
-            live.end("its record is gone", time.monotonic(), surely=True)
-        for live in playing:
-            live.gone.wait(5)
-        for live in going:
-            self._forget(live)
-            self.log(live.task.name).unlink(missing_ok=True)
+        going = [server for server in self._all() if names is None or server.task.name in names]
+        playing = [server for server in going if server.task.status != "STOPPED"]
+        for server in playing:
+            server.silent = True
+            server.end("its record is gone", time.monotonic(), even_unsaved=True)
+        for server in playing:
+            server.gone.wait(5)
+        for server in going:
+            self._forget(server)
+            self.log(server.task.name).unlink(missing_ok=True)
         return len(playing)
 
     def playing(self) -> Sequence[TaskRecord]:
-        """The servers that have not stopped. A warm server has a `folder` once it is assigned."""
-        there = [live for live in self._all() if live.task.status != "STOPPED"]
-        for live in there:
+        """The servers that have not stopped. A warm server's `folder` is empty until it is assigned."""
+        playing = [server for server in self._all() if server.task.status != "STOPPED"]
+        for server in playing:
             with contextlib.suppress(OSError):  # the next look sees it
-                live.read_handover()
-        return [live.task for live in there]
+                server.read_handover()
+        return [server.task for server in playing]
 
     def log(self, name: str) -> Path:
         """The log file of the server of this name."""
@@ -218,26 +218,27 @@ class ProcessTasks:
 
     def _all(self) -> Sequence[TaskProcess]:
         with self._lock:
-            return [*self._live.values()]
+            return [*self._servers.values()]
 
-    def _forget(self, live: TaskProcess) -> None:
+    def _forget(self, server: TaskProcess) -> None:
         with self._lock:
-            if self._live.get(live.task.name) is live:
-                del self._live[live.task.name]
-            live.forget()
+            if self._servers.get(server.task.name) is server:
+                del self._servers[server.task.name]
+            server.forget()
 
     def _load(self) -> None:
+        """Read the records that an earlier process left. Raises OSError."""
         for task in self._files.load():
-            live = self._live[task.name] = TaskProcess(task, self._shared)
+            server = self._servers[task.name] = TaskProcess(task, self._shared)
             if task.status == "STOPPED":
-                live.gone.set()
+                server.gone.set()
 
     def _prune(self) -> None:
-        """Forget servers that are long gone."""
-        gone = [live for live in self._all() if live.task.status == "STOPPED"]
-        gone.sort(key=lambda live: live.task.stopped or "", reverse=True)
-        for live in gone[KEPT_LOGS:]:
-            self.log(live.task.name).unlink(missing_ok=True)
-        for live in gone[KEPT_TASKS:]:
-            if not live.unfinished:
-                self._forget(live)
+        """Remove the records and logs of stopped servers, except for the newest. Raises OSError."""
+        gone = [server for server in self._all() if server.task.status == "STOPPED"]
+        gone.sort(key=lambda server: server.task.stopped or "", reverse=True)
+        for server in gone[KEPT_LOGS:]:
+            self.log(server.task.name).unlink(missing_ok=True)
+        for server in gone[KEPT_TASKS:]:
+            if not server.unfinished:
+                self._forget(server)

@@ -1,4 +1,4 @@
-"""Timers as files, and one thread that waits for the next of them."""
+"""Timers as files, and a thread that fires each when it is due."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from local.backend import files
 from local.backend.retry import Retry, reports_errors, start
 from protocol import disk
 
-NAME = re.compile(r"[0-9a-zA-Z_.-]{1,64}")  # what EventBridge Scheduler takes
+NAME = re.compile(r"[0-9a-zA-Z_.-]{1,64}")  # the names that EventBridge Scheduler accepts
 AGAIN = 5.0  # seconds until a timer that could not fire is tried again
 Say = Callable[[str], None]
 
 
 @reports_errors
 class FolderTimers:
-    """Implements `hippodrome.ports.Timers`. `fire` publishes to the stop topic; then the timer is gone."""
+    """Implements `hippodrome.ports.Timers`. `fire` publishes a timer's message; then the timer is removed."""
 
     def __init__(
         self, state: Path, fire: Callable[[Message], None], say: Say = print, retry: Retry | None = None
@@ -40,11 +40,11 @@ class FolderTimers:
         self._thread = threading.Thread(target=self._work, name="timers", daemon=True)
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """Raises ValueError for a name that a scheduler would not take."""
+        """As `Timers` says. Raises ValueError for a name that EventBridge Scheduler would not accept."""
         path = self._path(name)
         when = float(int(at.timestamp()))
         with self._changed:
-            heapq.heappush(self._queue, (when, name))  # first: an error may come when the file is there already
+            heapq.heappush(self._queue, (when, name))  # before the file: it may exist even if writing it raises
             self._changed.notify()
             files.write_json(path, {"at": datetime.fromtimestamp(when, UTC).isoformat(), "message": dict(message)})
 
@@ -56,7 +56,7 @@ class FolderTimers:
         yield from (name.removesuffix(".json") for name in files.names(self._folder, ".json"))
 
     def fire(self, name: str, now: float = math.inf) -> None:
-        """Let the timer fire if it is due."""
+        """Fire the timer if it is due at `now` (Unix time). Raises OSError."""
         with self._changed:  # not while it is being replaced or cancelled
             at, message = self._due(name)
             if 0 < at <= now:
@@ -64,7 +64,7 @@ class FolderTimers:
                 self._path(name).unlink(missing_ok=True)
 
     def start(self) -> None:
-        """Begin to fire: first the timers that came due while no process ran."""
+        """Begin to fire, first the timers that became due while no process ran. Raises OSError."""
         with self._changed:
             self._queue = [(at, name) for name in self.list() if (at := self._due(name)[0])]
             heapq.heapify(self._queue)
@@ -85,10 +85,10 @@ class FolderTimers:
         return self._folder / f"{name}.json"
 
     def _due(self, name: str) -> tuple[float, Any]:
-        """When the timer of that name is due (0 if there is none), and its message."""
-        kept = files.read_json(self._path(name))
+        """When the timer is due (Unix time; 0 if there is no such timer), and its message. Raises OSError."""
+        stored = files.read_json(self._path(name))
         try:
-            return datetime.fromisoformat(kept["at"]).timestamp(), kept["message"]
+            return datetime.fromisoformat(stored["at"]).timestamp(), stored["message"]
         except (TypeError, KeyError, ValueError):
             return 0.0, None
 
@@ -97,13 +97,13 @@ class FolderTimers:
             try:
                 self.fire(name, time.time())
             except Exception as error:  # noqa: BLE001 - the other timers go on
-                if not isinstance(error, OSError):  # that has been told
+                if not isinstance(error, OSError):  # `Retry` has reported those
                     self._say(f"a timer failed and is tried again: {type(error).__name__}: {error}")
                 with self._changed:
                     heapq.heappush(self._queue, (time.time() + AGAIN, name))
 
     def _next(self) -> str:
-        """The name of the next timer that is due; waits for it. Empty if closed."""
+        """Wait until a timer is due, and return its name; empty once this is closed."""
         with self._changed:
             while self._open:
                 wait = self._queue[0][0] - time.time() if self._queue else None

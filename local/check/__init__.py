@@ -1,1 +1,1 @@
-"""`make check`: what is wrong with a project, found before participants come."""
+"""`make check`: finds the mistakes of a project before participants come."""

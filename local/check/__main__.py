@@ -1,6 +1,6 @@
-"""`python -m local.check [FOLDER]`: look for everything in a project that would go wrong in the study.
+"""`python -m local.check [FOLDER]`: find what would go wrong in the study of a project.
 
-Mistakes make the exit status 1. Remarks are about what works, but most likely not as it was meant.
+With a mistake the exit status is 1. A remark is about something that works, but most likely not as it was meant.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Whether the agent starts the game and plays whole episodes, in each group.
+"""Tries the agent: starts it, and lets it play whole episodes, in each group.
 
 The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`) with a
 server's environment variables. With `warmServers` it is tried as on a warm server (`trial/server/assignment.py`): the
-participant becomes known only before the first `reset`, and code that asks earlier gets a message.
+participant becomes known only before the first `reset`, and code that reads them earlier gets a remark.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from protocol import environment as variables
 from protocol.handover import Handover
 from trial.server import process_group
 
-SECONDS = 120.0  # in which the agent must have done everything, in each group
-PLAY_SECONDS = 20.0  # for playing, in all groups together; what is started is not counted
+SECONDS = 120.0  # seconds in which all calls of the agent must return, in each group
+PLAY_SECONDS = 20.0  # seconds of playing, in all groups together; the start is not counted
 
-_WARM_SERVER = 10.0  # seconds in which the agent's process must have written down where it hangs
+_STACK_SECONDS = 10.0  # seconds more, in which the agent's process must have written down where it hangs
 _ROOT = Path(__file__).resolve().parents[2]
-_AWS = ("AWS_", "ECS_")  # variables that a server would not have
-_WHOSE = (*variables.PARTICIPANT, variables.SESSION)
+_AWS = ("AWS_", "ECS_")  # beginnings of variables that a server does not have
+_OWNERS = (*variables.PARTICIPANT, variables.SESSION)
 _SESSION = f"s.{'0' * 20}"
 
 
 def try_agent(
     folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
 ) -> list[Diagnostic]:
-    """What goes wrong when the agent (ours, if the project has none) plays in each group.
+    """Let the agent play in each group (Hippodrome's agent, if the project has none), and return its problems.
 
-    `say` is told how far it has played, a line for each group. What fails in one group is not looked for in the others.
+    `say` gets a line for each group: how far the agent played. After a mistake in one group the others are not tried.
     """
     folder = folder.resolve()
     found: list[Diagnostic] = []
@@ -49,7 +49,7 @@ def try_agent(
             place = Path(temporary)
             environment = _environment(folder, config, place, seconds, group)
             environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
-            status = _run(place, environment, layout.agent_folder(folder).resolve(), seconds + _WARM_SERVER)
+            status = _run(place, environment, layout.agent_folder(folder).resolve(), seconds + _STACK_SECONDS)
             report = AgentReport(folder, config, place, seconds, group)
             found += [problem for problem in report.problems(status) if problem not in found]
             if report.played:
@@ -60,21 +60,21 @@ def try_agent(
 
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
-    """As a trial server has it; see `local.backend.task_process` and `trial/settings.py`."""
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _WHOSE}
+    """Environment variables as a trial server has them (`local/backend/task_process.py`, `trial/settings.py`)."""
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _OWNERS}
     several = config.project.has_sessions
     if config.project.warm_servers or several:  # a session's members are not known when its server starts
-        whose = {
+        owner = {
             variables.WARM_SERVER: "on",
             "GIVEN": Handover(_SESSION if several else "check", group, "check").to_json().decode(),
         }
     else:
-        whose = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
-    asked = {"MATCH": json.dumps(_question(folder, config))} if config.project.matching == MATCH and several else {}
+        owner = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
+    question = {"MATCH": json.dumps(_question(folder, config))} if config.project.matching == MATCH and several else {}
     return {
         **inherited,
-        **whose,
-        **asked,
+        **owner,
+        **question,
         variables.PROJECT_ID: config.project.id,
         variables.SERVER: "check",
         variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
@@ -88,9 +88,9 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
 
 
 def _question(folder: Path, config: Config) -> dict[str, Any]:
-    """Made-up participants for the function `match`, who have answered the pages before the game.
+    """What `match` is asked: made-up participants who have answered the pages before the game.
 
-    They choose at random; the last of them answer what the first have answered.
+    Their answers are random, but the last of them give the answers of the first.
     """
     try:
         pages = EarlierAnswers.before_the_game(open_folder(folder).path, config)
@@ -109,7 +109,7 @@ def _question(folder: Path, config: Config) -> dict[str, Any]:
 
 
 def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
-    """The process's exit status, None if it had to be killed."""
+    """Run the agent's process; return its exit status, or None if it had to be killed."""
     with (place / "output").open("wb") as output:
         return process_group.run(
             [sys.executable, "-P", "-m", "local.check.agent_process", str(place / "report")],

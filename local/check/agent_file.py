@@ -1,4 +1,4 @@
-"""agent.py as a file, which is not run here: whether Python can read it, and where its methods stand."""
+"""Reads agent.py without running it: whether it is Python, and where its methods stand."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from trial.agent.callback_names import NAMES
 
 
 def label_of(folder: Path) -> str | None:
-    """agent.py as messages name it, by its path from the project's folder; None if there is none."""
+    """The path of agent.py from the project's folder, as messages name it; None if there is no agent.py."""
     code = layout.agent_folder(folder)
     return (code / AGENT).relative_to(folder).as_posix() if (code / AGENT).is_file() else None
 
 
 def read_agent(folder: Path) -> list[Diagnostic]:
-    """What is wrong with agent.py as Python reads it, without running it."""
+    """The mistake for which Python cannot read agent.py, if there is one."""
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         source = path.read_bytes() if path.is_file() else b""
@@ -33,7 +33,7 @@ def read_agent(folder: Path) -> list[Diagnostic]:
             compile(source, label, "exec", dont_inherit=True)
     except SyntaxError as error:
         return [Diagnostic(label, error.lineno or None, "", f"Python cannot read this: {short(error.msg)}")]
-    except Exception as error:  # noqa: BLE001 - such as a file that is not text at all
+    except Exception as error:  # noqa: BLE001 - such as a file that is no text
         return [Diagnostic(label, None, "", f"Python cannot read this file: {short(str(error))}")]
     return []
 
@@ -47,21 +47,22 @@ def never_called(folder: Path, config: Config) -> list[Diagnostic]:
         return []
     used = {part.attr for part in ast.walk(tree) if isinstance(part, ast.Attribute)}
     used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)}
-    agents = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
-    methods = [method for made in agents for method in _functions(made.body, used)]
-    said = [(method.lineno, _nearly_a_callback(method.name)) for method in methods]
+    classes = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
+    methods = [method for each in classes for method in _unused_functions(each.body, used)]
+    found = [(method.lineno, _nearly_a_callback(method.name)) for method in methods]
     if config.project.has_sessions and config.project.matching != MATCH:
-        asks = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
-        said += [(beside.lineno, asks) for beside in _functions(tree.body, used) if beside.name == MATCH]
-    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in said if sentence]
+        sentence = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
+        found += [(each.lineno, sentence) for each in _unused_functions(tree.body, used) if each.name == MATCH]
+    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in found if sentence]
 
 
-def _functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
-    """Those that the file itself does not use."""
+def _unused_functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
+    """The functions of `body` whose names the file does not use."""
     return [part for part in body if isinstance(part, ast.FunctionDef) and part.name not in used]
 
 
 def _nearly_a_callback(name: str) -> str:
+    """The remark on a method whose name is similar to a callback's; otherwise empty."""
     if name in NAMES or not name.startswith("on_"):
         return ""
     hint = did_you_mean(name, NAMES)
@@ -69,9 +70,9 @@ def _nearly_a_callback(name: str) -> str:
 
 
 def line_of(path: Path, method: str) -> int | None:
-    """Where the method of class Agent is written; else the class. Without that class, where the function is.
+    """The line of a method of class Agent, else of the class; without that class, of the function of that name.
 
-    `match` is a function beside the class, also where there is one.
+    `match` stands beside the class. None if nothing is found.
     """
     try:
         body = ast.parse(path.read_bytes()).body
@@ -85,5 +86,6 @@ def line_of(path: Path, method: str) -> int | None:
 
 
 def _last(body: list[ast.stmt], function: str) -> int | None:
+    """The line of the last function of that name; None if there is none."""
     found = [part.lineno for part in body if isinstance(part, ast.FunctionDef) and part.name == function]
     return found[-1] if found else None

@@ -1,4 +1,4 @@
-"""`python -m local.check.agent_process REPORT`: lets the agent play, and writes to REPORT how far it came.
+"""`python -m local.check.agent_process REPORT`: lets the agent play, and writes to REPORT how far it got.
 
 Runs in a process of its own, since the agent may hang or end Python. `agent.py` starts it and reads the report.
 """
@@ -39,19 +39,17 @@ from trial.pictures.reader import PictureReader
 from trial.server import assignment
 from trial.settings import trial_section
 
-WHOSE = variables.PARTICIPANT  # what a warm server's agent does not know when it starts
-
-_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # os.getenv, environ.get and "in"
+_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # modules of os.getenv, environ.get and "in"
 
 
-class _Early(os._Environ[str]):
-    """Replaces `os.environ` until the participant is known: notes which line of the project asks for them."""
+class _EarlyEnviron(os._Environ[str]):
+    """The class of `os.environ` until the participant is known: notes the lines of the project that read them."""
 
-    asked: ClassVar[list[tuple[str, str, int]]] = []
+    lines: ClassVar[list[tuple[str, str, int]]] = []
     folder: ClassVar[Path]
 
     def __getitem__(self, key: str) -> str:
-        if key in WHOSE:
+        if key in variables.PARTICIPANT:
             self._note(key)
         return super().__getitem__(key)
 
@@ -62,12 +60,12 @@ class _Early(os._Environ[str]):
         path = Path(frame.f_code.co_filename)
         if path.is_relative_to(self.folder) and "site-packages" not in path.parts:
             place = (key, path.relative_to(self.folder).as_posix(), frame.f_lineno)
-            if place not in self.asked:
-                self.asked.append(place)
+            if place not in self.lines:
+                self.lines.append(place)
 
 
 class _Deadline:
-    """When the time is over, it ends the process and writes down where that hangs."""
+    """Ends the process when the time is over, and writes down in which line each thread was."""
 
     def __init__(self, stack: IO[str], seconds: float) -> None:
         self._stack, self._at = stack, time.monotonic() + seconds
@@ -75,7 +73,7 @@ class _Deadline:
 
     @contextlib.contextmanager
     def within(self, seconds: float) -> Iterator[None]:
-        """Meanwhile the time is over after so many seconds."""
+        """Within the block, the time is over after so many seconds, if not earlier."""
         self._set(min(seconds, self._left))
         try:
             yield
@@ -84,31 +82,31 @@ class _Deadline:
 
     @property
     def _left(self) -> float:
-        return max(0.001, self._at - time.monotonic())  # no time at all is refused
+        return max(0.001, self._at - time.monotonic())  # faulthandler refuses 0
 
     def _set(self, seconds: float) -> None:
         faulthandler.dump_traceback_later(seconds, exit=True, file=self._stack)
 
 
 def _try(report: Path, deadline: _Deadline) -> None:
-    """Let the agent play, and write down how far it came."""
+    """Let the agent play, and write to the report how far it got."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = AgentProgress(report, folder, Outside(config.scene), _Early.asked)
+    progress = AgentProgress(report, folder, Outside(config.scene), _EarlyEnviron.lines)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     document = os.environ.pop("GIVEN", "")
     group = _group(document)
-    plain, _Early.folder = os.environ.__class__, folder
+    usual_class, _EarlyEnviron.folder = os.environ.__class__, folder
     if document:
-        os.environ.__class__ = _Early
+        os.environ.__class__ = _EarlyEnviron
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
     player: AgentAdapter | JointAdapter = progress.result
 
     def reset() -> Any:
-        os.environ.__class__ = plain
+        os.environ.__class__ = usual_class
         if document:
-            assignment.set_environment(os.environ, _whose(document))
+            assignment.set_environment(os.environ, _assigned(document))
         progress.callbacks.session_begins()
         return player.reset(1)
 
@@ -125,22 +123,24 @@ def _try(report: Path, deadline: _Deadline) -> None:
         game = GameOfSeveral(player, players, config, folder, progress)
         if not player.steps_itself and progress.known["names"] > (progress.known["count"] or math.inf):
             progress.foreign = [progress.known["count"]]
-        played = game.load() and game.play(reset, progress.time_over)
-        if played and _seen_idle(player, players, config, progress) and game.close():
-            progress.over()
+        if game.load() and game.play(reset, progress.time_over):
+            _note_idle(player, players, config, progress)
+            if game.close():
+                progress.over()
         return
     env, space = player.env, getattr(player.env, "action_space", None)
     count = getattr(space, "n", None)
     if count is not None and len(player.action_space) > int(count):
         first = int(getattr(space, "start", 0))
         progress.foreign = _foreign_actions(env, range(first, first + int(count)))
-    played = _play(player, progress, reset, config)
-    if played and _seen_idle(player, players, config, progress) and progress.call("close", player.close):
-        progress.over()
+    if _play(player, progress, reset, config):
+        _note_idle(player, players, config, progress)
+        if progress.call("close", player.close):
+            progress.over()
 
 
 def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress, deadline: _Deadline) -> bool:
-    """Whether `match` returns, in the time that it has on a server."""
+    """Whether `match` returns a correct answer within the time that it has on a server."""
     progress.known["within"] = match.SECONDS
     with deadline.within(match.SECONDS):
         went_well = progress.call("match", lambda: _match(adapter, question, progress))
@@ -163,22 +163,22 @@ def _match(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgr
 
 
 def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> PictureReader:
-    """Reads pictures, and notes what in the project's images and objects cannot be drawn."""
+    """A reader of pictures that notes which images and objects of the project cannot be drawn."""
     found = Assets() if config.scene is None else assets.load(folder, config.scene.assets)
     progress.undrawn.extend(found.problems)
     return PictureReader(config.scene, found, progress.undrawn.append)
 
 
-def _whose(document: str) -> assignment.Found:
-    """What tells a server who plays there: the handover itself, or the document of the session that it names."""
-    given = handover.parse(document.encode())
-    if not is_session_id(given.user_id):
-        return given
-    return SessionDocument(given.user_id, MAX_PLAYERS, (), given.group)
+def _assigned(document: str) -> assignment.Found:
+    """The document that tells a server for whom it runs: the handover itself, or that of the session that it names."""
+    found = handover.parse(document.encode())
+    if not is_session_id(found.user_id):
+        return found
+    return SessionDocument(found.user_id, MAX_PLAYERS, (), found.group)
 
 
 def _group(document: str) -> int | None:
-    """The participant's group, which a warm server is told when it is assigned."""
+    """The participant's group: from the handover, for a warm server; otherwise from the environment variable."""
     if document:
         return handover.parse(document.encode()).group
     text = os.environ.get(variables.GROUP, "")
@@ -186,7 +186,7 @@ def _group(document: str) -> int | None:
 
 
 def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[str, Any]:
-    """How many names of actions there are, and how many actions (None: not known); the names, if they are not given."""
+    """The number of actions' names, and of actions (None: not known); the names, if config.yml does not give them."""
     if isinstance(player, AgentAdapter):
         count = getattr(getattr(player.env, "action_space", None), "n", None)
         found = {"names": len(player.action_space), "count": None if count is None else int(count)}
@@ -196,16 +196,16 @@ def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[
     return found | ({} if config.action_space else {"actions": max(player.action_spaces.values(), key=len)})
 
 
-def _seen_idle(
+def _note_idle(
     player: AgentAdapter | JointAdapter, players: Sequence[Player], config: TrialSection, progress: AgentProgress
-) -> bool:
-    """Note whether the action of no key visibly does something, where config.yml says nothing of it. Always true.
+) -> None:
+    """Note whether the idle action, which is taken while no key is pressed, changes the picture.
 
-    Errors are not told: the agent has played well without them.
+    It does nothing if config.yml names that action or all actions. Errors are ignored: the agent has played already.
     """
     human = next(one for one in players if one.human)
     if config.pace == "turns" or config.action_space or config.idle_action is not None:
-        return True
+        return
     others = {one.name: one.idle for one in players}
 
     def step(action: int) -> bool:
@@ -220,13 +220,12 @@ def _seen_idle(
         if still is not None:
             names = [human.action_space[action] for action in still]
             progress.known["idle"] = {"action": human.action_space[human.idle], "still": names}
-    return True
 
 
 def _callbacks(
     player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: AgentProgress, seconds: float
 ) -> Callbacks:
-    """The agent's callbacks, which are told what happens as on a server."""
+    """The agent's callbacks, called as on a server."""
     humans = tuple(each.name for each in players if each.human)
     return Callbacks(
         player.callbacks,
@@ -239,7 +238,7 @@ def _callbacks(
 
 
 def _foreign_actions(env: Any, actions: range) -> list[int]:
-    """A list that from now on gets each action that the environment is given and does not have."""
+    """Watch `env.step`: the list that is returned gets each action that is not among `actions`."""
     found: list[int] = []
     step = env.step
 
@@ -249,18 +248,18 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
                 found.append(int(action))
         return step(action, *more, **named)
 
-    with contextlib.suppress(AttributeError):  # an object that takes no attributes is not watched
+    with contextlib.suppress(AttributeError):  # an object without a `__dict__` cannot be watched
         env.step = watched
     return found
 
 
 def _play(player: Any, progress: AgentProgress, first_reset: Callable[[], Any], config: TrialSection) -> bool:
-    """Play up to the end of the last episode, or of the time; False if something failed.
+    """Play until the last episode or the time is over; False if a call failed.
 
-    Each action comes once in turn, then they are at random.
+    Each action is taken once, in turn; then actions are random.
     """
     callbacks = progress.callbacks
-    random = Random(1)  # noqa: S311 - the same each time
+    random = Random(1)  # noqa: S311 - the same actions each time
     for episode in range(1, config.max_episodes + 1):
         reset = first_reset if episode == 1 else partial(player.reset, episode)
         if not progress.call("reset", reset):

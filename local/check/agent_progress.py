@@ -1,4 +1,4 @@
-"""How far the tried agent has come: its process (`agent_process.py`) writes it down, `agent_report.py` reads it."""
+"""The report of a tried agent: its process (`agent_process.py`) writes it, `agent_report.py` reads it."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from local.check.pace import Pace
 from trial.recordings import recording
 
 PLAY_STEPS = 5_000  # in each group
-REPORT_BYTES = 2**20  # after which the report begins anew
+REPORT_BYTES = 2**20  # a report of this size begins anew
 
 
 class AgentProgress:
-    """Writes down each method before it calls it: if the process ends or hangs, the last line names the method.
+    """Reports each method before it calls it: if the process ends or hangs, the last line names the method.
 
-    A line holds all that is known. There are two for each step, and to make a new file for each would take longer than
-    many an environment's step.
+    Each line holds all that is known. There are two lines for each step: to make a new file for each would take longer
+    than a step of many environments.
     """
 
     def __init__(
         self, report: Path, folder: Path, outside: Outside, early: Sequence[tuple[str, str, int]] = ()
     ) -> None:
-        """`early`: the lines of the project that have asked for the participant too early, which others add to."""
+        """`early`: the project's lines that read the participant too early: variable, file, line. It may still grow."""
         self._report, self._folder, self._outside = report, folder, outside
         self._early = early
         self._file: io.FileIO | None = None
         self.episodes = self.steps = 0
         self.matched: int | None = None
-        """How many sessions `match` made of made-up participants, if it was asked."""
-        self.action: Any = 0  # or by player
+        """How many sessions `match` made of made-up participants; None if it was not called."""
+        self.action: Any = 0  # the last action, or the last actions by player
         self.known: dict[str, Any] = {}
         self.foreign: list[int] = []
         self.undrawn: list[str] = []
@@ -47,33 +47,33 @@ class AgentProgress:
         self._callback_errors: list[dict[str, Any]] = []
         self.pace = Pace()
         self.result: Any = None
-        self._ours = _installed_modules()
+        self._loaded_before = _installed_modules()
         self._until = math.inf
 
     def time_over(self) -> bool:
-        """Whether enough has been played. The time counts from the first step on."""
+        """Whether the steps or the time of playing are over. The time counts from the end of the first step."""
         if self.steps == 1 and self._until == math.inf:
             self._until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
         return self.steps >= PLAY_STEPS or time.monotonic() > self._until
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
-        """Call it; whether that went well."""
+        """Report the name, call the function and keep its `result`; False if it raised, which is reported too."""
         self._write(call=name)
         try:
             self.result = function()
-        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
-            self._write(call=name, error=_told(error, self._folder))
+        except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure too
+            self._write(call=name, error=_described(error, self._folder))
             return False
         if name == "render":
             self._outside.see(self.result)
         return True
 
     def callback_failed(self, name: str, error: BaseException) -> None:
-        """A callback of the agent has raised."""
-        self._callback_errors.append({"name": name, **_told(error, self._folder)})
+        """Note that a callback of the agent has raised this error."""
+        self._callback_errors.append({"name": name, **_described(error, self._folder)})
 
     def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
-        """Note the first value of these that is too large for the recording."""
+        """Note the first value that is too large for the recording: of the infos, or of what the agent records."""
         if "tooLarge" in self.known:
             return
         for where, values in (
@@ -86,18 +86,18 @@ class AgentProgress:
                 return
 
     def over(self) -> None:
-        """All has been tried."""
+        """Report that everything has been tried."""
         self.known["outside"] = self._outside.found()
-        self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._ours))
+        self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._loaded_before))
 
-    def _write(self, **what: Any) -> None:
-        far = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": self._early}
-        far["pace"], far["matched"] = vars(self.pace), self.matched
+    def _write(self, **fields: Any) -> None:
+        known = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": self._early}
+        known["pace"], known["matched"] = vars(self.pace), self.matched
         if self.callbacks is not None:
-            far["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
+            known["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
         if self.undrawn:
-            far["undrawn"] = self.undrawn
-        self._append(json.dumps({**far, **self.known, "foreign": bool(self.foreign), **what}).encode() + b"\n")
+            known["undrawn"] = self.undrawn
+        self._append(json.dumps({**known, **self.known, "foreign": bool(self.foreign), **fields}).encode() + b"\n")
 
     def _append(self, line: bytes) -> None:
         with contextlib.suppress(OSError):  # the agent has closed the file
@@ -119,8 +119,8 @@ def _installed_modules() -> set[str]:
     return {name.partition(".")[0] for name, file in files if "site-packages" in Path(file).parts}
 
 
-def _told(error: BaseException, folder: Path) -> dict[str, Any]:
-    """The error in its own words, and the last line of the project's code that was on the way to it."""
+def _described(error: BaseException, folder: Path) -> dict[str, Any]:
+    """The error's type and text, and the last line of the project's code in its traceback."""
     frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError) and error.filename:
         frames.append((Path(error.filename), error.lineno))

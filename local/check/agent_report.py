@@ -1,4 +1,4 @@
-"""What `make check` says of an agent that was tried: the report of its process (`agent_process.py`) as diagnostics."""
+"""Makes diagnostics of the report that the process of a tried agent has written (`agent_process.py`)."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from local.check.wording import short
 from protocol import environment as variables
 from protocol.players import HUMAN
 
-SLOW = 0.5  # of the frame rate; slower than that is remarked
-LONG_ENOUGH = 2.0  # seconds of playing from which the pace can be told
+SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
+LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
 
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
 def last_line(report: str) -> dict[str, Any]:
-    """What the agent's process knew last. It may have been killed while it wrote a further line. Raises ValueError."""
+    """The last whole line of a report; the process may have been killed while it wrote another. Raises ValueError."""
     whole, _, _ = report.rpartition("\n")
     found: dict[str, Any] = json.loads(whole.rpartition("\n")[2])
     return found
 
 
 class AgentReport:
-    """Says what the agent's process has reported."""
+    """The report of an agent that was tried in one group. `place` is the folder that its process wrote to."""
 
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
@@ -49,7 +49,7 @@ class AgentReport:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Diagnostic]:
-        """What to say of the report, if the process has ended with this exit status (None: it had to be killed)."""
+        """The diagnostics, if the process has ended with this exit status (None: it had to be killed)."""
         return [
             *self._early(),
             *self._failures(status),
@@ -68,11 +68,11 @@ class AgentReport:
 
     @property
     def played(self) -> bool:
-        """Whether there was a step at all."""
+        """Whether the agent has taken a step."""
         return bool(self._report.get("steps"))
 
     def how_far(self) -> str:
-        """What was played, in a line."""
+        """How far the agent played, in a line."""
         report = self._report
         where = "" if self._group is None else f" in group {self._group}"
         episodes, steps, most = report.get("episodes", 0), report.get("steps", 0), self._config.trial.max_episodes
@@ -80,7 +80,7 @@ class AgentReport:
         return f"played{where}: {episodes} of {most} episodes to the end, {steps} steps{rest}"
 
     def _where(self) -> str:
-        """In which step of which episode it was; nothing for the first step in all groups."""
+        """The place in the game, in parentheses; empty before the second step of the first group."""
         steps, episodes = self._report.get("steps", 0), self._report.get("episodes", 0)
         group = "" if self._group is None else f", group {self._group}"
         if self._report.get("call") in ("start", "match", "players", "policies", "close"):
@@ -90,33 +90,32 @@ class AgentReport:
         return f" (episode {episodes + 1}, after {steps} steps in all{group})"
 
     def _early(self) -> list[Diagnostic]:
-        """Where the agent asked for what is not known yet. A group matters where there are some, or if it failed."""
-        group_matters = self._config.groups or self._report.get("error")
-        matters = variables.PARTICIPANT if group_matters else (variables.USER_ID,)
+        """Remarks on lines that read the participant too early; on the group only if there are groups or it failed."""
+        group_counts = self._config.groups or self._report.get("error")
+        unknown = variables.PARTICIPANT if group_counts else (variables.USER_ID,)
         several = self._config.project.has_sessions
         key, whose = ("players", "participants come") if several else ("warmServers", "participant comes")
         why = f"is not known here: with {key} the agent starts before its {whose}; read it in reset()"
-        asked = self._report.get("early", ())
         return [
             Diagnostic(self._name(file), line, "", f"{name} {why}", remark=True)
-            for name, file, line in asked
-            if name in matters
+            for name, file, line in self._report.get("early", ())
+            if name in unknown
         ]
 
     def _slow(self) -> list[Diagnostic]:
-        """A step that takes far longer than the frame rate allows. Told once, of the first group."""
+        """A remark on steps that take far longer than the frame rate allows, for the first group only."""
         pace = self._report.get("pace")
         if pace is None or self._group:
             return []
-        said = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
-        return [self._in_config(("trial", "startingFrameRate"), said, remark=True)] if said else []
+        message = slowness(Pace(**pace), self._config.trial.starting_frame_rate)
+        return [self._in_config(("trial", "startingFrameRate"), message, remark=True)] if message else []
 
     def _slow_policies(self) -> list[Diagnostic]:
-        """Policies that need longer for an action than there is time. Told once, of the first group."""
+        """Remarks on policies that need longer for an action than they have, for the first group only."""
         trial, pace = self._config.trial, Pace(**self._report.get("pace", {}))
         found: list[Diagnostic] = []
-        for player, told in () if self._group else self._report.get("policies", {}).items():
-            each = Pace(**told)
+        for player, reported in () if self._group else self._report.get("policies", {}).items():
+            each = Pace(**reported)
             if trial.pace == "turns":
                 given, why = trial.policy_seconds, f"policySeconds is {trial.policy_seconds:g}"
             else:
@@ -133,7 +132,7 @@ class AgentReport:
         return found
 
     def _undrawn(self) -> list[Diagnostic]:
-        """What in images and objects cannot be drawn. The game goes on without it."""
+        """Remarks on images and objects that cannot be drawn. The game goes on without them."""
         found = []
         for sentence in self._report.get("undrawn", ()):
             if sentence.startswith("render(): "):
@@ -143,12 +142,12 @@ class AgentReport:
         return found
 
     def _outside(self) -> list[Diagnostic]:
-        """Objects that are never in the picture, since their places are pixels. Told once, of the first ones."""
-        told = {} if self._group else self._report.get("outside", {})
-        if not told:
+        """A remark on objects that are never in the picture, as their places are pixels; for the first group only."""
+        places = {} if self._group else self._report.get("outside", {})
+        if not places:
             return []
-        name, (x, y) = next(iter(told.items()))
-        others = {1: "", 2: ", nor is 1 other"}.get(len(told), f", nor are {len(told) - 1} others")
+        name, (x, y) = next(iter(places.items()))
+        others = {1: "", 2: ", nor is 1 other"}.get(len(places), f", nor are {len(places) - 1} others")
         message = (
             f"render(): the object {name!r} is never in the picture{others}: its place is ({x:g}, {y:g}), and 1 is the "
             "picture's right or lower edge; did you mean pixels? Write coordinates: pixels into trial.scene"
@@ -156,36 +155,36 @@ class AgentReport:
         return [self._at(self._place_of("render"), message, remark=True)]
 
     def _too_large(self) -> list[Diagnostic]:
-        """A value that the recording does not hold."""
-        told = self._report.get("tooLarge")
-        if told is None:
+        """A remark on a value that is too large for the recording."""
+        value = self._report.get("tooLarge")
+        if value is None:
             return []
         message = (
-            f"{told['name']!r} in {told['where']} is too large for the recording ({told['size']} bytes; all values of "
-            "a step may have a megabyte as JSON): its size is recorded instead"
+            f"{value['name']!r} in {value['where']} is too large for the recording ({value['size']} bytes; all values "
+            "of a step may have a megabyte as JSON): its size is recorded instead"
         )
         return [self._at(self._place_of("step"), message, remark=True)]
 
     def _idle(self) -> list[Diagnostic]:
-        """An action of no key that visibly does something. Told once, of the first group."""
-        told = self._report.get("idle")
-        if told is None or self._group or told["action"] in remarks.IDLE:
+        """A remark on an idle action that changes the picture, for the first group only."""
+        found = self._report.get("idle")
+        if found is None or self._group or found["action"] in remarks.IDLE:
             return []
-        still = ", ".join(told["still"])
+        still = ", ".join(found["still"])
         advice = (
-            f'write idleAction: "{told["still"][0]}"'
+            f'write idleAction: "{found["still"][0]}"'
             if still
             else "name one as idleAction, or see docs/agent.md#no-key"
         )
-        said = f"; {still} {'does' if len(told['still']) == 1 else 'do'} not" if still else ""
+        others = f"; {still} {'does' if len(found['still']) == 1 else 'do'} not" if still else ""
         message = (
-            f'missing; while no key is pressed, the game takes its action "{told["action"]}", which changes the picture'
-            f"{said}: {advice}"
+            f'missing; while no key is pressed, the game takes its action "{found["action"]}", which changes the '
+            f"picture{others}: {advice}"
         )
         return [self._in_config(("trial", "idleAction"), message, remark=True)]
 
     def _turns(self) -> list[Diagnostic]:
-        """Players who take turns in real time. Told once, of the first group."""
+        """A remark on players who take turns in real time, for the first group only."""
         config = self._config.trial
         if not self._report.get("takeTurns") or self._group or config.pace != "realtime":
             return []
@@ -196,26 +195,27 @@ class AgentReport:
         return [self._in_config(("trial", "pace"), message, remark=True)]
 
     def _plays(self, player: str) -> str:
-        """What plays this player, as config.yml has it: a policy in the place of a human too."""
+        """What plays this player, as config.yml says it; for a human, the policy that substitutes for them, if any."""
         trial = self._config.trial
         plays, substitute = trial.players_of(self._group).get(player, player), trial.substitute
         return substitute if plays == HUMAN and substitute else plays
 
     def _player(self, player: str) -> Keys:
-        """Where config.yml says who plays this player, or in their place."""
+        """The key of config.yml that says who plays this player, or who substitutes for the human."""
         if self._config.trial.players_of(self._group).get(player) == HUMAN:
             return ("trial", "substitute")
         by_group = (str(self._group or 0),) if self._config.trial.groups() else ()
         return ("trial", "players", *by_group, player)
 
     def _not_on_aws(self) -> list[Diagnostic]:
-        """What was loaded here, and participants' servers lack."""
+        """Remarks on packages that were loaded here and that servers on AWS lack."""
         if not agent_imports.may_run_on_aws(self._config):
             return []
         found = agent_imports.loaded(self._folder, self._config, self._report.get("loaded", ()))
         return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:
+        """The mistake for which the agent did not play to the end; if it did, those in the number of actions."""
         report, call = self._report, self._call()
         if report.get("over") or report.get("foreign"):
             return self._actions()
@@ -238,37 +238,37 @@ class AgentReport:
         place = (self._name(error["file"]), error["line"]) if error["file"] else None
         if error["type"] in ("AgentError", "BadGroups", "FrameError", "SceneError"):
             return [self._breach(error["text"], place)]
-        told = self._of_players(error, place)
-        if told is not None:
-            return [told]
+        of_players = self._of_players(error, place)
+        if of_players is not None:
+            return [of_players]
         remark = report["call"] == "close"
         message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
         return [self._at(place, message, remark=remark)]
 
     @property
     def _allowed(self) -> float:
-        """Seconds that the last call had."""
+        """The seconds that the last call had."""
         within: float = self._report.get("within", self._seconds)
         return min(self._seconds, within)
 
     def _of_players(self, error: Mapping[str, Any], place: tuple[str, int] | None) -> Diagnostic | None:
-        """What to say of who plays whom, and of a policy that cannot play; None if it is another error."""
+        """The mistake of who plays whom, or of a policy that cannot play; None for any other error."""
         text = error["text"].partition(": ")[2]
         if error["type"] == "PlayersError":
-            key, _, said = text.removeprefix("trial.").partition(" ")
-            return self._in_config(("trial", key), short(said))
+            key, _, message = text.removeprefix("trial.").partition(" ")
+            return self._in_config(("trial", key), short(message))
         if error["type"] not in ("PolicyError", "PolicyFileMissing"):
             return None
-        player, said = self._asked_policy(), text
+        player, message = self._asked_policy(), text
         for name in self._config.trial.players_of(self._group):
             before = f"trial.players: {name} cannot be played by {self._plays(name)}: "
             if text.startswith(before):
-                player, said = name, text.removeprefix(before)
+                player, message = name, text.removeprefix(before)
         if player is None:
             return None
         if place is None or self._plays(player).endswith(".onnx"):
-            return self._in_config(self._player(player), short(f"{said}{self._where()}"))
-        return self._at(place, short(f"{said}{self._where()}"))
+            return self._in_config(self._player(player), short(f"{message}{self._where()}"))
+        return self._at(place, short(f"{message}{self._where()}"))
 
     def _asked_policy(self) -> str | None:
         """The player whose policy was called last, if one was."""
@@ -276,34 +276,34 @@ class AgentReport:
         return called[1] if called else None
 
     def _callbacks(self) -> list[Diagnostic]:
-        """What callbacks raise, and one that takes too long. Neither ends a game, but data are lacking then."""
-        told = self._report.get("callbacks") or {}
+        """Mistakes in callbacks that raised, and a remark on one that took too long. Neither ends the game."""
+        callbacks = self._report.get("callbacks") or {}
         found = []
-        for error in told.get("errors", ()):
+        for error in callbacks.get("errors", ()):
             place = (self._name(error["file"]), error["line"]) if error["file"] else self._place_of(error["name"])
             text = f"{error['name']}() fails: {short(error['text'])}{remedy(error['type'], error['text'])}"
             found.append(self._at(place, text))
-        if told.get("late"):
+        if callbacks.get("late"):
             text = (
-                f"{told['late']}() takes longer than callbackSeconds ({self._config.trial.callback_seconds:g} s); "
+                f"{callbacks['late']}() takes longer than callbackSeconds ({self._config.trial.callback_seconds:g} s); "
                 "callbacks are skipped until it has returned"
             )
-            found.append(self._at(self._place_of(told["late"]), text, remark=True))
+            found.append(self._at(self._place_of(callbacks["late"]), text, remark=True))
         return found
 
     def _nobody_matched(self) -> list[Diagnostic]:
-        """A function `match` that puts nobody into a session. Told once, of the first group."""
+        """A remark on a function `match` that puts no participant into a session, for the first group only."""
         if self._group or self._report.get("matched") != 0:
             return []
         made_up = 3 * self._config.project.players
-        said = f"match() made no session of {made_up} made-up participants: such participants wait on"
-        return [self._at(self._place_of("match"), said, remark=True)]
+        message = f"match() made no session of {made_up} made-up participants: such participants wait on"
+        return [self._at(self._place_of("match"), message, remark=True)]
 
     def _place_of(self, method: str) -> tuple[str, int | None]:
         return self._label or AGENT, line_of(self._code / AGENT, method)
 
     def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
-        """The agent does not keep the contract of docs/agent.md."""
+        """The mistake of an agent that does not keep the contract of docs/agent.md."""
         text = text.partition(": ")[2] or text  # without the error's own name
         if "trial.actionSpace" in text:
             message = "missing; list the game's actions, since the environment does not name them"
@@ -313,24 +313,25 @@ class AgentReport:
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
         if self._config.project.has_sessions and "observations by player" in text:
             text += "; an environment with one player is for participants who play alone (project.players: 1)"
-        method = _SIGNATURE.match(text)  # it says how a method is written, whichever was called
+        method = _SIGNATURE.match(text)  # the text is about this method, whichever was called
         if method:
             return self._at((self._label or AGENT, line_of(self._code / AGENT, method[1])), short(text))
         return self._at(place, short(text), whole="has no" in text)
 
     def _actions(self) -> list[Diagnostic]:
+        """Mistakes and remarks on an actionSpace with more or fewer names than the environment has actions."""
         names, count = self._report.get("names"), self._report.get("count")
         if not self._config.trial.action_space or count is None or names == count:
             return []
         if names > count and not self._report.get("foreign"):
-            return []  # step() turns them into actions that there are
+            return []  # step() in agent.py translates them
         message = f"has {names} names, but the environment has {count} actions"
         if names > count:
             message += "; take out the names of actions that it does not have, or let step() in agent.py translate them"
         return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
 
     def _arrows(self) -> list[Diagnostic]:
-        """Arrows of `ui` and keys that do nothing, as far as the environment says what its actions are called."""
+        """Remarks on arrows of `ui` and keys that do nothing, as far as the environment names its actions."""
         names, source = self._report.get("actions", ()), read_source(self._folder)
         if not names:
             return []
@@ -338,11 +339,12 @@ class AgentReport:
             found = remarks.arrows_of_unnamed_actions(self._config, len(names))
         else:
             found = remarks.arrows_without_an_action(self._config, names)
-        arrows = [said for said in found if source.names(said.path)]
+        arrows = [each for each in found if source.names(each.path)]
         keys = [] if self._config.trial.action_space else remarks.keys_without_an_action(self._config, names)
-        return [self._in_config(*said, remark=True) for said in (*arrows, *keys)]
+        return [self._in_config(*each, remark=True) for each in (*arrows, *keys)]
 
     def _call(self) -> str:
+        """The last call, as messages name it."""
         call = self._report.get("call", "start")
         policy = self._asked_policy()
         if policy is not None:
@@ -356,10 +358,7 @@ class AgentReport:
     def _at(
         self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False
     ) -> Diagnostic:
-        """The problem at a line of the project's code, or else where the method that was called stands.
-
-        `whole` is about the class and none of its methods.
-        """
+        """The problem at `place`; without one, at the method that was called last, or with `whole` at the class."""
         if self._label is None:
             return self._in_config(("trial", "game"), message, remark=remark)
         file, line = place or (
@@ -372,30 +371,31 @@ class AgentReport:
         return read_source(self._folder).diagnostic(path, message, remark=remark)
 
     def _stack(self) -> str:
-        """Where all threads were when the time was over; empty if it was not."""
+        """The stacks of all threads when the time was over; empty if the process ended before."""
         try:
             return (self._place / "report.stack").read_text(errors="replace")
         except OSError:
             return ""
 
     def _hung(self, stack: str) -> tuple[str, int] | None:
-        """The line at which the project's code was then; None if it was not running."""
+        """The file and line of the project's code in these stacks; None if it did not run."""
         frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
         ours = [(self._name(file.name), line) for file, line in frames if file.parent == self._code]
         return ours[0] if ours else None
 
     def _name(self, file: str) -> str:
-        """A file beside agent.py as messages name it."""
+        """The path of a file beside agent.py, as messages name it."""
         return (Path(self._label or AGENT).parent / file).as_posix()
 
     def _last_words(self) -> str:
+        """The last line that the process printed, after a colon; empty if it printed nothing."""
         lines = (self._place / "output").read_text(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
-        return f": {short(said[-1])}" if said else ""
+        printed = [line.strip() for line in lines if line.strip()]
+        return f": {short(printed[-1])}" if printed else ""
 
 
 def slowness(pace: Pace, rate: int) -> str | None:
-    """What to say if the agent is far slower than the frame rate (steps a second)."""
+    """The remark on an agent that is far slower than the frame rate (steps a second); None if it is not."""
     seconds = pace.seconds - pace.slowest
     if seconds < LONG_ENOUGH or (pace.steps - 1) / seconds >= SLOW * rate:
         return None

@@ -1,4 +1,4 @@
-"""Answers that a page names and that no participant can have given: the page shows nothing in their place."""
+"""Finds answers that a page names but no participant can have given: the page shows nothing there."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from local.check.wording import short
 from protocol.similar import did_you_mean
 
 _METHODS = frozenset(dir(dict))
-"""`answers["2"].items` is the method of Python's dictionary, and no field."""
+"""`answers["2"].items` is a method of Python's dictionary, and no field."""
 
 
 def check_answers_named(label: str, parsed: nodes.Template, earlier: EarlierAnswers) -> Iterator[Diagnostic]:
-    """Remarks on steps that are not named in quotes, and on fields that an earlier step does not have."""
+    """Remarks on keys of steps without quotes, and on fields that an earlier step does not have."""
     for node in _lookups(parsed):
-        step = _key(node)
-        if _is_answers(node.node) and isinstance(step, int) and not isinstance(step, bool):
-            yield _remark(label, node, f'write answers["{step}"], with quotes')
-        inner, field = node.node, step
+        inner, key = node.node, _key(node)
+        if _is_answers(inner) and isinstance(key, int) and not isinstance(key, bool):
+            yield _remark(label, node, f'write answers["{key}"], with quotes')
         if not isinstance(inner, nodes.Getitem | nodes.Getattr) or not _is_answers(inner.node):
             continue
-        if not isinstance(field, str) or (isinstance(node, nodes.Getattr) and field in _METHODS):
+        if not isinstance(key, str) or (isinstance(node, nodes.Getattr) and key in _METHODS):
             continue
-        key = _key(inner)
-        known = earlier.fields_of(key) if isinstance(key, str) else None
-        if known is not None and field not in known:
+        step = _key(inner)
+        known = earlier.fields_of(step) if isinstance(step, str) else None
+        if known is not None and key not in known:
             has = ", ".join(known) or "no fields"
-            message = f"step {key} has no answer {short(field)}{did_you_mean(field, known)} (it has {short(has)})"
+            message = f"step {step} has no answer {short(key)}{did_you_mean(key, known)} (it has {short(has)})"
             yield _remark(label, node, message)
 
 

@@ -1,4 +1,4 @@
-"""What participants may have answered before they see a page."""
+"""The answers that participants may have given before they see a page."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ class EarlierAnswers:
     """The answers of a participant who sees a page: to every question, or only to the required ones."""
 
     def __init__(self, folder: Path, config: Config | None, steps: Sequence[StepFiles]) -> None:
-        """`steps` are those that the participant has done, of the pages in `folder`."""
+        """`steps` are the steps before the page; `folder` holds the pages."""
         self._folder = folder
         self._steps = steps
         self._least_played = {"outcome": UNMATCHED} if config and config.project.has_sessions else _PLAYED
 
     @classmethod
     def before_the_game(cls, folder: Path, config: Config) -> EarlierAnswers:
-        """Those of a participant who comes to the first game step."""
+        """The answers of a participant who comes to the first game step."""
         return cls(folder, config, list(itertools.takewhile(lambda step: not step.type.on_server, config.steps)))
 
     @classmethod
     def before_page(cls, folder: Path, config: Config | None, name: str) -> EarlierAnswers:
-        """Those of a participant who comes to the page with this file."""
+        """The answers of a participant who comes to the page with this file."""
         steps = list(config.steps) if config else []
         in_game = [file.name for page in (config.game_pages if config else ()) for file in page.files]
         place = next(
@@ -46,15 +46,15 @@ class EarlierAnswers:
         return cls(folder, config, steps[:place])
 
     def fields(self) -> tuple[list[str], str]:
-        """The names of the fields of all pages before, and the text of these pages."""
+        """The names of the fields of all earlier pages, and the text of these pages."""
         texts = self._texts()
         found = (name for text in texts for name in _answered(text)[0])
         return list(dict.fromkeys(found)), "\n".join(texts)
 
     def fields_of(self, key: str) -> list[str] | None:
-        """The names of all that may be answered at an earlier step; None if that is not known.
+        """The names of all fields of an earlier step; None if they are not known.
 
-        It is not known where a script or Jinja may make fields, and of steps that are not done before the page.
+        They are not known if a script or Jinja may make fields, or if the step does not come before the page.
         """
         step = next((step for step in self._steps if step.key == key), None)
         if step is None or not (step.files or step.type.on_server):
@@ -63,11 +63,11 @@ class EarlierAnswers:
             return [*_PLAYED, *_PLAYED_TOGETHER]
         texts = [source_of(file) for file in step.files]
         names = [control.name for text in texts for form in _forms(text) for control in form.controls if control.name]
-        unsure = any("<script" in text.lower() for text in texts) or any(spans.MARK in name for name in names)
-        return None if unsure else list(dict.fromkeys(names))
+        may_have_more = any("<script" in text.lower() for text in texts) or any(spans.MARK in name for name in names)
+        return None if may_have_more else list(dict.fromkeys(names))
 
     def choices(self, field: str) -> int | None:
-        """How many different answers a participant can give to a field; None if they write it, or a script makes it."""
+        """The number of different answers to a field; None if participants write it, or a script may make it."""
         texts = self._texts()
         if any("<script" in text.lower() for text in texts):
             return None
@@ -83,7 +83,7 @@ class EarlierAnswers:
         return len(found) if found else None
 
     def answers(self, group: int | None, person: int = 1) -> list[dict[str, dict[str, Any]]]:
-        """By step: the most that may have been answered there, and the least. Another `person` chooses otherwise."""
+        """Two lists of answers by step: to all questions, and to the required ones. `person` seeds the choices."""
         most: dict[str, dict[str, Any]] = {}
         least: dict[str, dict[str, Any]] = {}
         for step in self._steps:
@@ -98,7 +98,7 @@ class EarlierAnswers:
         return [most, least]
 
     def _texts(self) -> list[str]:
-        """The pages of all groups."""
+        """The texts of the earlier pages, in the versions of all groups."""
         return [source_of(file) for step in self._steps for file in step.files]
 
 
@@ -108,13 +108,13 @@ _PLAYED_TOGETHER = ("scores", "session", "player")  # in games of several player
 
 
 def _forms(text: str) -> list[forms.Form]:
-    """The forms of a page, with a mark in the place of each Jinja expression."""
+    """The forms of a page, with `spans.MARK` in the place of each Jinja expression."""
     page = spans.replace(text, lambda _: spans.MARK, *spans.JINJA)
     return forms.read(f"<form>{fragments.prepare(page).text}</form>")
 
 
 def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Answers to a page: to all its questions, and to those only that must be answered."""
+    """Answers to a page: to all questions, and to the required ones only."""
     found = _forms(text)
     if not found:
         return {}, {}
@@ -130,7 +130,7 @@ def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any
 
 
 def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
-    """The answers to a question of one page, "" for none; None if they are more than can be counted."""
+    """The possible answers to a question of one page, "" for none; None if they cannot be counted."""
     kinds = {control.kind for control in controls}
     needed = any(control.required for control in controls)
     if kinds == {"radio"} or (kinds == {"checkbox"} and len(controls) == 1):
@@ -149,7 +149,7 @@ def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
 
 
 def source_of(path: Path) -> str:
-    """The text of a page; empty if it cannot be read, which the configuration's check says."""
+    """The text of a page; empty if it cannot be read, which the check of the configuration reports."""
     try:
         return path.read_bytes().decode("utf-8", "replace")
     except OSError:

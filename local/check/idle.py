@@ -1,7 +1,7 @@
-"""Whether the action of no key visibly does something: in the agent's process (`agent_process.py`).
+"""Finds out whether the idle action, which is taken while no key is pressed, changes the picture.
 
-In the same state, the picture after the idle action differs from the one before it, and that after another action does
-not: then the idle action did it, and not the game by itself. States are reached by the same seed and actions each time.
+It runs in the agent's process (`agent_process.py`). If the idle action changes the picture in a state in which another
+action does not, the action changed it, and not the game by itself. The same seed and actions lead to the same state.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from typing import Any
 
 import numpy as np
 
-SECONDS = 3.0
-_STATES = (0, 2, 5, 9)  # so many steps after a reset
+SECONDS = 3.0  # after which it gives up
+_STATES = (0, 2, 5, 9)  # each state by its number of steps after a reset
 _MOST_ACTIONS = 10
 
 
 def moves(
     begin: Callable[[int], Any], step: Callable[[int], bool], picture: Callable[[], Any], count: int, idle: int
 ) -> list[int] | None:
-    """None if the idle action does nothing visible, or if that cannot be told; else the actions that change nothing.
+    """The actions that change nothing, if the idle action changes the picture; None if not, or if that is not known.
 
-    `begin(seed)` begins an episode, `step(action)` takes a step and says whether the episode is over.
+    `begin(seed)` begins an episode. `step(action)` takes a step, and returns whether the episode is over. `picture`
+    returns the picture. `count` is the number of actions.
     """
     until = time.monotonic() + SECONDS
     random = Random(1)  # noqa: S311 - the same each time
@@ -44,7 +45,7 @@ def moves(
             after = picture()
             first = first or (before, after)
             if not same(before, first[0]) or (action == idle and not same(after, first[1])):
-                return None  # it plays differently each time
+                return None  # the game is not the same each time
             seen[action] = not same(before, after)
             if seen[action]:
                 still.discard(action)

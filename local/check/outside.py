@@ -1,4 +1,4 @@
-"""Objects that are never in the picture: their places are pixels, where the scene's coordinates are relative."""
+"""Finds objects that are never in the picture: their places are pixels, but the scene's coordinates are relative."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from trial.pictures.scene import Scene
 from trial.pictures.scene_object import CheckedObject
 
 LEAST = 5
-"""No share of the picture that is meant: objects that wait beside it are nearer."""
-_LARGEST = 4096  # pixels: of a sprite whose size is that of its image
+"""A relative coordinate this large cannot be meant: objects that wait beside the picture are nearer to it."""
+_LARGEST = 4096  # pixels of a sprite that has the size of its image
 
 
 class Outside:
-    """Sees each picture of the check's episodes."""
+    """Looks at each picture of the episodes that `make check` plays."""
 
     def __init__(self, section: SceneSection | None) -> None:
         self._size = (section.width, section.height) if section and section.coordinates == "relative" else None
@@ -23,7 +23,7 @@ class Outside:
         self._outside: dict[tuple[str, str], tuple[float, float]] = {}
 
     def see(self, picture: Any) -> None:
-        """Look at a picture, or at pictures by player."""
+        """Look at a picture, or at a picture for each player."""
         if self._size is None:
             return
         for view, scene in picture.items() if isinstance(picture, Mapping) else (("", picture),):
@@ -32,7 +32,7 @@ class Outside:
                     self._look_at((view, name), each, self._size)
 
     def found(self) -> dict[str, tuple[float, float]]:
-        """The objects that were always outside and would be inside if their coordinates were pixels, with a place."""
+        """The objects that were never inside, but would be if their coordinates were pixels: by name, with a place."""
         return {name: place for (_, name), place in self._outside.items()}
 
     def _look_at(self, key: tuple[str, str], each: CheckedObject, size: tuple[int, int]) -> None:
@@ -52,6 +52,7 @@ class Outside:
 
 
 def _places(each: CheckedObject) -> Iterator[tuple[float, float]]:
+    """The points of an object, or its one place, as (x, y)."""
     if "points" in each:
         yield from ((x, y) for x, y in each["points"])
     else:
@@ -59,7 +60,7 @@ def _places(each: CheckedObject) -> Iterator[tuple[float, float]]:
 
 
 def _reach(each: CheckedObject) -> float:
-    """How far from its place an object is to be seen at most, in pixels."""
+    """The largest distance from its place at which an object is visible, in pixels."""
     if each["type"] == "sprite":
         return float(each.get("width", _LARGEST)) + float(each.get("height", _LARGEST))
     if each["type"] == "text":

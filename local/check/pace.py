@@ -1,4 +1,4 @@
-"""How fast an agent plays: what its process reports, and `make check` reads."""
+"""How fast an agent plays: its process measures it, and `make check` reports it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class Pace:
-    """How long steps have taken, each with its picture; the slowest one apart, which may have had something to load."""
+    """The seconds that steps have taken, with their pictures; the slowest apart, since it may have loaded something."""
 
     steps: int = 0
     seconds: float = 0.0
@@ -15,7 +15,7 @@ class Pace:
 
     @property
     def usual(self) -> float:
-        """Seconds of a step on average, without the slowest one."""
+        """The mean seconds of a step, without the slowest one."""
         return (self.seconds - self.slowest) / (self.steps - 1) if self.steps > 1 else self.seconds
 
     def took(self, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""What is wrong with step pages, each by itself and all together."""
+"""Checks step pages, each by itself and all together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from local.check.templates import check_template
 
 
 def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
-    """What is wrong with the pages of the study: with all those in the folder if its configuration is not known."""
+    """The problems of the study's pages; of all pages in the folder if the configuration cannot be read."""
     try:
         steps = open_folder(folder)
     except StepFileError:
@@ -30,7 +30,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
         try:
             source = (steps.path / name).read_bytes().decode("utf-8", "replace")
         except OSError:
-            continue  # the configuration's check says so
+            continue  # the check of the configuration reports it
         label = f"{steps.path.name}/{name}"
         here = [
             *check_template(label, source, config, groups, EarlierAnswers.before_page(steps.path, config, name)),
@@ -42,7 +42,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
 
 
 def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:
-    """What can be said of all pages together only."""
+    """Problems that show only when all pages are known."""
     used = _pages(names, config)
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
     found = [_unused(folder, unused)] if unused else []
@@ -57,7 +57,7 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
 
 
 def _unused(folder: Path, names: list[str]) -> Diagnostic:
-    """One remark for all: a clone of HIPPO Gym may have the pages of several studies."""
+    """One remark on all pages that no step shows: a clone of HIPPO Gym may have the pages of several studies."""
     if len(names) == 1:
         message = "no step shows this page; name it under project.steps, or delete it"
         return Diagnostic(f"{folder.name}/{names[0]}", None, "", message, remark=True)
@@ -72,11 +72,11 @@ def _no_code(label: str) -> Diagnostic:
 
 
 def _leads_back(source: str) -> bool:
-    """Whether a last page shows the participant's code, or has a link to another place: docs/recruiting.md."""
+    """Whether a last page shows the completion code or has a link to another site (docs/recruiting.md)."""
     try:
         if "completion_code" in meta.find_undeclared_variables(sandbox.environment().parse(source)):
             return True
-    except Exception:  # noqa: BLE001 - the page's own check says what Jinja cannot read
+    except Exception:  # noqa: BLE001 - the check of the page reports what Jinja cannot read
         return True
     links = _Links()
     links.feed(spans.replace(source, lambda jinja: spans.MARK, *spans.JINJA))
@@ -85,7 +85,7 @@ def _leads_back(source: str) -> bool:
 
 
 class _Links(PageParser):
-    """Whether a page has a link to another place."""
+    """Finds out whether a page has a link to another site."""
 
     elsewhere = False
 

@@ -11,7 +11,10 @@ from local.check.sessions import check_sessions
 
 
 def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
-    """What is wrong with pages and agent.py, as far as can be seen without running it; remarks on the configuration."""
+    """The problems of pages and agent.py, which is not run, and remarks on the configuration.
+
+    `config` is None if the configuration cannot be read.
+    """
     plays = config is None or bool(config.game_steps)
     found = remarks.remarks_on(folder, config) if config else []
     if config and plays and agent_imports.may_run_on_aws(config):

@@ -1,4 +1,4 @@
-"""What to do about a package, or a name of one, that agent.py imports and that is not there."""
+"""Advice for an agent.py that imports a package which is not installed, or a name which a package lacks."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _PACKAGES = {
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
 }
-"""The packages of modules that have another name than theirs."""
+"""Packages by their modules, where the names differ."""
 _OLD = {
     "atari_py": "ale_py stands in for it",
     "baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
     "stable_baselines": "it needs TensorFlow 1 and Python 3.7: use stable_baselines3",
 }
-"""Modules of HIPPO Gym's time that cannot be installed for the versions of Python that Hippodrome runs on."""
+"""Modules from the time of HIPPO Gym that have no versions for the Pythons of Hippodrome."""
 
 
 def remedy(kind: str, text: str) -> str:
-    """The advice that follows an error's text, with its semicolon; empty for an error of another kind.
+    """Advice to append to an error's text, beginning with a semicolon; empty if there is none for this error.
 
     `kind` is the name of the exception's class.
     """
@@ -50,7 +50,7 @@ def _of_module(module: str) -> str:
 
 
 def _of_gym(name: str) -> str:
-    """What Gym had and Hippodrome's stand-in for it lacks (`trial/agent/old_gym`)."""
-    if util.find_spec("gym"):  # a real one comes first
+    """Advice for a name that Gym had and Hippodrome's replacement of it lacks (`trial/agent/old_gym`)."""
+    if util.find_spec("gym"):  # Gym itself is installed
         return ""
     return f"; what stands in for Gym here has no {name}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"

@@ -1,4 +1,4 @@
-"""What several participants in one environment (`project.players`) need of the pages."""
+"""Checks what the pages must have if several participants play together (`project.players`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from protocol.similar import did_you_mean
 
 
 def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
-    """What is lacking for the participants to find each other, or for those who do not."""
+    """Mistakes in how participants find each other, and a remark on the page for those who find no other."""
     if not config.project.has_sessions or not config.game_steps:
         return
     try:
@@ -31,7 +31,7 @@ def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
 
 
 def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
-    """The field by which people are matched is on a page before the game. A page's script may make fields too."""
+    """A mistake if no page before the game has the field by which people are matched. A script may make the field."""
     field = field_of(config.project.matching)
     if field is None:
         return None
@@ -45,7 +45,7 @@ def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
 
 
 def _too_alike(earlier: EarlierAnswers, folder: Path, config: Config, field: str) -> Diagnostic | None:
-    """As many different answers can be given as participants play together, if theirs are to be different."""
+    """A mistake if players must answer differently, but the field has fewer answers than there are players."""
     choices, players = earlier.choices(field), config.project.players
     if "different" not in config.project.matching or choices is None or choices >= players:
         return None
@@ -55,7 +55,7 @@ def _too_alike(earlier: EarlierAnswers, folder: Path, config: Config, field: str
 
 
 def _unmatched(pages: Path, config: Config) -> Iterator[Diagnostic]:
-    """The page after the game may speak to those who found no other to play with."""
+    """A remark if no page after the game tells participants who found no other from those who have played."""
     last = max(index for index, step in enumerate(config.steps) if step.type.on_server)
     after = [file for step in config.steps[last + 1 :] for file in step.files]
     if after and not any("unmatched" in source_of(file) for file in after):

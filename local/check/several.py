@@ -1,7 +1,7 @@
-"""Plays an environment with several players: in the agent's process (`agent_process.py`).
+"""Lets an environment with several players play, in the agent's process (`agent_process.py`).
 
-Participants press random keys, and policies play in their places, as on a server but one after another: each is timed
-by itself. If several participants play together, `substitute` plays in each of their places for a while.
+Humans take random actions, and policies play the other players. As on a server, but one after another, so that each
+policy is timed by itself. If there are several humans, `substitute` plays in each of their places for a while.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from trial.core.seeds import policy_seed
 from trial.policies.places import load_policies
 from trial.policies.policy import Policy
 
-STAYS = 20  # steps for which a substitute plays, before another does
+STAYS = 20  # steps for which a substitute plays in one place
 
 
 class Reporting(Protocol):
-    """Where plays are reported: `AgentProgress`."""
+    """The methods of `AgentProgress` that are used here."""
 
     action: Any
     steps: int
@@ -42,7 +42,7 @@ class Reporting(Protocol):
 
 
 class GameOfSeveral:
-    """A game of several players; `play` lets them."""
+    """A game of several players: `load`, `play`, `close`."""
 
     def __init__(
         self, adapter: JointAdapter, players: Sequence[Player], config: TrialSection, folder: Path, progress: Reporting
@@ -55,11 +55,11 @@ class GameOfSeveral:
         self._random = Random(1)  # noqa: S311 - the same each time
         self._pressed = 0
         self._substitutes: dict[str, Policy] = {}  # by the player in whose place each plays
-        self._acted: set[frozenset[str]] = set()  # who was to act at the same time
+        self._acted: set[frozenset[str]] = set()  # the groups of players that acted at the same time
         adapter.views = tuple(player.name for player in players if player.human)
 
     def load(self) -> bool:
-        """Load the policies; whether that went well."""
+        """Load the policies; return False if one cannot be loaded, which is reported."""
         humans = [player for player in self._players if player.human]
         plays = self._config.substitute if len(humans) > 1 else None
         policies = self._loaded(self._players)
@@ -82,7 +82,7 @@ class GameOfSeveral:
         return dict(self._progress.result) if done else None
 
     def play(self, first_reset: Callable[[], Any], over: Callable[[], bool]) -> bool:
-        """Play up to the end of the last episode, or until `over`; False if something failed."""
+        """Play until the last episode has ended or `over()`; return False if a call failed, which is reported."""
         progress, callbacks = self._progress, self._progress.callbacks
         for episode in range(1, self._config.max_episodes + 1):
             if not progress.call("reset", first_reset if episode == 1 else partial(self._adapter.reset, episode)):
@@ -119,7 +119,7 @@ class GameOfSeveral:
         return True
 
     def close(self) -> bool:
-        """Close the policies and the agent."""
+        """Close the policies and the agent; return False if that failed, which is reported."""
         for policy in (*self._policies.values(), *self._substitutes.values()):
             if not self._progress.call("close", policy.close):
                 return False
@@ -134,7 +134,7 @@ class GameOfSeveral:
         return True
 
     def _actions(self, now: Joint, step: int) -> dict[str, int] | None:
-        """What those who are to act do; None if a policy failed."""
+        """The actions of the players who are to act; None if a policy failed."""
         actions: dict[str, int] = {}
         replaced = self._replaced()
         for player in self._players:
@@ -154,7 +154,7 @@ class GameOfSeveral:
         return actions
 
     def _replaced(self) -> str | None:
-        """In whose place the substitute plays at this step: in none at first, then in each in turn."""
+        """The player whom the substitute replaces at this step: none at first, then each human in turn."""
         names = (None, *self._substitutes)
         return names[self._progress.steps // STAYS % len(names)]
 
@@ -163,23 +163,25 @@ class GameOfSeveral:
         return len(self._acted) > 1 and all(len(together) == 1 for together in self._acted)
 
     def _press(self, allowed: Sequence[int]) -> int:
-        """Each action once in turn, then they are at random."""
+        """A human's action: each once, in turn; then random ones."""
         self._pressed += 1
         return self._pressed - 1 if self._pressed - 1 in allowed else self._random.choice(allowed)
 
     def _between(self, player: Player) -> int:
-        """What a policy's player does between two choices: the last goes on, unless each press is one action."""
+        """The action of a policy's player between two choices: the last one, or with `input: single` the idle one."""
         return player.idle if self._config.input == "single" else self._last.get(player.name, player.idle)
 
     def _due(self, step: int) -> bool:
         return self._config.pace == "turns" or step % self._config.frame_skip == 0
 
     def _asked(self, name: str, now: Joint) -> int | None:
+        """The action that this player's policy chooses; None if it failed."""
+
         def act() -> int:
             began = time.monotonic()
             policy = self._policies.get(name) or self._substitutes[name]
             action = policy.act(now.observations.get(name), now.infos.get(name, {}), now.masks.get(name))
-            self._paces[name].took(time.monotonic() - began)  # without what reporting takes
+            self._paces[name].took(time.monotonic() - began)  # without the time of reporting
             return action
 
         if not self._progress.call(f"policy {name} act", act):

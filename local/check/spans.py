@@ -1,6 +1,6 @@
-"""Finds what stands between an opening and a closing mark, such as `{{ … }}`, in a time that grows with the text only.
+"""Finds the parts of a text between an opening and a closing mark, such as `{{ … }}`, in linear time.
 
-A regular expression like `\\{\\{.*?\\}\\}` looks through the rest of the text again for each mark that is never closed.
+A regular expression like `\\{\\{.*?\\}\\}` takes quadratic time: it reads the rest of the text at each unclosed mark.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Marks(NamedTuple):
-    """What opens and what closes a span."""
+    """The opening and the closing mark of a span."""
 
     opening: re.Pattern[str]
     closing: re.Pattern[str]
@@ -26,14 +26,13 @@ SCRIPT = Marks(
     re.compile(r"<script\b[^>]*+(?:>|\Z)", re.IGNORECASE), re.compile(r"</script\s*+(?:>|\Z)", re.IGNORECASE)
 )
 
-
 JINJA = (VALUE, BLOCK, NOTE)
 MARK = "\ue000"
-"""Stands for what Jinja fills in."""
+"""Stands in the place of what Jinja fills in."""
 
 
 class Span(NamedTuple):
-    """Where a span and what is inside begin and end."""
+    """The positions of a span (`start` to `end`) and of its inside (`inside` to `until`)."""
 
     start: int
     inside: int
@@ -42,7 +41,7 @@ class Span(NamedTuple):
 
 
 def spans(text: str, *kinds: Marks) -> Iterator[Span]:
-    """The spans of these kinds from left to right. An opening mark inside a span, or never closed, begins none."""
+    """The spans of these kinds, from left to right. No span begins inside of another or at an unclosed mark."""
     at = 0
     following = {kind: kind.opening.search(text) for kind in kinds}
     while True:
@@ -63,7 +62,7 @@ def spans(text: str, *kinds: Marks) -> Iterator[Span]:
 
 
 def replace(text: str, by: Callable[[str], str], *kinds: Marks) -> str:
-    """The text with each span of these kinds replaced by what `by` makes of it."""
+    """The text in which each span of these kinds is replaced: `by` gets the span and returns its replacement."""
     parts, at = [], 0
     for span in spans(text, *kinds):
         parts += [text[at : span.start], by(text[span.start : span.end])]
@@ -72,5 +71,5 @@ def replace(text: str, by: Callable[[str], str], *kinds: Marks) -> str:
 
 
 def lines(text: str) -> str:
-    """Only the ends of lines of the text, so that what follows keeps its line."""
+    """The ends of lines of the text alone. As its replacement, they keep the numbers of later lines."""
     return "\n" * text.count("\n")

@@ -1,4 +1,4 @@
-"""What is wrong with a page as a whole: choices that overwrite each other, tags left open, values inside scripts."""
+"""Checks a page as a whole: radio buttons that exclude each other, tags left open, values inside scripts."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _VOID = frozenset(("area", "base", "br", "col", "embed", "frame", "hr", "img", "
 _VOID |= {"source", "track", "wbr"}
 _OPTIONAL = frozenset(("p", "li", "dt", "dd", "tr", "td", "th", "thead", "tbody", "tfoot", "option", "optgroup"))
 _OPTIONAL |= {"rt", "rp", "colgroup", "caption", "html", "head", "body", "form"}
-"""Their end tags may be left out, or the frame takes them out."""
+"""Tags whose end tags may be left out, or that the frame removes."""
 _SWALLOWS = ("script", "style", "textarea", "title", "select")
-"""Left open, these take in the rest of the page, with its button."""
+"""Tags that, if left open, swallow the rest of the page with its button."""
 
 
 def check_structure(label: str, source: str) -> list[Diagnostic]:
-    """Mistakes and remarks, in no order."""
+    """The page's mistakes and remarks, in no order."""
     found = [*_scripts(label, source)]
     text = spans.replace(source, spans.lines, spans.RAW)
     text = spans.replace(text, lambda value: spans.MARK + spans.lines(value), spans.VALUE, spans.NOTE)
@@ -40,6 +40,7 @@ def check_structure(label: str, source: str) -> list[Diagnostic]:
 
 
 def _scripts(label: str, source: str) -> Iterator[Diagnostic]:
+    """Mistakes: values in scripts that an answer can break."""
     text = spans.replace(source, _blank, spans.RAW)
     for script in spans.spans(text, spans.SCRIPT):
         inside = text[script.inside : script.until]
@@ -56,6 +57,7 @@ def _scripts(label: str, source: str) -> Iterator[Diagnostic]:
 
 
 def _comments(label: str, text: str) -> Iterator[Diagnostic]:
+    """A mistake: a comment that is never closed."""
     rest = spans.replace(text, _blank, spans.COMMENT)
     begin = rest.find("<!--")
     if begin >= 0:
@@ -66,7 +68,7 @@ def _comments(label: str, text: str) -> Iterator[Diagnostic]:
 
 @dataclass
 class _Radio:
-    """A choice: where it stands."""
+    """A radio button: its line and value, and the numbers of {% … %} before it, of its fieldset and table row."""
 
     line: int
     value: str | None
@@ -76,12 +78,12 @@ class _Radio:
 
 
 class _Reader(PageParser):
-    """Notes the choices of a page and the tags that are not closed."""
+    """Notes the radio buttons of a page and the tags that are not closed."""
 
     def __init__(self, label: str) -> None:
         super().__init__()
         self._label = label
-        self._choices: dict[str, list[_Radio]] = {}
+        self._radios: dict[str, list[_Radio]] = {}
         self._open: list[tuple[str, int]] = []
         self._left: list[tuple[str, int]] = []
         self._strays: list[tuple[str, int]] = []
@@ -106,12 +108,12 @@ class _Reader(PageParser):
             if name and spans.MARK not in name and _STEP not in name:
                 fieldset = self._fieldsets[-1] if self._fieldsets else 0
                 radio = _Radio(self.getpos()[0], given.get("value"), self._blocks, fieldset, self._row)
-                self._choices.setdefault(name, []).append(radio)
+                self._radios.setdefault(name, []).append(radio)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
         if tag not in _VOID and tag not in _OPTIONAL:
-            self._open.pop()  # <path/> of a picture
+            self._open.pop()  # such as <path/> in an <svg>
 
     def handle_endtag(self, tag: str) -> None:
         if tag == "fieldset" and self._fieldsets:
@@ -133,11 +135,11 @@ class _Reader(PageParser):
     def handle_data(self, data: str) -> None:
         self._blocks += data.count(_STEP)
 
-    # What is found
+    # Diagnostics
 
     def radios(self) -> Iterator[Diagnostic]:
-        """Choices without a value, and questions that share a name."""
-        for name, radios in self._choices.items():
+        """Mistakes: radio buttons without a value, and questions that share a name."""
+        for name, radios in self._radios.items():
             shown = printable(name, 40)
             for radio in radios:
                 if radio.value is None:
@@ -153,7 +155,10 @@ class _Reader(PageParser):
 
     @staticmethod
     def _second_question(radios: list[_Radio]) -> _Radio | None:
-        """The choice with which a second question by the same name begins; not between different {% … %}."""
+        """The radio button at which a second question of the same name begins; None if there is no such question.
+
+        Only radio buttons between the same {% … %} are compared.
+        """
         for number, radio in enumerate(radios):
             before = [each for each in radios[:number] if each.blocks == radio.blocks]
             same = [each for each in radios[number:] if each.blocks == radio.blocks]
@@ -174,7 +179,7 @@ class _Reader(PageParser):
         return None
 
     def open_tags(self) -> Iterator[Diagnostic]:
-        """Tags that are never closed, and end tags that close nothing."""
+        """Mistakes and remarks: tags that are never closed, and end tags that close nothing."""
         for tag, line in [*self._left, *self._open]:
             swallows = tag in _SWALLOWS
             rest = ", so the rest of the page is not shown" if swallows else ""
@@ -186,7 +191,7 @@ class _Reader(PageParser):
 
 
 def _blank(text: str) -> str:
-    """Spaces in the place of everything but the ends of lines."""
+    """The text with every character replaced by a space, except for the ends of lines."""
     return re.sub(r"[^\n]", " ", text)
 
 

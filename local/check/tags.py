@@ -1,4 +1,4 @@
-"""What is wrong with single tags of a page: what browsers, or the frame around pages, will not do."""
+"""Checks single tags of a page: browsers, or the frame around pages, do not do all that a tag asks for."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _HANDLER = re.compile(r"on[a-z]{3,}")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
 _IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
-_BUTTONS = ("button", "reset", "submit", "image")  # inputs that do well without a name
+_BUTTONS = ("button", "reset", "submit", "image")  # inputs that need no name
 _LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
 class Tags(PageParser):
-    """Looks at each tag of a page for what browsers or our frame will not do."""
+    """Finds the tags of a page that do not work, in browsers or in the frame around pages."""
 
     def __init__(self, label: str, names: Iterable[str], config: Config | None) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class Tags(PageParser):
         self._styling = False
 
     def read(self, source: str) -> list[Diagnostic]:
-        """Everything that is wrong. Jinja's expressions are set aside, and what depends on them is not judged."""
+        """The problems of a page's tags. Values with Jinja expressions are not checked."""
         self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
         self.close()
         return self._found
@@ -81,7 +81,7 @@ class Tags(PageParser):
                 self._remark(f"{short(address)} is not found from a style; write url({short(place)})", line)
 
     def _address(self, tag: str, address: str, given: dict[str, str]) -> None:
-        """Whether what is loaded from there can be loaded."""
+        """Check whether the file or the page at this address can be loaded."""
         relations = given.get("rel", "").lower().split()
         if spans.MARK in address or not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
             return
@@ -111,7 +111,7 @@ class Tags(PageParser):
             self._mistake(f"{short(origin)} is not in allowedHosts of the config file, so nothing is loaded; {known}")
 
     def _file(self, path: str) -> None:
-        """A file of the project's, by its name."""
+        """Check whether this file of the project exists and is shown."""
         name = path.removeprefix(self._own) if self._own else path.rpartition("/")[2]
         name = name.removeprefix("./")
         alone = re.split(r"[/\\]", name)[-1]

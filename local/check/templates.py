@@ -1,4 +1,4 @@
-"""What is wrong with a page's Jinja: whether it can be read, and shown to participants with few or many answers."""
+"""Checks a page's Jinja: whether it can be parsed, and shown to participants with few or many answers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ from local.check.wording import short
 from protocol.answer import UNMATCHED
 from protocol.similar import did_you_mean
 
-VALUES = ("answers", "completion_code", "group", "participant", "project")  # what a page may mention: docs/pages.md
+VALUES = (
+    "answers",
+    "completion_code",
+    "group",
+    "participant",
+    "project",
+)  # the values that a page may use: docs/pages.md
 
 
 def check_template(
     label: str, source: str, config: Config | None, groups: list[int | None], earlier: EarlierAnswers
 ) -> Iterator[Diagnostic]:
-    """Whether the page can be read, and can be shown to a participant who has answered the pages before it."""
+    """Problems in parsing the page, and in showing it to participants who have answered the pages before it."""
     page = fragments.prepare(source)
     if not sandbox.uses_jinja(page.text):
         return
@@ -37,29 +43,30 @@ def check_template(
         yield Diagnostic(label, None, "", f"Jinja cannot read this page: {short(str(error))}")
         return
     unknown = [*_unknown(label, parsed, environment)]
-    if unknown:  # Jinja would say the same of the first
+    if unknown:  # rendering would fail at the first of them
         yield from unknown
         return
-    strangers = meta.find_undeclared_variables(parsed) - {*VALUES, *environment.globals}
+    undefined = meta.find_undeclared_variables(parsed) - {*VALUES, *environment.globals}
     for name in parsed.find_all(nodes.Name):
-        if name.name in strangers:
-            strangers.remove(name.name)
+        if name.name in undefined:
+            undefined.remove(name.name)
             message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
     yield from check_answers_named(label, parsed, earlier)
     for group in groups:
         for answers in earlier.answers(group):
-            known = _nothing_known(config, group)
+            values = _values(config, group)
             if config:
-                known["participant"] |= _met(answers, config)
+                values["participant"] |= _company(answers, config)
             try:
-                page.render({**known, "answers": answers})
+                page.render({**values, "answers": answers})
             except FragmentError as error:
                 yield _failing(label, error, may_depend=bool(sandbox.records_mentioned(page.text)))
                 return
 
 
 def _unread(error: TemplateSyntaxError) -> str:
+    """The message for a page that Jinja cannot parse."""
     comment = (
         '; {# begins a comment, also in a style: write "{ #" there' if "end of comment" in str(error.message) else ""
     )
@@ -67,7 +74,7 @@ def _unread(error: TemplateSyntaxError) -> str:
 
 
 def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[Diagnostic]:
-    """Filters and tests that do not exist: Jinja itself finds those of a condition only when it holds."""
+    """Filters and tests that do not exist. Jinja itself finds them inside an {% if %} only if its condition is true."""
     for kind, node_type, known in (
         ("filter", nodes.Filter, environment.filters),
         ("test", nodes.Test, environment.tests),
@@ -78,8 +85,8 @@ def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[D
                 yield Diagnostic(label, node.lineno, "", message)
 
 
-def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
-    """What a page may mention, for a participant who has not answered anything."""
+def _values(config: Config | None, group: int | None) -> dict[str, Any]:
+    """The values that a page may use, for a participant without answers."""
     project = config.project if config else None
     return {
         "project": {
@@ -94,8 +101,8 @@ def _nothing_known(config: Config | None, group: int | None) -> dict[str, Any]:
     }
 
 
-def _met(answers: Mapping[str, Mapping[str, Any]], config: Config) -> dict[str, Any]:
-    """What a page after a game of several may mention of the participant; nothing on pages before it."""
+def _company(answers: Mapping[str, Mapping[str, Any]], config: Config) -> dict[str, Any]:
+    """What `participant` has after a game of several: whether they found others, and how many they were together."""
     played = [answers[step.key] for step in config.game_steps if step.key in answers]
     if not config.project.has_sessions or not played:
         return {}
@@ -104,7 +111,7 @@ def _met(answers: Mapping[str, Mapping[str, Any]], config: Config) -> dict[str, 
 
 
 def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
-    """A page that cannot be shown; only a remark if it may be possible with answers."""
+    """The mistake of a page that cannot be shown; a remark if that may depend on the participant's answers."""
     cause, why = error.__cause__, short(error.message)
     if isinstance(cause, TypeError) and "no loader" in str(cause):
         why = "include, import and extends do not work: a page is one file"
@@ -119,7 +126,7 @@ def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
 
 
 def _certain(cause: BaseException) -> bool:
-    """Whether it fails whatever the participants answer."""
+    """Whether the page fails for every participant, whatever they have answered."""
     return isinstance(cause, SecurityError) or (
         isinstance(cause, TemplateRuntimeError) and not isinstance(cause, UndefinedError)
     )

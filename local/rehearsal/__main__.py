@@ -1,8 +1,7 @@
 """`python -m local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
 
-It holds the study itself, with a data folder of its own (in `data-try/` of the project, where the data stay), lets
-bots walk through it, and then looks whether everything that they sent and played can be found in the data and whether
-every server is gone.
+It runs the study with a data folder of its own, which stays in `data-try/` of the project, and lets bots walk through
+it. Then it checks that everything that they sent and played is in the data, and that no server is left.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from local.rehearsal.logs import FunctionLog, verify
 from local.rehearsal.report import report
 from local.rehearsal.study_process import (
     TRIED,
-    NotHeld,
+    StudyNotStarted,
     StudyProcess,
     copy_of,
     logs_of,
@@ -46,12 +45,10 @@ from local.rehearsal.study_process import (
     wait_until_gone,
 )
 
-# The rehearsal
-
 
 @dataclass(frozen=True)
 class Crowd:
-    """How many bots walk through the study, and how. Times are in seconds."""
+    """How many bots walk through the study, how many of them `at_once`, and how. Times are in seconds."""
 
     bots: int
     _: KW_ONLY
@@ -62,7 +59,7 @@ class Crowd:
 
 
 async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
-    """Send the crowd through the study; what happened to each bot. Cancelling ends all of them."""
+    """Send the crowd through the study; return each bot's report. Cancelling ends all bots."""
     run, width = secrets.token_hex(3), len(str(crowd.bots))
     bots = [
         Bot(link, f"bot-{run}-{number:0{width}}", Random(f"{run}{number}"), play=crowd.play, patience=crowd.patience)  # noqa: S311
@@ -85,7 +82,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
         bar = progress.add_task("Bots", total=bots, doing="")
 
         def watch(reports: Sequence[BotReport]) -> None:
-            stages = [re.sub(r"step \S+", "pages", report.stage) for report in reports]
+            stages = [re.sub(r"step \S+", "pages", bot.stage) for bot in reports]
             over = sum(stage in ("finished", "failed") for stage in stages)
             doing = [
                 f"{stages.count(stage)} {words}"
@@ -107,8 +104,8 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
 
 
 @contextlib.contextmanager
-def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[StudyProcess]:
-    """The study on this machine; whatever happens, nothing of it is left afterwards."""
+def _running(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[StudyProcess]:
+    """Run the study, or a copy of it in which bots can end the game if `changed`. Nothing runs afterwards."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
         place = Path(temporary)
         project = place / "project" if changed else folder
@@ -128,19 +125,19 @@ def _held(folder: Path, data: Path, changed: bool, console: Console) -> Iterator
 
 
 def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
-    """Where the bots' data go. Raises NotHeld if people's data would be among them, or nothing can be written there."""
+    """Make the folder for the bots' data. Raises StudyNotStarted if it is for people's data or cannot be written."""
     place = data or folder / TRIED / f"try-{time.strftime('%Y%m%d-%H%M%S')}"
     users = place / project_id / "users"
     people = [user.name for user in users.iterdir() if not user.name.startswith("bot-")] if users.is_dir() else []
     if people or place.resolve() == (folder / "data").resolve():
         whose = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
-        raise NotHeld(
+        raise StudyNotStarted(
             f"{place} {whose}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
         )
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise NotHeld(
+        raise StudyNotStarted(
             f"The bots' data cannot be kept in {place}: {error.strerror}. Name another folder with --data (with make: "
             "DATA=)."
         ) from None
@@ -148,24 +145,25 @@ def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
 
 
 def _how_to_read(folder: Path, data: Path) -> str:
+    """Where the data are, and the command that makes tables of them."""
     project = "" if folder.resolve() == Path.cwd() else f" PROJECT={shlex.quote(str(folder))}"
     return f"The bots' data are in {data}. This makes tables of them: make data{project} DATA={shlex.quote(str(data))}"
 
 
 def _keep_logs(study: StudyProcess, project: Path) -> Path:
-    """Put the logs where they outlive the rehearsal, and let them name only what is there afterwards."""
-    kept = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
-    shutil.copy(study.log, kept)
+    """Copy the logs to a folder that stays; there they name the project and the copied logs, not temporary folders."""
+    place = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
+    shutil.copy(study.log, place)
     servers = logs_of(study.data)
     if servers.is_dir():
-        shutil.copytree(servers, kept / "logs")
-    names = {str(servers): str(kept / "logs"), str(study.folder): str(project.resolve())}
-    for log in kept.rglob("*.log"):
+        shutil.copytree(servers, place / "logs")
+    names = {str(servers): str(place / "logs"), str(study.folder): str(project.resolve())}
+    for log in place.rglob("*.log"):
         text = log.read_text(encoding="utf-8", errors="replace")
         for before, after in names.items():
             text = text.replace(before, after)
         log.write_text(text, encoding="utf-8")
-    return kept
+    return place
 
 
 def _rehearse_and_report(
@@ -179,18 +177,21 @@ def _rehearse_and_report(
     console: Console,
     began: float,
 ) -> bool:
-    """Send the crowd through the study at `link`, whose data are in `data` if that is known; whether all is well."""
+    """Send the crowd through the study at `link`, and print the report; return whether all is well.
+
+    `data` is None if the folder of its data is not known.
+    """
     functions = FunctionLog(data) if data else None
     servers = ServerLogs(data) if data else None
     with _bar(console, crowd.bots) as watch:
         reports = interruptible(rehearse(link, crowd, watch))
     left = None
     if data:
-        ids = {report.user_id for report in reports}
+        ids = {bot.user_id for bot in reports}
         sessions = sessions_of(data, config.project.id, ids)
         left = wait_until_gone(data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set()))
     if study and left:
-        left.stubborn = not study.interrupt()
+        left.local_mode_killed = not study.interrupt()
         left.processes = max(left.processes, study.clear())
     found = verify(data, config.project.id, reports, recorded=config.trial.s3upload) if data else None
     fine = report(
@@ -200,13 +201,13 @@ def _rehearse_and_report(
         left,
         time.monotonic() - began,
         recorded=config.trial.s3upload,
-        live=config.project.live or bool(study and crowd.play > 0),  # the bots' copy is
-        said=functions.complaints() if functions else (),
+        live=config.project.live or bool(study and crowd.play > 0),  # the copy for bots is live
+        warnings=functions.warnings() if functions else (),
         crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
     )
     if not fine and study:
-        kept = _keep_logs(study, folder)
-        console.print(f"What local mode and the servers said is in {kept}.", soft_wrap=True)
+        logs = _keep_logs(study, folder)
+        console.print(f"The logs of local mode and of the servers are in {logs}.", soft_wrap=True)
     if study and data:
         console.print(_how_to_read(folder, data), markup=False, soft_wrap=True)
     return fine
@@ -216,31 +217,31 @@ def main(
     folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
     *,
     bots: Annotated[int, typer.Option(min=1, max=1000, help="How many simulated participants.")] = 20,
-    at_once: Annotated[int, typer.Option(min=1, help="How many of them at the same time.")] = 10,
+    at_once: Annotated[int, typer.Option(min=1, help="How many of them walk at the same time.")] = 10,
     play: Annotated[float, typer.Option(min=0, help="Seconds that each plays; 0: to the end of the game.")] = 8.0,
     patience: Annotated[float, typer.Option(min=1, help="Seconds that a bot waits for any one thing.")] = 300.0,
     ramp: Annotated[float, typer.Option(min=0, help="Seconds between the first arrivals.")] = 0.3,
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Keep the bots' data here, else in data-try/ of the project. With --url: where that study keeps them."
+            help="The folder for the bots' data; default: data-try/ of the project. With --url: that study's data."
         ),
     ] = None,
     url: Annotated[
-        str | None, typer.Option(help="The link of a study that is held already, on this machine only.")
+        str | None, typer.Option(help="The link of a study that runs already, on this machine only.")
     ] = None,
 ) -> None:
-    """Send simulated participants through the whole study of FOLDER, and see whether everything arrives."""
-    os.umask(0o077)  # as `make run`: what is written here is its owner's alone
+    """Send simulated participants through the whole study of FOLDER, and check that everything arrives."""
+    os.umask(0o077)  # as `make run`: only their owner may read these files
     console = Console(highlight=False)
     for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)  # as Ctrl-C: nothing may be left over
+        signal.signal(number, signal.default_int_handler)  # as Ctrl-C, which leaves nothing running
     began = time.monotonic()
     try:
         config = read_project(folder)
         link = with_project(THIS_MACHINE.page(url), config.project.id) if url else None
         place = data if link else _data_of_bots(folder, config.project.id, data)
-        with _held(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
+        with _running(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
             fine = _rehearse_and_report(
                 folder,
                 config,
@@ -251,7 +252,7 @@ def main(
                 console=console,
                 began=began,
             )
-    except (ConfigErrors, AddressRefused, NotHeld) as error:
+    except (ConfigErrors, AddressRefused, StudyNotStarted) as error:
         console.print(str(error), markup=False, soft_wrap=True)
         raise typer.Exit(1) from None
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Errors of agent.py during a rehearsal, as the servers' logs have them (`trial/agent/tracebacks.py` writes them)."""
+"""Finds errors of agent.py in the servers' logs of a rehearsal (`trial/agent/tracebacks.py` writes them)."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ _LONGEST = 40  # lines of a traceback
 
 @dataclass
 class AgentCrash:
-    """An error of agent.py's: where and what (`agent.py:30: ValueError: …`), its traceback, how often it happened."""
+    """An error of agent.py: its place and text (`agent.py:30: ValueError: …`), its traceback, how often it happened."""
 
-    what: str
+    text: str
     traceback: str
     count: int = 0
 
     def words(self) -> str:
         """The crash in a line."""
         times = "once" if self.count == 1 else f"{self.count} times"
-        return f"agent.py failed {times}: {self.what}"
+        return f"agent.py failed {times}: {self.text}"
 
 
 class ServerLogs:
-    """What the servers of a study write into their logs from now on."""
+    """The servers' logs of a study, from now on."""
 
     def __init__(self, data: Path) -> None:
         self._folder = logs_of(data)
-        self._begin = {log: log.stat().st_size for log in self._logs()}
+        self._sizes = {log: log.stat().st_size for log in self._logs()}
 
     def crashes(self, names: Mapping[str, str] | None = None) -> list[AgentCrash]:
         """Each error of agent.py once, the most frequent first; in the texts, `names` are replaced by their values."""
         found: dict[str, AgentCrash] = {}
         for log in self._logs():
             try:
-                text = log.read_bytes()[self._begin.get(log, 0) :].decode("utf-8", "replace")
+                new = log.read_bytes()[self._sizes.get(log, 0) :].decode("utf-8", "replace")
             except OSError:
                 continue
             for before, after in (names or {}).items():
-                text = text.replace(before, after)
-            for crash in read(text.splitlines()):
-                found.setdefault(crash.what, crash).count += 1
+                new = new.replace(before, after)
+            for crash in read(new.splitlines()):
+                found.setdefault(crash.text, crash).count += 1
         return sorted(found.values(), key=lambda crash: -crash.count)
 
     def _logs(self) -> list[Path]:
@@ -57,15 +57,15 @@ class ServerLogs:
 def read(lines: Iterable[str]) -> Iterator[AgentCrash]:
     """The errors in a server's log, one for each time that agent.py failed."""
     last: AgentCrash | None = None
-    told: list[str] | None = None  # the lines of the traceback that is being read
+    traceback: list[str] | None = None  # the lines so far of the traceback that is being read
     for line in [*lines, "0000-00-00 00:00:00 INFO the end"]:
         if not _LINE.match(line):
-            if told is not None:
-                told.append(line)
+            if traceback is not None:
+                traceback.append(line)
             continue
-        if told:
-            last = AgentCrash(told[-1], "\n".join(told[-_LONGEST:]))
+        if traceback:
+            last = AgentCrash(traceback[-1], "\n".join(traceback[-_LONGEST:]))
             yield last
-        told = [] if _FAILED.search(line) else None
+        traceback = [] if _FAILED.search(line) else None
         if _AGAIN in line and last is not None:
             yield last

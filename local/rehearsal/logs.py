@@ -1,4 +1,4 @@
-"""What bots sent and played, looked for in the data of `make try`, and what its functions and servers said."""
+"""Checks the data of `make try` for what the bots sent and played, and reads the logs of functions and servers."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from bots import verification
 from bots.report import BotReport
 from bots.verification import Verification, document
 from hippodrome.model import ids
-from local.activity.function_log import complaint
+from local.activity.function_log import log_line
 from local.activity.server_logs import last_error
 from local.rehearsal.study_process import logs_of
 from protocol.keys import membership_key
 
 
 def verify(data: Path, project_id: str, reports: Sequence[BotReport], *, recorded: bool = True) -> Verification:
-    """Compare what is in the data folder with what the bots say. `recorded`: the project keeps recordings."""
+    """Compare the data folder with the bots' reports. `recorded`: the project keeps recordings."""
     return verification.verify(
         data, project_id, reports, recorded=recorded, last_error=partial(_last_error, data, project_id)
     )
 
 
 def _last_error(data: Path, project_id: str, user_id: str) -> str:
-    """What the log of the participant's last server, or of their session's, says of its last error."""
+    """The last error in the log of the last server of a participant or their session; empty if there is none."""
     owner = document(data / membership_key(project_id, user_id)).get("session") or user_id
     label = ids.server_label(project_id, owner)
     attempt = document(data / "_servers" / f"{label}.json").get("attempt", 1)
@@ -33,17 +33,17 @@ def _last_error(data: Path, project_id: str, user_id: str) -> str:
 
 
 class FunctionLog:
-    """What the functions of a study complain of from now on: pages that are broken, and the like."""
+    """The log of a study's functions, from now on."""
 
     def __init__(self, data: Path) -> None:
         self._log = logs_of(data) / "functions.log"
-        self._begin = self._log.stat().st_size if self._log.is_file() else 0
+        self._size = self._log.stat().st_size if self._log.is_file() else 0
 
-    def complaints(self) -> list[str]:
-        """Each in a line, as often as it was said."""
+    def warnings(self) -> list[str]:
+        """New warnings and errors, a line each, as often as they were logged."""
         found = []
         try:
-            lines = self._log.read_bytes()[self._begin :].splitlines()
+            lines = self._log.read_bytes()[self._size :].splitlines()
         except OSError:
             return []
         for line in lines:
@@ -52,5 +52,5 @@ class FunctionLog:
             except ValueError:
                 continue
             if record.get("level") in ("WARNING", "ERROR"):
-                found.append(complaint(str(record.get("message")), record))
+                found.append(log_line(str(record.get("message")), record))
         return found

@@ -1,4 +1,4 @@
-"""The report of a rehearsal: a table, and what went wrong."""
+"""Prints the report of a rehearsal: a table, and what went wrong."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bots.verification import Verification
 from local.rehearsal.crashes import AgentCrash
 from local.rehearsal.study_process import Leftovers
 
-EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended before their time
-SHOWN = 10  # lines of each kind
-SHOWN_NAMES = 3  # of those who found no others
+EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended early
+SHOWN_LINES = 10  # of each kind
+SHOWN_NAMES = 3  # of bots that found no others
 SHOWN_CRASHES = 3  # tracebacks of agent.py
 
 
@@ -31,13 +31,13 @@ def report(
     *,
     recorded: bool = True,
     live: bool = True,
-    said: Sequence[str] = (),
+    warnings: Sequence[str] = (),
     crashes: Sequence[AgentCrash] = (),
 ) -> bool:
-    """Print the table and what went wrong; whether everything is as it should be.
+    """Print the table and what went wrong; return whether everything is as it should be.
 
-    `recorded` and `live` are what config.yml says, `said` what the functions complained of, `crashes` the errors of
-    agent.py.
+    `recorded` and `live` are what config.yml says, `warnings` those of the functions' log, `crashes` the errors of
+    agent.py. `found` is None if the data are not known, `left` if nobody looked for servers that are left.
     """
     table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")
     for name, value in [
@@ -46,8 +46,8 @@ def report(
         *([("servers left over", str(max(left.processes, len(left.records))))] if left else []),
     ]:
         table.add_row(name, value)
-    errors = [f"{report.user_id}: {error}" for report in reports for error in report.errors]
-    troubles = [f"{report.user_id}: {trouble}" for report in reports for trouble in report.troubles]
+    errors = [f"{bot.user_id}: {error}" for bot in reports for error in bot.errors]
+    troubles = [f"{bot.user_id}: {trouble}" for bot in reports for trouble in bot.troubles]
     if troubles:
         table.add_row("troubles got over", str(len(troubles)))
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
@@ -58,10 +58,10 @@ def report(
         console.print(escape(crash.traceback), style="red", soft_wrap=True)
     _print(console, troubles, "yellow")
     _print(console, bad, "red")
-    if said:
+    if warnings:
         console.print("  Local mode said:")
-    _print(console, said, "red" if bad else "yellow")
-    return all(report.finished for report in reports) and not bad and not crashes
+    _print(console, warnings, "red" if bad else "yellow")
+    return all(bot.finished for bot in reports) and not bad and not crashes
 
 
 Rows = list[tuple[str, str]]
@@ -72,9 +72,9 @@ def _title(reports: Sequence[BotReport], seconds: float) -> str:
 
 
 def _played(reports: Sequence[BotReport], found: Verification | None) -> Rows:
-    """What the bots have seen."""
-    plays = [play for report in reports for play in report.plays]
-    rows = [("bots finished", _of(sum(report.finished for report in reports), len(reports)))]
+    """The rows of what the bots have seen."""
+    plays = [play for bot in reports for play in bot.plays]
+    rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
     rows += _together(reports)
     if plays:
         rows.append(("wait on the game page", _spread([play.waited for play in plays])))
@@ -90,8 +90,8 @@ def _played(reports: Sequence[BotReport], found: Verification | None) -> Rows:
 
 
 def _together(reports: Sequence[BotReport]) -> Rows:
-    """Who played with others, for a study of several participants."""
-    plays = [play for report in reports for play in report.plays]
+    """The rows of games that bots played together; none if no bot played or waited with others."""
+    plays = [play for bot in reports for play in bot.plays]
     waited = [play.lobby for play in plays if play.lobby is not None]
     if not waited and not any(play.unmatched or play.members > 1 for play in plays):
         return []
@@ -106,7 +106,7 @@ def _together(reports: Sequence[BotReport]) -> Rows:
     )
     early = Counter(play.outcome for play in plays if play.outcome in EARLY)
     ended = ", ".join(f"{count} {outcome}" for outcome, count in sorted(early.items()))
-    alone = [report.user_id for report in reports if any(play.unmatched for play in report.plays)]
+    alone = [bot.user_id for bot in reports if any(play.unmatched for play in bot.plays)]
     names = ", ".join(alone[:SHOWN_NAMES]) + (" …" if len(alone) > SHOWN_NAMES else "")
     return [
         ("games played together", made or "none"),
@@ -117,12 +117,12 @@ def _together(reports: Sequence[BotReport]) -> Rows:
 
 
 def _found(reports: Sequence[BotReport], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
-    """What of it is in the data."""
+    """The rows of what is in the data."""
     if not found:
         return [("data", "not looked at: --data says where they are")]
     unrecorded = "none expected: config.yml says `s3upload: false`"
     closed = "none expected: config.yml says `live: false`, so no participant gets in"
-    finished = sum(report.finished for report in reports)
+    finished = sum(bot.finished for bot in reports)
     recordings = f"{found.recordings}, with {found.steps} steps"
     return [
         ("answers found", _of(found.answers, found.answers_sent)),
@@ -134,14 +134,14 @@ def _found(reports: Sequence[BotReport], found: Verification | None, *, recorded
 
 def _print(console: Console, all_lines: Sequence[str], style: str) -> None:
     lines = _counted(all_lines)
-    for line in lines[:SHOWN]:
+    for line in lines[:SHOWN_LINES]:
         console.print(f"  {escape(line)}", style=style, soft_wrap=True)
-    if len(lines) > SHOWN:
-        console.print(f"  … and {len(lines) - SHOWN} more", style=style)
+    if len(lines) > SHOWN_LINES:
+        console.print(f"  … and {len(lines) - SHOWN_LINES} more", style=style)
 
 
 def _counted(lines: Sequence[str]) -> list[str]:
-    """Each line once. Of lines that differ only in who they are about, the first, and of how many it is true."""
+    """Each line once. Of lines that differ only in the bot that they begin with, the first one, and their number."""
     groups: dict[str, list[str]] = {}
     for line in lines:
         groups.setdefault(re.sub(r"^bot-\w+-\d+", "", line), []).append(line)
@@ -153,6 +153,7 @@ def _of(part: int, whole: int) -> str:
 
 
 def _spread(values: Sequence[float]) -> str:
+    """The median, the 95th percentile and the maximum of seconds."""
     ordered = sorted(values)
     p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1) + 0.49))]
     return f"p50 {median(ordered):.1f} s, p95 {p95:.1f} s, max {ordered[-1]:.1f} s"

@@ -1,4 +1,4 @@
-"""A study held by `python -m local` in a process of its own: started, killed, ended, and looked at from outside."""
+"""Runs a study by `python -m local` in a process of its own, ends it, and looks at its servers and records."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from protocol.keys import handover_key, membership_key
 from protocol.session import is_session_id
 
 ROOT = Path(__file__).resolve().parents[2]
-TRIED = "data-try"  # the folder in the project's with the data of each rehearsal
-START_SECONDS = 60.0  # until the study must be held
-PATIENCE = 30  # seconds in which a bot must have found others, in the copy of a study
-GONE_SECONDS = 45.0  # until the servers must be gone after the last bot
-END_SECONDS = 30.0  # until local mode must have ended
+TRIED = "data-try"  # the project's folder with the data of its rehearsals
+START_SECONDS = 60.0  # in which the study must have started
+PATIENCE = 30  # seconds: the longest `patience` in the copy of a study
+GONE_SECONDS = 45.0  # after the last bot, in which the servers must have ended
+END_SECONDS = 30.0  # in which local mode must have ended
 
 _LINK = re.compile(r"http://127\.0\.0\.1:\d+/next\S*")
 
 
-class NotHeld(Exception):
-    """The study could not be held; the text is what local mode said."""
+class StudyNotStarted(Exception):
+    """The study cannot be started; the text is the reason, or what local mode printed."""
 
 
 class Process(Protocol):
-    """What is asked of the process; `subprocess.Popen` is one."""
+    """The methods of `subprocess.Popen` that are used here."""
 
     @property
     def pid(self) -> int: ...
@@ -56,7 +56,7 @@ class Process(Protocol):
 
 
 class StudyProcess:
-    """`python -m local` in a process of its own."""
+    """`python -m local` in a process of its own. `link` is the study's link once it has started."""
 
     def __init__(self, folder: Path, data: Path, *, log: Path | None = None) -> None:
         self.folder, self.data = folder.resolve(), data.resolve()
@@ -70,29 +70,29 @@ class StudyProcess:
         return self._process.pid
 
     def start(self, seconds: float = START_SECONDS) -> None:
-        """Start it and wait for its link. Raises NotHeld."""
+        """Start it and wait for its link. Raises StudyNotStarted."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("ab") as log:
-            said = log.tell()
+            begin = log.tell()
             self._process = self._begin(
                 [str(self.folder), "--port", "0", "--data", str(self.data)],
                 cwd=ROOT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is for us; we end it ourselves
+                start_new_session=True,  # Ctrl-C must not reach it: `interrupt` ends it
             )
         until = time.monotonic() + seconds
         while True:
             ended = self._process.poll() is not None
-            text = self.log.read_bytes()[said:].decode("utf-8", "replace")
+            text = self.log.read_bytes()[begin:].decode("utf-8", "replace")
             found = _LINK.search(text)
             if found:
                 self.link = found[0]
                 return
             if ended or time.monotonic() > until:
                 self.kill()
-                raise NotHeld(text.strip() or "it said nothing")
+                raise StudyNotStarted(text.strip() or "it printed nothing")
             time.sleep(0.05)
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
@@ -101,7 +101,7 @@ class StudyProcess:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)  # noqa: S603 - our own command
 
     def interrupt(self, seconds: float = END_SECONDS) -> bool:
-        """End it as Ctrl-C does; whether it did so by itself."""
+        """End it as Ctrl-C does; return False if it had to be killed after `seconds`."""
         process = self._process
         if process is None:
             return True
@@ -115,13 +115,13 @@ class StudyProcess:
         return True
 
     def kill(self) -> None:
-        """`kill -9`: it has no time to say goodbye."""
+        """Send SIGKILL, and wait for its end. Its servers go on."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
 
     def clear(self) -> int:
-        """End what is left of it, in any case; how many processes there were."""
+        """Kill it and all its servers; return how many servers there were."""
         self.kill()
         left = servers_of(self.data)
         for process in left:
@@ -132,30 +132,33 @@ class StudyProcess:
 
 
 def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
-    """The trial processes of this data folder (and these users), found by their environment."""
+    """The server processes of a data folder, found by their environment; with `users`, only those of these owners.
+
+    An owner is a participant's id or a session's.
+    """
     store = str(data.resolve())
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
-            told = process.environ()
-            if told.get(environment.STORE) == store and (users is None or _plays(told, data) in users):
+            variables = process.environ()
+            if variables.get(environment.STORE) == store and (users is None or _owner(variables, data) in users):
                 found.append(process)
     return found
 
 
-def _plays(told: Mapping[str, str], data: Path) -> str | None:
+def _owner(variables: Mapping[str, str], data: Path) -> str | None:
     """The participant or session of a server: from its environment, or for a warm server from its handover."""
     for name in (environment.USER_ID, environment.SESSION):
-        if told.get(name):
-            return told[name]
+        if variables.get(name):
+            return variables[name]
     with contextlib.suppress(OSError, ValueError, KeyError):
-        key = handover_key(told[environment.PROJECT_ID], told[environment.SERVER])
+        key = handover_key(variables[environment.PROJECT_ID], variables[environment.SERVER])
         return handover.parse((data / key).read_bytes()).user_id
     return None
 
 
 def copy_of(project: Path, folder: Path) -> list[str]:
-    """A copy of the project in which bots can end the game; what was changed, in words. Its files are links."""
+    """Make a copy of the project, of links, in which bots can end the game; return what was changed, in words."""
     folder.mkdir(parents=True)
     source = read_source(project)
     config = source.layout.config
@@ -164,9 +167,9 @@ def copy_of(project: Path, folder: Path) -> list[str]:
             (folder / path.name).symlink_to(path.resolve())
     tree = yaml.safe_load(config.read_text(encoding="utf-8"))
     _copy_policies(project, folder, tree.get("trial") or {})
-    known_as = source.adapted.at(("project", "id"))  # it may come from the folder's name, which the copy has not
-    if isinstance(known_as, str):
-        tree["project"]["id"] = known_as
+    project_id = source.adapted.at(("project", "id"))  # it may come from the folder's name, and the copy has another
+    if isinstance(project_id, str):
+        tree["project"]["id"] = project_id
     changes = []
     if not tree["project"].get("live"):
         tree["project"]["live"] = True
@@ -180,21 +183,21 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         tree["project"]["patience"] = PATIENCE
         changes.append(f"`patience` is {PATIENCE}")
     trial = tree.get("trial") or {}
-    shown = trial.get("ui")
-    if isinstance(shown, list):
-        shown = dict.fromkeys(shown, True)
-    shown = shown or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
-    if not shown.get("stop"):
-        tree["trial"] = {**trial, "ui": {**shown, "stop": True}}
+    ui = trial.get("ui")
+    if isinstance(ui, list):
+        ui = dict.fromkeys(ui, True)
+    ui = ui or dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
+    if not ui.get("stop"):
+        tree["trial"] = {**trial, "ui": {**ui, "stop": True}}
         changes.append("the game may be stopped (`ui.stop`)")
     (folder / config.name).write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return changes
 
 
 def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> None:
-    """Copy the policies' files and what lies beside them: a server reads none that a link leads to.
+    """Replace the links to the policies' files, or to their folders, by copies: a server reads no policy by a link.
 
-    What is wrong in `players` and `substitute` is said by local mode.
+    Local mode reports the mistakes in `players` and `substitute`.
     """
     named = {key: trial.get(key) for key in ("players", "substitute")}
     for top in {Path(file).parts[0] for _, file in who.files(named) if (project / file).is_file()}:
@@ -206,20 +209,20 @@ def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> Non
 
 
 def logs_of(data: Path) -> Path:
-    """Where a study with this data folder puts what its functions and servers say."""
+    """The folder with the logs of the functions and servers of a study with this data folder."""
     return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
 
 
 def sessions_of(data: Path, project_id: str, users: Collection[str]) -> set[str]:
-    """The sessions in which these participants play together with others."""
+    """The ids of the sessions in which these participants play with others."""
     keys = (membership_key(project_id, user_id) for user_id in users)
     return {str(membership["session"]) for key in keys if (membership := document(data / key)).get("session")}
 
 
 def sessions_not_open(data: Path, project_id: str) -> set[str]:
-    """The sessions that have a server, but those that the lobby lists as open.
+    """The ids of the sessions that have a server, without those that the lobby lists as open.
 
-    Their servers were started ahead, and wait for participants who may still come.
+    The servers of open sessions were started ahead, and wait for participants who may still come.
     """
     ahead = {each["id"] for each in document(data / decisions.key(project_id)).get("open", ())}
     owners = {str(document(path).get("userId")) for path in (data / "_servers").glob("*.json")}
@@ -227,7 +230,7 @@ def sessions_not_open(data: Path, project_id: str) -> set[str]:
 
 
 def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
-    """The servers (of these users) that the records call open."""
+    """The labels of the servers whose records are not closed; with `users`, only those of these owners."""
     records = ((path.stem, document(path)) for path in sorted((data / "_servers").glob("*.json")))
     return [
         name
@@ -238,24 +241,24 @@ def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
 
 @dataclass
 class Leftovers:
-    """What must not be there at the end."""
+    """What a study has left over: processes of servers, records that are not closed, and local mode itself."""
 
     processes: int = 0
     records: list[str] = field(default_factory=list)
-    stubborn: bool = False  # local mode had to be killed
+    local_mode_killed: bool = False  # it did not end by itself
 
     def words(self) -> list[str]:
-        """What is wrong; nothing if nothing is left over."""
+        """A line for each thing that is left over."""
         lines = [f"the record of server {name} is not closed" for name in self.records]
         if self.processes:
             lines.append(f"{self.processes} server process(es) were left over")
-        if self.stubborn:
+        if self.local_mode_killed:
             lines.append(f"local mode did not end within {END_SECONDS:.0f} s")
         return lines
 
 
 def wait_until_gone(data: Path, users: Collection[str] | None = None) -> Leftovers:
-    """Give the last servers time to end; what is left."""
+    """Wait up to GONE_SECONDS until the last servers have ended; return what is left."""
     until = time.monotonic() + GONE_SECONDS
     while True:
         left = Leftovers(len(servers_of(data, users)), open_records(data, users))

@@ -1,9 +1,10 @@
-"""Which requests this machine's web server answers: those of its own pages, of people who open a link, and of programs.
+"""Decides which requests the web server of this machine answers.
 
-A page of another site that is open in the researcher's browser can send requests to this machine, too. Browsers say so:
-in `Origin` (https://fetch.spec.whatwg.org/#origin-header) and `Sec-Fetch-Site`, `-Dest`
-(https://www.w3.org/TR/fetch-metadata/). A name of the other site's that leads to this machine (DNS rebinding) stands in
-`Host`. Programs that are no browsers send neither and may ask.
+It answers its own pages, people who open a link, and programs. A page of another site that is open in the researcher's
+browser can send requests to this machine, too. Browsers name that site in `Origin`
+(https://fetch.spec.whatwg.org/#origin-header), and say in `Sec-Fetch-Site` and `Sec-Fetch-Dest` that it is another one
+(https://www.w3.org/TR/fetch-metadata/). If the other site's own name leads to this machine (DNS rebinding), `Host` has
+that name. Programs that are no browsers send no `Origin` and no `Sec-Fetch-` headers, and are answered.
 """
 
 from __future__ import annotations
@@ -12,19 +13,18 @@ from collections.abc import Collection, Mapping
 from urllib.parse import urlsplit
 
 NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
-"""What this machine is called in its own addresses; at any port, which a tunnel may have changed."""
-
+"""Names and addresses of this machine. The port may be any: a tunnel may have changed it."""
 
 TLS_NAMES = frozenset({"study.localhost", "api.localhost"})
-"""Further names with TLS: the site's as on AWS, and the one that HIPPO's front end at `localhost` asks."""
+"""Further names with TLS: the site's name, as on AWS, and the name to which HIPPO's front end sends its requests."""
 
 
 def refusal(
     method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = (), *, scheme: str = "http"
 ) -> str | None:
-    """Why the request is not answered, in a sentence; None if it is. Names of headers are in lower case.
+    """The sentence with which a request is refused; None if it is answered. Names of headers are in lower case.
 
-    `origins` are the other origins whose pages may ask, such as `http://localhost:3000`.
+    `origins` are other origins whose pages are answered too, such as `http://localhost:3000`.
     """
     host = headers.get("host", "")
     if _name(host) not in (NAMES | TLS_NAMES if scheme == "https" else NAMES):
@@ -46,11 +46,11 @@ def refusal(
 
 
 def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: Collection[str]) -> dict[str, str]:
-    """The headers of a response as they leave this machine.
+    """The headers that are sent with a response, made from those of the function (`sent`).
 
-    On AWS any origin may read the answers, since only participants have their links. Here a study's id is
-    enough, so the functions' CORS headers are for `origins` only. The referrer is kept within our pages, so that they
-    send an `Origin` with their forms; browsers that must not send a referrer write `null` there.
+    On AWS any origin may read responses, since only participants have their links. Here a study's id suffices, so only
+    `origins` get the CORS headers. Pages of this server may send each other a referrer: without that, browsers send
+    `Origin: null` with forms.
     """
     kept = dict(sent)
     if kept.get("referrer-policy") == "no-referrer":
@@ -79,7 +79,7 @@ def origin_of(address: str) -> str | None:
 
 
 def _name(host: str) -> str:
-    """The name in a `Host` header, without the port; empty if it is none."""
+    """The name in a `Host` header, without the port; empty if it cannot be parsed."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:

@@ -1,4 +1,4 @@
-"""The ASGI application: each request that may be answered goes to its function, in a thread."""
+"""The ASGI application: it calls the function of each request in a thread."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 
 class App:
-    """The ASGI application. `functions` are the handlers by name. Pages of `origins` may send requests as ours do."""
+    """The ASGI application. `functions` are the handlers by name. Pages of `origins` are answered, too."""
 
     def __init__(self, functions: Mapping[str, Handler], say: Say = print, origins: Collection[str] = ()) -> None:
         self._functions = functions
@@ -36,16 +36,17 @@ class App:
         answer = await self._answer(scope, receive)
         if answer is None:
             return
-        headers = [*self._leaving(scope, answer.headers), (b"content-length", str(len(answer.body)).encode())]
+        headers = [*self._sent_headers(scope, answer.headers), (b"content-length", str(len(answer.body)).encode())]
         await send({"type": "http.response.start", "status": answer.status, "headers": headers})
         body = b"" if scope["method"] == "HEAD" else answer.body
         await send({"type": "http.response.body", "body": body})
 
     def close(self) -> None:
+        """Call no more functions; those that run end by themselves."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _answer(self, scope: Scope, receive: Receive) -> GatewayResponse | None:
-        """The answer; None if the client has gone."""
+        """The answer to a request; None if the client has closed its connection."""
         path = scope["path"]
         if path == "/next/":
             path = "/next"
@@ -72,8 +73,8 @@ class App:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._threads, self._call, self._functions[route.function], event)
 
-    def _leaving(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
-        """An answer's headers as they leave this machine (`access.headers_for`)."""
+    def _sent_headers(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+        """The headers that are sent with an answer (`access.headers_for`), and its cookies."""
         cookies = [(name, value) for name, value in headers if name == b"set-cookie"]
         others = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in headers if name != b"set-cookie"]
         kept = access.headers_for(_headers(scope).get("origin"), others, self._origins)
@@ -82,13 +83,13 @@ class App:
     def _call(self, handler: Handler, event: dict[str, Any]) -> GatewayResponse:
         try:
             return answer_of(handler(event, None))
-        except Exception:  # noqa: BLE001 - as API Gateway: the participant learns nothing of it
+        except Exception:  # noqa: BLE001 - as with API Gateway, the participant sees no details
             self._say(f"a function failed:\n{traceback.format_exc().rstrip()}")
             return _message(500, "Internal Server Error")
 
 
 def _headers(scope: Scope) -> dict[str, str]:
-    """The headers of a request, for `access`. A header that was sent twice has both values."""
+    """The headers of a request, for `access`. A header that was sent twice has both values, with a comma between."""
     found: dict[str, str] = {}
     for raw_name, raw_value in scope["headers"]:
         name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
@@ -97,7 +98,7 @@ def _headers(scope: Scope) -> dict[str, str]:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """The whole body; a little more than allowed if it is too large; None if the client has gone."""
+    """The body, cut off soon after LARGEST_BODY; None if the client has closed its connection."""
     body = bytearray()
     while True:
         message = await receive()
@@ -118,7 +119,7 @@ def _message(status: int, text: str) -> GatewayResponse:
 
 
 def _nothing_here(scope: Scope) -> GatewayResponse:
-    """What API Gateway answers; for browsers a page, since their user may have mistyped an address."""
+    """The answer for a path without a route: that of API Gateway, or a page if a browser asks for one."""
     accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
     if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
         return _message(404, "Not Found")

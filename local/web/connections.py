@@ -1,4 +1,4 @@
-"""HTTP connections with limits in time and number, so that silent or slow ones block no others."""
+"""HTTP connections with limits of time and number, so that silent or slow clients block no others."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-HEADER_SECONDS = 10.0  # from the connection, or the end of the last answer, until a request's headers are there
-REQUEST_SECONDS = 60.0  # from there until its body is read and its answer is sent
+HEADER_SECONDS = 10.0  # from the connection or the last answer until the headers of a request have come
+REQUEST_SECONDS = 60.0  # from then until its body has come and its answer is sent
 MAX_CONNECTIONS = 512  # connections at once
-SHARE = 4  # of the files that this process may open, one in so many may be a connection
+SHARE = 4  # at most one in so many of the files that this process may open is a connection
 
 
 def most() -> int:
-    """How many connections there may be at once. The limit of files may change while the process runs."""
+    """The most connections at once. It is computed anew each time: the limit of open files may change."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return MAX_CONNECTIONS if soft == resource.RLIM_INFINITY else max(1, min(MAX_CONNECTIONS, soft // SHARE))
 
 
 class HttpConnection(H11Protocol):
-    """A connection as uvicorn has it, cut off when it is too slow.
+    """uvicorn's connection, which is closed when its client is too slow.
 
-    Beyond `most`, the oldest that waits for a request goes; if all are being answered, the newest.
+    If there are more connections than `most`, the oldest that waits for a request is closed; if all are being answered,
+    the newest.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -35,7 +36,7 @@ class HttpConnection(H11Protocol):
         if len(self.connections) > most():
             waiting = [each for each in self.connections if isinstance(each, HttpConnection) and not each.answering]
             oldest = min(waiting, key=lambda each: each._since, default=self)
-            self.connections.discard(oldest)  # the transport says so later
+            self.connections.discard(oldest)  # `connection_lost` is called only later
             oldest.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -55,7 +56,7 @@ class HttpConnection(H11Protocol):
 
     @property
     def answering(self) -> bool:
-        """Whether a request's headers are there and its answer is not all sent."""
+        """Whether a request's headers have come and its answer has not been sent to the end."""
         cycle: Any = self.cycle
         return cycle is not None and not cycle.response_complete
 

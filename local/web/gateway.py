@@ -1,10 +1,10 @@
-"""What API Gateway does: it makes events of requests for the functions, and responses of what these return.
+"""Does what API Gateway does: it makes events of requests for the functions, and responses of what these return.
 
-What the events look like was taken from payload format 2.0 of HTTP APIs:
+The events have the payload format 2.0 of HTTP APIs:
 https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html
-and, where that page is silent, from what others measured on AWS: `rawPath` is decoded; a body is text only if it is
-`text/*` or JSON, XML or JavaScript by its content type, so that forms arrive in base64 (ministack pull request 766,
-middleapi/standard-server pull request 93).
+That page does not say how `rawPath` and bodies are coded. Others have measured it on AWS: `rawPath` is decoded; a body
+is text only if its content type is `text/*`, JSON, XML or JavaScript, so that forms arrive in base64 (ministack pull
+request 766, middleapi/standard-server pull request 93).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
-_HOST = "127.0.0.1"  # of a request that names none
+_HOST = "127.0.0.1"  # for a request without a host
 
 Scope = MutableMapping[str, Any]
 
@@ -27,14 +27,14 @@ _TEXT = re.compile(r"text/.*|application/(json|xml|javascript)")
 
 
 class Route(NamedTuple):
-    """Which requests go to which function. `{name}` in the path stands for one segment."""
+    """The requests that a function answers. `{name}` in the path stands for one segment."""
 
     methods: tuple[str, ...]
     path: str
     function: str
 
     def match(self, method: str, path: str) -> dict[str, str] | None:
-        """The path parameters if the request is for this route."""
+        """The path parameters of a request for this route; None if it is for another route."""
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.path))
         found = re.fullmatch(pattern, path) if method in self.methods else None
         return found.groupdict() if found else None
@@ -50,7 +50,7 @@ ROUTES = (
 
 
 class GatewayResponse(NamedTuple):
-    """What goes back over the wire."""
+    """The status, headers and body that are sent to the client."""
 
     status: int
     headers: list[tuple[bytes, bytes]]
@@ -114,7 +114,7 @@ def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, s
 
 
 def answer_of(result: Any) -> GatewayResponse:
-    """The response that API Gateway makes of what a function returns. Raises for what it would call an error."""
+    """The response that API Gateway makes of a function's result. Raises an exception where API Gateway sends a 500."""
     if not isinstance(result, dict) or "statusCode" not in result:
         return json_answer(200, result)
     body = result.get("body") or ""
@@ -132,7 +132,7 @@ def answer_of(result: Any) -> GatewayResponse:
 
 
 def _text(body: bytes, content_type: str) -> str | None:
-    """The body as text; None if it travels in base64."""
+    """The body as text; None if the event has it in base64."""
     if not _TEXT.fullmatch(content_type.partition(";")[0].strip().lower()):
         return None
     try:

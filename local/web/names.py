@@ -1,7 +1,7 @@
-"""Names of servers on one machine, as AWS has them: `wss://{name}.localhost:5000/` leads to the server of that name.
+"""Names of servers on one machine, as on AWS: `wss://{name}.localhost:5000/` leads to the server of that name.
 
-All names below localhost are this machine (RFC 6761, 6.3), and all servers share its one port. So TLS ends here: the
-name that the client asks for in its TLS hello says which server gets the connection.
+All names below localhost are this machine (RFC 6761, 6.3), and all servers share one port. So this module terminates
+TLS: the name in the client's TLS hello (SNI) says which server gets the connection.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from local.backend.authority import Authority
 from local.web import connections
 
 PORT = 5000
-"""Where HIPPO's servers listen, and where its front end looks for them."""
-_PIECE = 16_384  # bytes that may wait here: trial servers send no more than a client takes
+"""The port of HIPPO's servers, to which its front end connects."""
+_PIECE = 16_384  # bytes that may wait here; so a trial server notices when its client is slow
 _HANDSHAKE_SECONDS = 10.0
 _BACKLOG = 100
 _PAUSE = 0.5  # seconds after a connection could not be accepted
@@ -27,7 +27,7 @@ Find = Callable[[str], int | None]
 
 
 class Names:
-    """Listens in a thread of its own. `find` has the port of the server of a name."""
+    """Listens in a thread of its own. `find` returns the port of the server with a name; None if there is none."""
 
     def __init__(self, listener: socket.socket, authority: Authority, find: Find) -> None:
         self.port: int = listener.getsockname()[1]
@@ -40,7 +40,7 @@ class Names:
         self._ended = asyncio.Event()
         self._context = authority.context("localhost")
         self._all: set[asyncio.Task[None]] = set()
-        self._shaking: dict[asyncio.Task[None], None] = {}  # those of `_all` without a server yet, the oldest first
+        self._handshakes: dict[asyncio.Task[None], None] = {}  # those of `_all` in their handshake, the oldest first
 
     def start(self) -> None:
         """Serve until `close`."""
@@ -66,7 +66,7 @@ class Names:
             task.cancel()
 
     async def _accept(self) -> None:
-        """Take connections. Beyond `connections.most`, the oldest that shakes hands goes, or the new one."""
+        """Accept connections. If there are `connections.most`, close the oldest in its handshake; else the new one."""
         self._context.sni_callback = self._choose
         self._listener.setblocking(False)
         self._listener.listen(_BACKLOG)
@@ -81,13 +81,13 @@ class Names:
                 continue
             task = self._loop.create_task(self._handle(accepted))
             self._all.add(task)
-            self._shaking[task] = None
+            self._handshakes[task] = None
             task.add_done_callback(self._forget)
-            await asyncio.sleep(0)  # it begins, and owns the socket
+            await asyncio.sleep(0)  # so the task begins, and owns the socket
 
     def _drop_oldest(self) -> bool:
-        """Close the oldest connection that has no server yet; whether there is one."""
-        oldest = next(iter(self._shaking), None)
+        """Close the oldest connection in its handshake; return False if there is none."""
+        oldest = next(iter(self._handshakes), None)
         if oldest is not None:
             self._forget(oldest)
             oldest.cancel()
@@ -95,10 +95,10 @@ class Names:
 
     def _forget(self, task: asyncio.Task[None]) -> None:
         self._all.discard(task)
-        self._shaking.pop(task, None)
+        self._handshakes.pop(task, None)
 
     async def _handle(self, accepted: socket.socket) -> None:
-        """Shake hands and carry what comes, until one side closes."""
+        """Do the TLS handshake, then connect the client with its server until one side closes."""
         reader = asyncio.StreamReader(_PIECE)
         protocol = asyncio.StreamReaderProtocol(reader)
         try:
@@ -109,11 +109,11 @@ class Names:
             return
         task = asyncio.current_task()
         assert task is not None
-        self._shaking.pop(task, None)
-        await self._connected(reader, asyncio.StreamWriter(transport, protocol, reader, self._loop))
+        self._handshakes.pop(task, None)
+        await self._relay(reader, asyncio.StreamWriter(transport, protocol, reader, self._loop))
 
     def _choose(self, connection: ssl.SSLObject, name: str | None, _: ssl.SSLContext) -> int | None:
-        """Show the certificate of the name that was asked for; refuse names that no server has."""
+        """Choose the certificate of the name that the client asks for; refuse names that no server has."""
         asked = (name or "").lower()
         if self._find(asked) is None:
             return ssl.ALERT_DESCRIPTION_UNRECOGNIZED_NAME
@@ -122,13 +122,13 @@ class Names:
         connection.context = self._contexts[asked]
         return None
 
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         chosen = writer.get_extra_info("ssl_object").context
         port = next((self._find(name) for name, context in self._contexts.items() if context is chosen), None)
         try:
             if port is not None:
-                there = await asyncio.open_connection("127.0.0.1", port, limit=_PIECE)
-                await _join((reader, writer), there)
+                server = await asyncio.open_connection("127.0.0.1", port, limit=_PIECE)
+                await _join((reader, writer), server)
         except OSError:
             pass  # the server is gone; the client sees its connection closed
         finally:
@@ -139,8 +139,8 @@ Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 async def _join(one: Stream, other: Stream) -> None:
-    """Carry bytes both ways until one side closes."""
-    ways = [asyncio.create_task(_carry(one[0], other[1])), asyncio.create_task(_carry(other[0], one[1]))]
+    """Copy bytes both ways until one side closes."""
+    ways = [asyncio.create_task(_copy(one[0], other[1])), asyncio.create_task(_copy(other[0], one[1]))]
     try:
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
     finally:
@@ -149,7 +149,7 @@ async def _join(one: Stream, other: Stream) -> None:
         other[1].close()
 
 
-async def _carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     writer.transport.set_write_buffer_limits(high=_PIECE)
     with contextlib.suppress(OSError):
         while piece := await reader.read(_PIECE):

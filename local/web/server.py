@@ -1,4 +1,4 @@
-"""The server process's port and thread: uvicorn, on this machine alone."""
+"""The web server: uvicorn in a thread, at a port that only this machine can reach."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from local.web.connections import HttpConnection
 
 HOST = "127.0.0.1"
 PORTS_TRIED = 20
-_NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # what accept(2) refuses until there is room
+_NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # errors of accept(2) that pass
 
 Refused = Callable[[BaseException], None]
-
 HIGHEST_PORT = 65535
 
 
 class NoPort(Exception):
-    """The number is no port, or every port that was tried is taken."""
+    """The number is no port, or no port that was tried is free; the text is a sentence for the researcher."""
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on this machine alone: at this port or the next free one; 0 for any. Raises `NoPort`."""
+    """A listening socket that only this machine can reach: at this port or the next free one; 0: any port.
+
+    Raises `NoPort`.
+    """
     if not 0 <= port <= HIGHEST_PORT:
         raise NoPort(f"{port} is no port: a port is a number from 1 to {HIGHEST_PORT} (PORT=, --port)")
     last = min(port + PORTS_TRIED, HIGHEST_PORT)
@@ -51,13 +53,14 @@ def listen(port: int) -> socket.socket:
 
 
 def _answers(port: int) -> bool:
+    """Whether a server accepts connections at this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.settimeout(0.2)
         return probe.connect_ex((HOST, port)) == 0
 
 
 class _Server(uvicorn.Server):
-    """uvicorn, with `refused` told of connections that this machine cannot take (asyncio tries them again)."""
+    """uvicorn's server. `refused` gets the error if this machine refuses a connection; asyncio accepts it later."""
 
     def __init__(self, config: uvicorn.Config, refused: Refused | None) -> None:
         super().__init__(config)
@@ -69,14 +72,14 @@ class _Server(uvicorn.Server):
 
     def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        if self._refused is not None and isinstance(error, OSError) and error.errno in _NO_MORE:
+        if self._refused is not None and isinstance(error, OSError) and error.errno in _NO_ROOM:
             self._refused(error)
         else:
             loop.default_exception_handler(context)
 
 
 class WebServer:
-    """uvicorn in a thread of its own, so that the main thread is free for signals."""
+    """uvicorn in a thread of its own, so that the main thread can wait for signals. `url` is its address."""
 
     def __init__(
         self, app: App, listener: socket.socket, refused: Refused | None = None, tls: ssl.SSLContext | None = None
@@ -102,17 +105,17 @@ class WebServer:
 
     @property
     def connections(self) -> Collection[object]:
-        """Those that are open."""
+        """The open connections."""
         return self._server.server_state.connections
 
     def start(self) -> None:
-        """Serve; returns when requests are answered."""
+        """Start the thread, and wait until it answers requests."""
         self._thread.start()
         while not self._server.started and self._thread.is_alive():
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Finish what is being answered, at most two seconds, and end."""
+        """End, after the requests that are being answered, but at most two seconds later. Close the port."""
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(4)

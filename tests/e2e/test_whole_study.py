@@ -17,7 +17,7 @@ from bots.http import ask
 from bots.links import with_user
 from bots.report import BotReport
 from local.rehearsal.logs import Verification, verify
-from local.rehearsal.study_process import NotHeld, StudyProcess, servers_of, wait_until_gone
+from local.rehearsal.study_process import StudyNotStarted, StudyProcess, servers_of, wait_until_gone
 
 
 def bot(study: StudyProcess, name: str, *, play: float = 0, patience: float = 60) -> Bot:
@@ -162,7 +162,7 @@ def test_ctrl_c_with_nobody_there_is_quick(project: Any, hold: Any) -> None:
 def test_one_data_folder_is_for_one_study_at_a_time(project: Any, hold: Any) -> None:
     folder = project(length=30, maxEpisodes=1)
     study = hold(folder)
-    with pytest.raises(NotHeld, match="already held"):
+    with pytest.raises(StudyNotStarted, match="already runs"):
         StudyProcess(folder, study.data, log=study.log.with_name("second.log")).start()
     reports = asyncio.run(with_bots([bot(study, "ada")]))  # the first does not mind
     looked_at(study, reports)

@@ -29,7 +29,7 @@ def watched(data: Path, owner: str) -> WatchedServer:
     task = TaskRecord(
         "name-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder=folder_of("study", owner)
     )
-    return WatchedServer(task, data, data / "log", anew=True)
+    return WatchedServer(task, data, data / "log", whole_log=True)
 
 
 def test_answers_of_a_participants_server_are_told_once(tmp_path: Path) -> None:

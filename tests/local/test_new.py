@@ -45,7 +45,7 @@ def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None
     folder = tmp_path / "new" / "My study"
     done = make_new(f"PROJECT={folder}", f"TEMPLATE={TOP}")
     assert done.returncode == 0, done.stderr
-    assert f"Made {folder} of {TOP}; its project id is My-study." in done.stdout
+    assert f"Made {folder} from {TOP}; its project id is My-study." in done.stdout
     for command in ("run", "check", "try"):
         assert f"make {command} PROJECT='{folder}'" in done.stdout
     assert read_project(folder).project.id == "My-study"

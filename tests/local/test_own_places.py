@@ -28,5 +28,5 @@ def test_where_groups_do_not_matter_they_are_numbered(matching: str, groups: int
 
 def test_what_answers_let_them_play_together_is_said() -> None:
     assert advice("mixed") == ""
-    assert advice({"same": "language"}) == "Give the same answer to the question language in each."
-    assert advice({"different": "role"}) == "Give a different answer to the question role in each."
+    assert advice({"same": "language"}) == "Give the same answer to the question language in each window."
+    assert advice({"different": "role"}) == "Give a different answer to the question role in each window."

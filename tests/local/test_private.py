@@ -59,6 +59,6 @@ def test_a_place_where_nothing_can_be_written_is_a_sentence(local: Make, where: 
     here = local()
     (here.place / "file").write_text("no folder")
     assert here.begin("--data", where).wait(20) == 1
-    assert f"The study cannot be held with the data in {where}: Not a directory." in here.text()
+    assert f"The study cannot run with the data in {where}: Not a directory." in here.text()
     assert "DATA=FOLDER" in here.text()
     assert "Traceback" not in here.text()

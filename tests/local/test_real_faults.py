@@ -180,7 +180,7 @@ def test_a_start_where_nothing_can_be_written_is_a_sentence(local: Make) -> None
         check=False,
     )
     assert made.returncode == 1
-    assert "The study cannot be held with the data in data: File too large." in made.stdout
+    assert "The study cannot run with the data in data: File too large." in made.stdout
     assert "Traceback" not in made.stdout + made.stderr
 
 

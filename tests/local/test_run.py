@@ -202,7 +202,7 @@ def test_a_second_one_on_the_same_data_says_so(local: Make) -> None:
     other = Local(here.folder, here.place)
     other.output = here.place / "other.txt"
     assert other.begin().wait(20) == 1
-    assert f"already held with the data in data, at {here.url}" in other.text()
+    assert f"already runs with the data in data, at {here.url}" in other.text()
     assert here.process
     assert here.process.poll() is None
 
@@ -453,7 +453,7 @@ def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
     here = local()
     (here.place / "data").write_text("a file")
     assert here.begin().wait(20) == 1
-    assert "The study cannot be held with the data in data" in here.text()
+    assert "The study cannot run with the data in data" in here.text()
     assert "Traceback" not in here.text()
 
 
@@ -461,7 +461,7 @@ def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
 def test_another_address_than_this_machines_is_refused_in_a_sentence(local: Make, host: str) -> None:
     here = local()
     assert here.begin("--host", host).wait(20) == 1
-    assert f"A study cannot be held at {host}" in here.text()
+    assert f"A study cannot run at {host}" in here.text()
 
 
 def test_an_origin_that_is_none_is_refused_in_a_sentence(local: Make) -> None:
