@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from hippodrome.config import Config, Diagnostic, layout
 from local.backend.files import names
@@ -14,6 +14,7 @@ from local.backend.retry import message_for
 from local.check.project import check_project
 from local.publish import NotPublished, step_files
 
+_GONE = (FileNotFoundError, NotADirectoryError)
 LOOK = 0.5  # seconds between looks; a change is complete when two looks in a row see the same
 Seen = Mapping[str, tuple[int, int]]
 Say = Callable[[str], None]
@@ -119,22 +120,18 @@ class Watch:
     def _look(self) -> Seen:
         """By file of the project: when it changed last (ns), and its size. Raises OSError if that cannot be seen."""
         seen = {}
-        files = [self._folder / name for name in layout.config_names()] + _if_there(lambda: step_files(self._folder))
+        files = [self._folder / name for name in layout.config_names()]
+        with contextlib.suppress(*_GONE):
+            files += step_files(self._folder)
         code = layout.agent_folder(self._folder)
-        files += _if_there(lambda: [code / name for name in names(code, ".py")])
+        with contextlib.suppress(*_GONE):
+            files += [code / name for name in names(code, ".py")]
         for file in files:
-            for status in _if_there(lambda file=file: [os.stat(file)]):  # type: ignore[misc]
+            with contextlib.suppress(*_GONE):
+                status = os.stat(file)
                 seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
         return seen
 
 
 def _mistaken(problems: Iterable[Diagnostic]) -> bool:
     return any(not problem.remark for problem in problems)
-
-
-def _if_there(look: Callable[[], list[Any]]) -> list[Any]:
-    """What `look` returns; an empty list if the file or folder does not exist."""
-    try:
-        return look()
-    except (FileNotFoundError, NotADirectoryError):
-        return []

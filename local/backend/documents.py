@@ -81,11 +81,11 @@ class FolderDocuments:
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
         path = self._path(key)
-        try:
-            body = path.read_bytes() if path else None
-        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+        if path is None:
             return None
-        if body is None:
+        try:
+            body = path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             return None
         etag = _etag(body)
         return known if known and known.etag == etag else Document(body, etag)
