@@ -6,11 +6,11 @@ DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 # `plan` and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
-# A study's own packages, by its requirements.txt.
+# Installs the study's own packages (requirements.txt).
 PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
 DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
-TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# the same for TLS=1 and NAMES=
+TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# TLS=1 and NAMES= count only on the command line
 NAMES_GIVEN = $(if $(filter command,$(origin NAMES)),$(NAMES))
 WITH_TLS = $(if $(TLS_GIVEN),--tls) $(if $(NAMES_GIVEN),--names "$(NAMES)")
 HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command line: shells have a variable HOST too
@@ -47,7 +47,7 @@ try: $(VENV)/local ## send BOTS=20 simulated participants through the study of P
 	@$(PACKAGES)
 	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
-# 8000, the default of `make run`, is no wish for this server: Gymie's port is 5000.
+# The default of PORT= is for `make run`. Without PORT=, this server takes 5000, the port of Gymie.
 .PHONY: gym
 gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
 	@$(BIN)/python -m trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
@@ -78,19 +78,19 @@ register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new v
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
 doctor: $(VENV)/deploy ## check that everything is in order on AWS, and say what to do if not
 status: $(VENV)/deploy ## show participants' steps and servers (ARGS=--watch)
-cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (has cost: ARGS="--project ID")
+cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (what it has cost: ARGS="--project ID")
 data: $(VENV)/deploy ## convert answers and recordings of PROJECT=. (DATA=) to CSV and Parquet, from here or AWS
 logs: $(VENV)/deploy ## show the logs of functions and servers (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
-certificate destroy: OF =
-cost: OF = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
-doctor status data logs stop: OF = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
-data: OF += $(if $(DATA_GIVEN),--from "$(DATA)")
+certificate destroy: STUDY =
+cost: STUDY = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
+doctor status data logs stop: STUDY = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
+data: STUDY += $(if $(DATA_GIVEN),--from "$(DATA)")
 certificate doctor status cost data logs stop destroy:
-	@$(DEPLOY) $@ $(OF) $(ARGS) $(FOUND)
+	@$(DEPLOY) $@ $(STUDY) $(ARGS) $(FOUND)
 
-# The quick tests compute. All tests together wait two thirds of their time, so that two cores take more workers.
+# The quick tests only compute. All tests together wait for two thirds of their time, so two cores can have more workers.
 WORKERS ?=
 AT_ONCE := 4
 # Python keeps its bytecode, whatever the shell's environment says: every worker and every process of a test uses it.
@@ -140,7 +140,8 @@ format: $(VENV)/dev ## format the code with ruff
 clean: ## remove the virtual environments and caches; data/ stays
 	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
 
-# Which versions of Python the pinned packages have wheels for; Intel Macs get older versions of some, in copies of the files.
+# NEWEST: the newest Python 3 for which all pinned packages have wheels. Intel Macs get older versions of some packages, in
+# copies of the requirement files.
 MACHINE := $(shell uname -sm)
 ifeq ($(MACHINE),Darwin x86_64)
 NEWEST := 13
@@ -151,7 +152,7 @@ REQUIREMENTS := requirements
 endif
 WHEELS := --only-binary ale-py,cryptography,h5py,isal,numpy,pillow,pyarrow,pydantic-core
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check
-# pip has said what is missing (a wheel, the network); this says what works.
+# Pip has printed what is missing (a wheel, the network); this sentence says on which machines it works.
 NOT_INSTALLED = || { echo 'Not everything could be installed: see above. There are packages for Linux (x86-64 and ARM) and macOS, with' \
 	'Python 3.11 to 3.$(NEWEST) on this machine ($(MACHINE)). With the right Python: rm -r $(VENV); make PYTHON=python3.$(NEWEST)'; exit 1; }
 

@@ -12,10 +12,10 @@ import numpy as np
 gymnasium.register_envs(ale_py)
 
 NATIVE_FRAMES = 2
-"""Frames of the console in one step. It makes 60 a second, so 2 in each of 30 steps a second is its real speed."""
+"""Frames of the console in one step. The console makes 60 a second, so 30 steps a second are its real speed."""
 
 GREEN = 1
-"""The channel with most of a pixel's brightness."""
+"""The index of the color channel that contributes most to a pixel's brightness."""
 
 
 class Agent:
@@ -57,7 +57,7 @@ class Agent:
         pixels = picture.reshape(-1, 3)
         for screen in self.screens[:-1]:
             others = screen.reshape(-1, 3)
-            brighter = np.flatnonzero(others[:, GREEN] > pixels[:, GREEN])  # few: their numbers are quicker than a mask
+            brighter = np.flatnonzero(others[:, GREEN] > pixels[:, GREEN])  # few pixels: indices are faster than a mask
             pixels[brighter] = others[brighter]
         return picture
 

@@ -16,7 +16,7 @@
 
   // The draft
 
-  // Storage may be full or forbidden; then there is simply no draft.
+  // Storage may be full or forbidden; then there is no draft.
   function withStorage(work) {
     try {
       return work(window.localStorage);
@@ -41,7 +41,8 @@
     else field.value = value;
   }
 
-  // Fields are known by name and, for boxes and circles, by value; a page that was changed meanwhile loses nothing else.
+  // A draft finds its fields by name and, for checkboxes and radio buttons, by value: if the page was changed meanwhile, only
+  // the changed fields lose their answers.
   function nameOf(field) {
     const choice = field.type === "checkbox" || field.type === "radio";
     return choice ? `${field.name}=${field.value}` : field.name;
@@ -63,7 +64,7 @@
     }
   }
 
-  // The participant has sent the pages before this one. Old drafts of all participants are removed too.
+  // Removes the drafts of the participant's other pages, which have been sent, and old drafts of all participants.
   function clearDrafts() {
     withStorage((storage) => {
       const own = prefix + [page.project, page.user, ""].join(":");
@@ -100,7 +101,7 @@
     return text.length + 3 * (text.match(/%0A/g) ?? []).length;
   }
 
-  // People count characters, of which an emoji is one that takes twelve bytes.
+  // Says by how many characters the longest text is too long. People count characters: an emoji, for one, has twelve bytes.
   function tooLong(size) {
     const texts = fields().filter((field) => typeof field.value === "string");
     if (!texts.length) return TEXT.tooLong;
@@ -158,7 +159,7 @@
 
   let firstInvalid = null;
 
-  // The browser itself moves to the first such field and shows a bubble, which soon goes; this sentence stays.
+  // The browser moves to the first field without a valid answer, and shows a bubble for a moment; this sentence stays.
   function onInvalid(event) {
     if (firstInvalid) return;
     firstInvalid = event.target;
@@ -198,7 +199,7 @@
         say(TEXT.copied);
         setTimeout(say, 3_000, TEXT.copy);
       } catch {
-        select(); // then the participant copies it
+        select(); // so that the participant can copy it
       }
     });
     say(TEXT.copy);

@@ -138,7 +138,7 @@ class TaskProcess:
     def end(self, reason: str, until: float, *, even_unsaved: bool = False) -> None:
         """Send SIGTERM; send SIGKILL at `until` (monotonic). Returns at once.
 
-        Raises OSError if the reason cannot be saved; then no signal is sent. With `even_unsaved`, SIGTERM is sent even then.
+        Raises OSError if the reason cannot be saved; then no signal is sent, unless `even_unsaved`.
         """
         with self._shared.lock:
             if self.task.status == "STOPPED":

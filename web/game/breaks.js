@@ -4,9 +4,9 @@ import { overlays, showOverlay } from "./overlay.js";
 import { duration, find, points, setText } from "./page.js";
 import { game } from "./state.js";
 
-export function showBreak(said, begins) {
+export function showBreak(message, begins) {
   if (begins) releaseAll(); // these keys were meant for the game that is over
-  if (typeof said.nextIn === "number") game.nextAt = performance.now() + 1000 * said.nextIn;
+  if (typeof message.nextIn === "number") game.nextAt = performance.now() + 1000 * message.nextIn;
   overlays.break.title = TEXT.gameOver(game.episode, game.maxEpisodes);
   if (begins) showOverlay("break");
   setText(find("overlay-score"), TEXT.yourScore(points(game.episodeScore)));

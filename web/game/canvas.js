@@ -5,12 +5,12 @@ import { find } from "./page.js";
 const canvas = find("screen");
 const context = canvas.getContext("2d", { alpha: false });
 
-let size = ""; // of the picture that is shown
-let pixels = null; // of the last lossless picture, as they came: one or three bytes each
-let rows = 0; // of a lossless picture that comes in parts, so far
+let size = ""; // width, height and channels of the picture that is shown
+let pixels = null; // the last lossless picture: one or three bytes for each pixel
+let rows = 0; // how many rows have come of a lossless picture that comes in parts
 let imageData = null;
 
-// The next frame begins anew: no difference to an earlier one can follow.
+// Forgets the picture: the next frame cannot be a difference to it.
 export function forgetPicture() {
   size = "";
 }
@@ -25,13 +25,14 @@ export function drawPixels(header, { first, bytes }) {
   putRows(0, header.height, header);
 }
 
-// The pixels of the last lossless picture stay: the next difference may be to them. Without a picture, only the size counts.
+// Draws a lossy picture; null: only takes over its size. The pixels of the last lossless picture stay: the next frame may
+// be a difference to them.
 export function drawPicture(header, picture) {
   beginPicture(header);
   if (picture) context.drawImage(picture, 0, 0);
 }
 
-// Rows replace those of the picture that is shown. With the last of them, differences to it can follow.
+// Puts rows in the place of those that are shown. After the last rows of a picture, differences to it can follow.
 function drawRows(header, first, bytes) {
   const { width, height, channels } = header;
   if (size !== `${width} ${height} ${channels}` || (first !== 0 && first !== rows)) throw new Error("no such frame");
@@ -42,7 +43,7 @@ function drawRows(header, first, bytes) {
   rows = first + count;
 }
 
-// What is there of an unfinished picture in rows, or of one of another size, is of no use any more.
+// Drops the pixels of a picture whose rows have not all come, and those of a picture of another size.
 function beginPicture({ width, height, channels = 0 }) {
   if (rows > 0 && rows < height) pixels = null;
   rows = 0;
@@ -54,7 +55,7 @@ function beginPicture({ width, height, channels = 0 }) {
   shapePicture(width / height);
 }
 
-// `ratio`: width by height of what is shown. The layout follows it.
+// Fits the layout to the picture. `ratio` is its width divided by its height.
 export function shapePicture(ratio) {
   document.body.style.setProperty("--ratio", ratio);
   document.body.classList.toggle("wide", ratio > 1);

@@ -1,4 +1,4 @@
-// The WebSocket to the participant's server (docs/wire.md): the handshake, acknowledgements, and noticing that it is dead.
+// The WebSocket to the participant's server (docs/wire.md): handshake, acknowledgements, and finding out that it is dead.
 import { startDrawing } from "./drawing.js";
 import { canDecode, canInflate, decodeJpeg, HEADER, readHeader, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
@@ -7,12 +7,12 @@ import { data } from "./page.js";
 export const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the last has no lossy frames
 const SILENCE = 2_500; // ms without a message; then the page asks whether the server is there
 const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
-const CONNECTING = 10_000; // ms; some firewalls neither let through nor refuse
-const ACK_EVERY = 8; // ms; more would be too many messages at high frame rates
-const ACK_WAIT = 50; // ms that an acknowledgement waits for one more picture, if they come as quickly
+const CONNECTING = 10_000; // ms for a connection to open; some firewalls neither let it through nor refuse it
+const ACK_EVERY = 8; // ms between acknowledgements; at high frame rates there would be too many
+const ACK_WAIT = 50; // ms for which an acknowledgement waits for another picture, if they come that quickly
 const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
 
-let link = null; // the present connection; what an earlier one still sends does not count
+let link = null; // the present connection; messages of earlier ones are ignored
 
 // Plays until the connection ends; `hear` gets each message. Resolves to `{ why, welcome, result }`: `why` is "done",
 // "elsewhere", "moved" or "lost", `welcome` whether the server let us in, `result` its last message after "done".
@@ -41,26 +41,26 @@ export function send(message) {
   if (link?.socket.readyState === WebSocket.OPEN) link.socket.send(JSON.stringify(message));
 }
 
-function receive(own, message, hear) {
+function receive(own, raw, hear) {
   own.heard = performance.now();
   own.asked = 0;
-  if (typeof message !== "string") {
-    const special = hooks.kinds[new Uint8Array(message)[0]];
-    if (special) return special(message, own.show);
-    const header = message.byteLength >= HEADER ? readHeader(message) : {};
-    return own.show(header, unpack(header, message));
+  if (typeof raw !== "string") {
+    const special = hooks.kinds[new Uint8Array(raw)[0]];
+    if (special) return special(raw, own.show);
+    const header = raw.byteLength >= HEADER ? readHeader(raw) : {};
+    return own.show(header, unpack(header, raw));
   }
-  if (message === "done") return own.end("done");
-  let said;
+  if (raw === "done") return own.end("done");
+  let message;
   try {
-    said = JSON.parse(message) ?? {};
+    message = JSON.parse(raw) ?? {};
   } catch {
-    return own.end("lost"); // no server of ours speaks like that
+    return own.end("lost"); // a trial server sends JSON or "done"
   }
-  if (said.frame) own.show({ id: said.frameId }, decodeJpeg(said.frame));
-  if (said.done) own.end("done", said);
-  if (Array.isArray(said.UI)) own.welcome = true;
-  hear(said);
+  if (message.frame) own.show({ id: message.frameId }, decodeJpeg(message.frame));
+  if (message.done) own.end("done", message);
+  if (Array.isArray(message.UI)) own.welcome = true;
+  hear(message);
 }
 
 // Every second picture is acknowledged, with the one before it, and each that comes ACK_WAIT or more after the last one.

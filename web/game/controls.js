@@ -1,4 +1,4 @@
-// The buttons and the slider, as the server's message with `UI` and `actionSpace` says.
+// The buttons and the slider, according to the server's message with `UI` and `actionSpace`.
 import { command } from "./actions.js";
 import { hooks } from "./hooks.js";
 import { assignKeys, DIRECTIONS, showLegend } from "./keyboard.js";
@@ -10,16 +10,16 @@ const COMPOUND = /^(up|down|left|right|fire){2,}$/; // two keys at once, such as
 
 let built = ""; // what the controls were built from
 
-export function buildControls(said) {
-  const wanted = JSON.stringify([said.UI, said.actionSpace, said.allowFrameRateChange]);
+export function buildControls(message) {
+  const wanted = JSON.stringify([message.UI, message.actionSpace, message.allowFrameRateChange]);
   if (wanted === built) return;
   built = wanted;
-  const shown = new Set(list(said.UI));
-  const own = hooks.controls(said);
-  const actions = own ? [] : singleActions(said.actionSpace);
+  const shown = new Set(list(message.UI));
+  const own = hooks.controls(message);
+  const actions = own ? [] : singleActions(message.actionSpace);
   const space = own?.space ?? actions.includes("fire");
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
-  const buttonOf = (name) => actionButton(name, said.labels?.[name] ?? DIRECTIONS[name]?.label ?? nice(name), DIRECTIONS[name]?.sign);
+  const buttonOf = (name) => actionButton(name, message.labels?.[name] ?? DIRECTIONS[name]?.label ?? nice(name), DIRECTIONS[name]?.sign);
   const others = actions.filter((name) => !(name in DIRECTIONS));
   game.directions = own?.arrows ?? directions.length > 0;
   game.offered = shown;
@@ -30,16 +30,16 @@ export function buildControls(said) {
         groupOf("pad", directions.map(buttonOf)),
         groupOf("others", others.map(buttonOf)),
       ]),
-      commandsOf(shown, said),
-      hooks.rates(shown, said),
+      commandsOf(shown, message),
+      hooks.rates(shown, message),
     ].filter(Boolean),
   );
   showLegend(directions, others, shown, space, own?.lines);
 }
 
-const list = (said) => (Array.isArray(said) ? said : []);
+const list = (value) => (Array.isArray(value) ? value : []);
 
-// The actions with keys or buttons: not "noop", and of a compound such as "upright" its parts.
+// The actions that get keys or buttons: not "noop", and instead of a compound such as "upright" its parts.
 function singleActions(actionSpace) {
   const single = list(actionSpace).map(String).flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
   return [...new Set(single)].filter((name) => name !== "noop").slice(0, 64);
@@ -65,7 +65,7 @@ function commandsOf(shown, { words }) {
   ]);
 }
 
-// The buttons that the project offers, of `all`: command, label, and the key of `ui` if it is another.
+// Those buttons of `all` that the project offers. Each is a command, its label, and its key in `ui` if that differs.
 export function commandButtons(shown, all) {
   const buttons = all.filter(([name, , key = name]) => shown.has(key)).map(([name, label]) => {
     const button = make("button", { type: "button", textContent: label });

@@ -1,10 +1,10 @@
-// The first picture of a game, which stands still for a moment, and the time that is left of a game.
+// The first picture of a game, which stands still for a moment, and the time that is left in the game.
 import { hooks } from "./hooks.js";
 import { overlays, showOverlay } from "./overlay.js";
 import { duration, find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
-const SOON = 10; // seconds that are left when that is said
+const SOON = 10; // a screen reader says when so many seconds are left
 
 const timeLeft = make("span", { id: "left", title: TEXT.timeLeft, hidden: true });
 let startsAt = null; // when the first picture begins to move
@@ -12,13 +12,13 @@ let endsAt = null; // when the time is over, if the game goes on as it does
 let saidSoon = false;
 
 overlays.freeze = { title: TEXT.getReady, band: true };
-// One line at the top: the picture below is what there is to be seen.
+// One line at the top, so that the picture below can be seen.
 hooks.overlay.push((name) => {
   find("overlay").style.cssText = name === "freeze" ? "inset: 0 0 auto; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
 });
 document.querySelector(".hud").append(timeLeft);
 
-hooks.said.push((message) => {
+hooks.message.push((message) => {
   if (!message.state) return;
   const now = performance.now();
   const freezes = message.state === "playing" && message.startsIn > 0;

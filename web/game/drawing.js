@@ -1,11 +1,11 @@
-// The frames of one connection in their order. They are unpacked side by side, but drawn one after the other: each may be
-// a difference to the one before. A lossy picture is left out if a later whole picture is ready to be drawn; the server
-// learns of it by the acknowledgement of that one.
+// Draws the frames of one connection in order. They are unpacked in parallel, but drawn one after the other, since each may
+// be a difference to the one before. A lossy picture is left out if a later whole picture is ready to be drawn; the
+// server learns that by the acknowledgement of the later one.
 import { drawPicture, drawPixels, forgetPicture } from "./canvas.js";
 import { JPEG, KEY } from "./frames.js";
 
-// Returns a function that takes a frame's header and the promise of what `unpack` made of it. `isOpen` says whether the
-// connection is still in use; `drawn` gets the id of each frame that was drawn, `failed` is called if one cannot be drawn.
+// Returns a function that takes a frame's header and the promise that `unpack` returned. `isOpen` says whether the
+// connection is still in use. `drawn` gets the id of each frame that was drawn; `failed` is called if one cannot be drawn.
 export function startDrawing(isOpen, drawn, failed) {
   let frames = 0;
   let newestWhole = 0; // number of the newest frame that is a whole picture and is unpacked

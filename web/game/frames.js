@@ -19,7 +19,7 @@ export function readHeader(buffer) {
   };
 }
 
-// Resolves to `{ picture }` for a JPEG, `{ first, bytes }` for rows, `{ bytes }` otherwise. Rejects what is no such frame.
+// Resolves to `{ picture }` for a JPEG, `{ first, bytes }` for rows, `{ bytes }` otherwise. Rejects if it is no valid frame.
 export async function unpack(header, buffer) {
   const { kind, width, height, channels } = header;
   const known = width * height > 0 && width * height <= LARGEST && (channels === 1 || channels === 3);
@@ -37,9 +37,9 @@ async function inflateRows({ width, height, channels }, buffer) {
   return { first, bytes };
 }
 
-// No more than the header says is unpacked: a small message must not become a huge picture. A DecompressionStream unpacks
-// what it is given at once, so it gets the next part when the last one has been read. (The bytes of a Blob would come
-// from another process: each frame would wait for it.)
+// Unpacks little more than the header says: a small message must not become a huge picture. A DecompressionStream unpacks
+// at once what it is given, so it gets each part when the one before has been read. (The bytes of a Blob would come from
+// another process, and each frame would wait for it.)
 export async function inflate(packed, least, most = least) {
   let at = 0;
   const parts = new ReadableStream({
@@ -67,7 +67,7 @@ async function decodeLossy({ width, height }, buffer) {
   return { picture };
 }
 
-// What the frame header (SOF) of a JPEG says. Segments begin with 0xff, a marker and their length.
+// The size in the frame header (SOF) of a JPEG; null if there is none. Segments begin with 0xff, a marker and their length.
 export function jpegSize(view) {
   for (let at = 2; at + 9 <= view.byteLength; at += 2 + view.getUint16(at + 2)) {
     const marker = view.getUint16(at);
@@ -78,7 +78,7 @@ export function jpegSize(view) {
   return null;
 }
 
-// A frame in the text of HIPPO's messages.
+// Decodes a frame in base64, as in HIPPO's messages.
 export async function decodeJpeg(base64) {
   const picture = new Image();
   picture.src = `data:image/jpeg;base64,${base64}`;

@@ -10,11 +10,11 @@ export const DIRECTIONS = {
   down: { sign: "↓", label: TEXT.down, codes: ["ArrowDown", "KeyS"] },
 };
 
-const COMMANDS = { reset: ["R", TEXT.keyReset], good: ["G", TEXT.keyGood], bad: ["B", TEXT.keyBad] }; // key, and words for the legend
+const COMMANDS = { reset: ["R", TEXT.keyReset], good: ["G", TEXT.keyGood], bad: ["B", TEXT.keyBad] }; // key, and text of the legend
 
 let keys = new Map(); // event.code -> `{ action }` or `{ command }`
 
-// `space`: whether that key is one of the game; then P starts and pauses it.
+// `space`: whether the game uses the space key; then P starts and pauses the game.
 export function assignKeys(directions, others, shown, space) {
   keys = new Map();
   for (const name of directions) for (const code of DIRECTIONS[name].codes) keys.set(code, { action: name });
@@ -39,17 +39,17 @@ export function showLegend(directions, others, shown, space, lines = []) {
   }
   lines.push([[space ? "P" : TEXT.space], shown.has("pause") ? TEXT.keyToggle : TEXT.keyStart]);
   for (const name in COMMANDS) if (shown.has(name)) lines.push(COMMANDS[name]);
-  find("legend").replaceChildren(...lines.map(([names, what]) => {
+  find("legend").replaceChildren(...lines.map(([names, text]) => {
     const boxes = [...names].map((name) => make("kbd", { textContent: name }));
-    return make("span", {}, ...boxes, ` ${what}`);
+    return make("span", {}, ...boxes, ` ${text}`);
   }));
 }
 
 export function onKeyDown(event) {
   const does = hooks.key(event) ?? keys.get(event.code);
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
-  const on = event.target;
-  if (on.matches("input, select, textarea") || (on.matches("button") && event.code === "Space")) return;
+  const { target } = event;
+  if (target.matches("input, select, textarea") || (target.matches("button") && event.code === "Space")) return;
   event.preventDefault(); // the page must not scroll
   if (event.repeat) return;
   if (does.action) press(does.action, event.code);

@@ -1,18 +1,18 @@
-// Keys and buttons of a project whose config.yml says what each key does (`keys` of the server's message with `UI`).
+// Keys and buttons of a project whose config.yml defines keys (`keys` in the server's message with `UI`).
 import { groupOf, nice } from "./controls.js";
 import { hooks } from "./hooks.js";
 import { DIRECTIONS } from "./keyboard.js";
 import { actionButton } from "./touch.js";
 
 const ARROWS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
-const MOST_BUTTONS = 64; // buttons
+const MOST_BUTTONS = 64;
 
-let bound = new Map(); // what a key is called here -> the key, as the server knows it
-const pressedKeys = new Map(); // event.code -> what the key is called here: Shift changes `event.key` before it is let go
+let bound = new Map(); // the name of a key in this module -> its name in `keys`
+const pressedKeys = new Map(); // event.code -> the name at the press: Shift may change `event.key` before the release
 
-const called = (key) => `key:${key}`;
+const nameOfKey = (key) => `key:${key}`;
 
-// As `parts` in protocol/keyboard.py.
+// The single keys of a combination; the same as `parts` in protocol/keyboard.py.
 function partsOf(combined) {
   if (combined === "+") return ["+"];
   return combined.endsWith("++") ? [...partsOf(combined.slice(0, -2)), "+"] : combined.split("+");
@@ -28,7 +28,7 @@ hooks.key = (event) => {
   }
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const onCode = /^(?:Key|Digit|Numpad)(.)$/.exec(event.code)?.[1].toLowerCase(); // another layout, or Shift with a digit
-  const name = [called(key), called(onCode)].find((each) => bound.has(each));
+  const name = [nameOfKey(key), nameOfKey(onCode)].find((each) => bound.has(each));
   if (!name) return undefined;
   pressedKeys.set(event.code, name);
   return { action: name };
@@ -38,13 +38,13 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
   if (!keys) return undefined;
   const all = Object.entries(keys).map(([combined, action]) => ({ parts: partsOf(combined), action }));
   const single = new Map(all.filter(({ parts }) => parts.length === 1).map(({ parts, action }) => [parts[0], action]));
-  bound = new Map(all.flatMap(({ parts }) => parts).map((key) => [called(key), key]));
-  const pad = Object.keys(ARROWS).filter((key) => bound.has(called(key)));
+  bound = new Map(all.flatMap(({ parts }) => parts).map((key) => [nameOfKey(key), key]));
+  const pad = Object.keys(ARROWS).filter((key) => bound.has(nameOfKey(key)));
   const label = (action) => labels[action] ?? nice(action);
   const ofPad = ({ parts }) => parts.every((key) => pad.includes(key));
   const ofButtons = ({ parts }) => parts.every((key) => pad.includes(key) || single.has(key));
 
-  // Whether the action has a button besides those of the pad. What two buttons do together has none.
+  // Whether the action gets a button outside of the pad. The action of two buttons together gets none.
   function standsAlone(action) {
     const own = all.filter((each) => each.action === action);
     if (own.some((each) => each.parts.length === 1 && ofPad(each))) return false;
@@ -55,12 +55,12 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
   const keyOf = (action) => [...single.keys()].find((key) => single.get(key) === action);
   return {
     arrows: pad.length > 0,
-    space: bound.has(called(" ")),
+    space: bound.has(nameOfKey(" ")),
     groups: [
       groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : DIRECTIONS[ARROWS[key]].label))),
       groupOf("others", actions.filter(standsAlone).slice(0, MOST_BUTTONS).map((action) => {
         const key = keyOf(action);
-        return actionButton(key === undefined ? action : called(key), label(action));
+        return actionButton(key === undefined ? action : nameOfKey(key), label(action));
       })),
     ],
     lines: actions.map((action) => [
@@ -72,7 +72,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
 
 function padButton(key, label) {
   const direction = ARROWS[key];
-  const button = actionButton(called(key), label, DIRECTIONS[direction].sign);
+  const button = actionButton(nameOfKey(key), label, DIRECTIONS[direction].sign);
   button.className = `hold ${direction}`;
   return button;
 }

@@ -1,4 +1,4 @@
-// The project's texts of arrows: where the page does not list the keys, each stands below its arrow.
+// The project's labels of arrows: on devices where the page does not list the keys, each stands below its arrow.
 import { hooks } from "./hooks.js";
 
 const captions = new CSSStyleSheet();
@@ -9,7 +9,7 @@ captions.replaceSync(`
 }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, captions];
 
-hooks.said.push(({ labels }) => {
+hooks.message.push(({ labels }) => {
   if (!labels) return;
   const texts = Object.values(labels);
   for (const button of document.querySelectorAll(".pad button")) {

@@ -1,4 +1,4 @@
-// The end: the last picture with the score, then a section that stays until the next page of the study can be loaded.
+// The end of the game: the last picture with the score, then a section until the next page of the study can be loaded.
 import { hideMessage, overlays, showOverlay } from "./overlay.js";
 import { find, points, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause } from "./requests.js";
@@ -22,7 +22,7 @@ export async function leave({ score, episodes } = {}) {
   }
 }
 
-// Resolves when it has been seen.
+// Shows the last picture. Resolves after some seconds, or when the participant goes on.
 function lastPicture(text) {
   showOverlay("over");
   hideMessage();

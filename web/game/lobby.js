@@ -1,21 +1,22 @@
-// The lobby: where a participant waits for others to play with. The rest of the script runs once they are matched, so
-// this module stands before it and imports nothing that runs the game. docs/pages.md says what the poll address answers.
+// The lobby, in which a participant waits for others. The rest of the script runs once the participant is matched, so
+// this module stands before it and imports nothing that runs the game. docs/pages.md describes the answers to polls.
 import { data, duration, find, make, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause, pollUntilAnswered } from "./requests.js";
 import { isOver } from "./waiting.js";
 
-// Milliseconds between polls. The lobby takes a participant who has not asked for ten seconds for gone; one who is
-// matched confirms that by the next poll. No poll is asked for from a timer's own timer: browsers slow such chains down
-// to one a minute on pages that are hidden for long (developer.chrome.com/blog/timer-throttling-in-chrome-88).
+// Milliseconds between polls. For the lobby, a participant who has not asked for ten seconds is gone; one who is matched
+// confirms that by the next poll. The answer to a poll sets the timer of the next one, and no timer sets another timer:
+// browsers let such chains run only once a minute on pages that are hidden for long
+// (developer.chrome.com/blog/timer-throttling-in-chrome-88).
 const ASK_EVERY = 2_000;
 const CONFIRM_AFTER = 500;
-const CLOCKS_DIFFER = 5; // seconds between two computers of the site at most
-const NO_ANSWER = 10_000; // ms in which polls fail; then the page may know why
-const SOON_OVER = [60, 10]; // seconds that are left when that is said
-const CALL = "● "; // before the title of a hidden page, every other second
+const CLOCKS_DIFFER = 5; // seconds by which the clocks of the site's computers may differ
+const NO_ANSWER = 10_000; // ms of failed polls after which the page is looked at: it may say why
+const SOON_OVER = [60, 10]; // a screen reader says when so many seconds are left
+const CALL = "● "; // stands before the title of a hidden page every other second
 
 const studyTitle = document.title;
-const lobby = { state: data.state, since: 0, trouble: null, waits: data.state.state === "lobby", said: "" };
+const lobby = { state: data.state, since: 0, trouble: null, waits: data.state.state === "lobby", text: "" };
 
 async function waitForOthers() {
   while (lobby.waits) {
@@ -24,13 +25,13 @@ async function waitForOthers() {
     const asked = performance.now();
     const state = await pollUntilAnswered();
     const took = performance.now() - asked;
-    // The study was registered for another number of players: this page was made for the one before.
-    if (state.players && state.players !== data.players) await makeAnew();
+    // The study was registered anew, for another number of players than this page.
+    if (state.players && state.players !== data.players) await reloadLobby();
     if (state.state === "lobby") {
       // The clock of a participant who was away begins anew.
       if (state.seconds < lobby.state.seconds - CLOCKS_DIFFER) {
         setText(find("lobby-note"), TEXT.lobbyAway);
-        tellAloud(find("lobby-note").textContent);
+        announce(find("lobby-note").textContent);
       }
       lobby.state = state;
       if (took > ASK_EVERY) await pause(took); // a site that is slow is asked less often
@@ -39,7 +40,7 @@ async function waitForOthers() {
 }
 
 // Loads the page again without leaving the lobby. Never resolves.
-function makeAnew() {
+function reloadLobby() {
   lobby.waits = false;
   return loadPage();
 }
@@ -54,7 +55,7 @@ async function proceed(state) {
   find("announce").textContent = TEXT.prepared;
 }
 
-// Who plays in the game that is being prepared, and the title meanwhile.
+// Shows who plays in the game that is being prepared, and sets the title.
 function showCompany() {
   const others = (data.state.members ?? 1) - 1;
   const empty = data.players - others - 1;
@@ -74,15 +75,15 @@ function showLobby() {
   find("lobby-places").replaceChildren(...Array.from({ length: players }, (_, at) => make("i", { className: at < there ? "taken" : "" })));
   const text = proposed ? textOfSession(players, there, then) : textOfFew(players, there);
   setText(find("lobby-here"), text);
-  if (lobby.said && lobby.said !== text) tellAloud(text);
-  lobby.said = text;
+  if (lobby.text && lobby.text !== text) announce(text);
+  lobby.text = text;
   document.title = `${proposed && there === players ? TEXT.found : TEXT.countOf(there, players)} – ${studyTitle}`;
   showTime();
 }
 
 const textOfFew = (players, there) => there === 1 ? TEXT.firstOf(players) : TEXT.hereWithYou(there, players);
 
-// What is said of a session that is about to begin. With `policies` it may have empty places, even all but one.
+// The text on a session that is about to begin. With `policies` it may have empty places, even all but one.
 function textOfSession(players, there, then) {
   if (there === players) return `${players === 2 ? TEXT.foundOther : TEXT.foundEnough} ${TEXT.moment}`;
   if (then !== "policies") return textOfFew(players, there);
@@ -91,7 +92,7 @@ function textOfSession(players, there, then) {
   return `${one ? TEXT.takesPlace(there, players) : TEXT.takePlaces(there, players)} ${TEXT.moment}`;
 }
 
-// How long it is until the participant no longer waits, and what happens then.
+// Shows how long the participant has waited, and when the wait ends and what happens then.
 function showTime() {
   const { players, patience, then, proposed } = lobby.state;
   const waited = Math.max(0, Math.round((performance.now() - lobby.since) / 1000));
@@ -105,10 +106,10 @@ function showTime() {
   if (proposed) setText(find("lobby-then"), "");
   else if (left) setText(find("lobby-then"), alone ? TEXT.ifNobody(duration(left), next) : TEXT.ifFew(duration(left), next));
   else setText(find("lobby-then"), `${alone ? TEXT.nobodyCame(next) : TEXT.fewCame(next)} ${TEXT.moment}`);
-  if (SOON_OVER.includes(left) && !proposed) tellAloud(find("lobby-then").textContent);
+  if (SOON_OVER.includes(left) && !proposed) announce(find("lobby-then").textContent);
 }
 
-const tellAloud = (text) => setText(find("announce"), text);
+const announce = (text) => setText(find("announce"), text);
 
 function leaveLobby() {
   if (!lobby.waits) return;
@@ -117,13 +118,13 @@ function leaveLobby() {
   navigator.sendBeacon(find("again").action, new URLSearchParams(form));
 }
 
-// Once the participant is matched, the title of a hidden page changes every second.
+// Marks the title of a page whose participant is matched, or removes the mark. On a hidden page they alternate.
 function callBack(calls) {
   const plain = document.title.replace(CALL, "");
   if (!lobby.waits) document.title = calls ? CALL + plain : plain;
 }
 
-// A site that answers for the page, and to no poll, has something to say there: the study is closed, for instance.
+// If the site answers for the page but not to polls, the page says why: the study is closed, for instance.
 async function lookAtPage() {
   lobby.trouble = find("wait-status").textContent ? lobby.trouble ?? performance.now() : null;
   if (lobby.trouble === null || performance.now() - lobby.trouble < NO_ANSWER) return;

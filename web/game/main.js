@@ -1,6 +1,6 @@
-// The game page: it waits for the participant's server, then plays. docs/wire.md says what travels over the WebSocket,
-// docs/pages.md what the poll address answers. The page carries these modules as one script
-// (hippodrome/participants/scripts.py): no top-level name may occur in two of them.
+// The game page: it waits for the participant's server, then plays. docs/wire.md describes the messages of the WebSocket,
+// docs/pages.md the answers to polls. The page carries these modules as one script (hippodrome/participants/scripts.py):
+// no top-level name may occur in two of them.
 import { isRunning, releaseAll, start } from "./actions.js";
 import { countDown } from "./breaks.js";
 import { ask, play, watch } from "./connection.js";
@@ -17,9 +17,9 @@ import { clearDrafts } from "./storage.js";
 import { isOver, noteRestart, pollDelay, restartedFor, showClock, showWaiting } from "./waiting.js";
 
 const HANGS = TEXT.hangs;
-const SILENT = 4_500; // ms without a message in a game; the server was asked meanwhile
-const LONG = 20_000; // ms of trouble until more is said
-const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may have been lost, and a reload repeats it
+const SILENT = 4_500; // ms without a message in a game, although the server was asked
+const LONG = 20_000; // ms of trouble until the page says more
+const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may be lost, and a reload repeats it
 
 const title = document.title;
 
@@ -51,7 +51,7 @@ async function main() {
   }
 }
 
-// A server that is not ready, or gone. Loads the page again if the page does not know yet that it is gone, and why.
+// Shows the state of a server that is not ready. If it has ended, loads the page again, which then says why.
 async function showServer(state) {
   const restarted = restartedFor(state);
   if (!isOver(state)) showWaiting(state);
@@ -69,21 +69,21 @@ async function playOn(server) {
   }
   game.state = "loading";
   const end = await play(server, hear);
-  lookWhetherItHangs();
+  checkForHang();
   releaseAll(false);
   game.state = end.why;
   return end;
 }
 
-function hear(said) {
-  if (said.error) showMessage(String(said.error));
-  if (Array.isArray(said.UI)) buildControls(said);
-  if (said.state) showStatus(said);
-  if (said.state === "playing") document.title = title;
-  for (const hook of hooks.said) hook(said);
+function hear(message) {
+  if (message.error) showMessage(String(message.error));
+  if (Array.isArray(message.UI)) buildControls(message);
+  if (message.state) showStatus(message);
+  if (message.state === "playing") document.title = title;
+  for (const hook of hooks.message) hook(message);
 }
 
-// Two pages that took the game from each other by themselves would do so for ever.
+// Another page has the game. The participant decides: two pages could take it from each other without end.
 function playHere() {
   showOverlay("elsewhere");
   hideMessage();
@@ -95,7 +95,7 @@ function playHere() {
   });
 }
 
-function lookWhetherItHangs() {
+function checkForHang() {
   const silent = watch(isRunning());
   if (silent > SILENT && isRunning()) setText(find("trouble"), HANGS);
   else if (find("trouble").textContent === HANGS) hideMessage();
@@ -104,16 +104,16 @@ function lookWhetherItHangs() {
 
 clearDrafts();
 setInterval(() => find("wait").hidden || showClock(), 1_000);
-setInterval(lookWhetherItHangs, 1_000);
+setInterval(checkForHang, 1_000);
 setInterval(countDown, 200);
 find("again").addEventListener("submit", noteRestart);
 find("overlay-button").addEventListener("click", () => {
   if (["ready", "paused", "break"].includes(game.state)) start();
   find("screen").focus({ preventScroll: true });
 });
-// A click must not take the keyboard away from the game: the next Space is meant for it.
+// A click on a button must not take the focus from the game: the next Space is meant for the game.
 find("play").addEventListener("mousedown", (event) => event.target.closest("button") && event.preventDefault());
-find("play").addEventListener("contextmenu", (event) => event.preventDefault()); // what a long press brings up
+find("play").addEventListener("contextmenu", (event) => event.preventDefault()); // the menu of a long press
 window.addEventListener("keydown", onKeyDown);
 window.addEventListener("keyup", onKeyUp);
 window.addEventListener("blur", () => releaseAll());

@@ -1,4 +1,4 @@
-// What covers the picture while the game does not run, and short messages of the server's.
+// The overlay that covers the picture while the game does not run, and short messages of the server.
 import { hooks } from "./hooks.js";
 import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
@@ -12,14 +12,14 @@ export const overlays = {
   unreachable: { title: TEXT.unreachable, note: TEXT.unreachableNote },
   elsewhere: { title: TEXT.elsewhere, button: TEXT.playHere, note: TEXT.elsewhereNote },
   ended: { title: TEXT.saving, band: true },
-  over: { title: TEXT.over, button: TEXT.goOn, band: true, shown: 4_000 }, // ms, unless the participant goes on
+  over: { title: TEXT.over, button: TEXT.goOn, band: true, shown: 4_000 }, // ms, if the participant does not go on before
 };
 
-// Shows the overlay of that name; none for other names, such as "playing".
+// Shows the overlay with that name; no overlay for names without one, such as "playing".
 export function showOverlay(name) {
   const overlay = Object.hasOwn(overlays, name) && overlays[name];
   find("overlay").hidden = !overlay;
-  find("overlay").classList.toggle("band", Boolean(overlay.band)); // the last picture stays to be seen
+  find("overlay").classList.toggle("band", Boolean(overlay.band)); // the last picture stays visible
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
   find("mode").dataset.state = name;
   setText(find("mode"), { playing: TEXT.playing, paused: TEXT.paused }[name] ?? "");

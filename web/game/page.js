@@ -1,4 +1,4 @@
-// The page's elements and what the server wrote into the page (`_data` of game_page in hippodrome/participants/pages.py).
+// The page's elements, and the data that stand in the page (`_data` in hippodrome/participants/pages.py).
 
 export const data = JSON.parse(document.getElementById("data").textContent);
 
@@ -11,7 +11,7 @@ export function showSection(id) {
   document.body.classList.toggle("playing", id === "play");
 }
 
-// Writing the same text again would make a screen reader say it again.
+// A text is only written if it changes: otherwise a screen reader would say it again.
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -29,7 +29,7 @@ export function duration(seconds) {
   return TEXT.minutes(Math.floor(seconds / 60), seconds % 60);
 }
 
-// Up to 1,000 with two decimals: all that is said in the line above the picture has to stand in it on a phone.
+// Below 1,000 with two decimals, from there on without: the line above the picture has little room on a phone.
 export function points(score) {
   return Number(score ?? 0).toLocaleString(TEXT.language, { maximumFractionDigits: Math.abs(score) < 1000 ? 2 : 0 });
 }

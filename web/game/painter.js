@@ -1,28 +1,29 @@
-// Draws the objects of a scene on a canvas of their own, which lies on that of the frames.
+// Draws the objects of a scene on a canvas of its own, which covers the canvas of the frames.
 import { shapePicture } from "./canvas.js";
 import { find, make } from "./page.js";
 import { spriteOf } from "./sprites.js";
 
-const MISSING = "#8080807f"; // instead of an image that is not there
+const MISSING = "#8080807f"; // the color in the place of an image that is missing
 const LONGEST = 4096; // pixels of the canvas, on each side
 
 const easel = make("canvas", { hidden: true });
 Object.assign(easel.style, { position: "absolute", inset: 0, width: "100%", height: "100%" });
-easel.setAttribute("aria-hidden", "true"); // the canvas below it has the name, and the keyboard
+easel.setAttribute("aria-hidden", "true"); // the canvas below it has the label and the keyboard focus
 find("screen").after(easel);
 const brush = easel.getContext("2d", { alpha: false });
 
 let picture = { width: 600, height: 400, background: "#ffffff", coordinates: "relative" };
-let unitX = 600; // what an x of 1 means, in pixels of the picture
+let unitX = 600; // pixels of the picture for an x of 1
 let unitY = 400;
 let repaint = () => {};
 
-// Says how large the picture is. `changed` is called when it has to be drawn again.
-export function prepare(said, changed) {
-  picture = said;
-  const relative = said.coordinates === "relative";
-  unitX = relative ? said.width : 1;
-  unitY = relative ? said.height : 1;
+// Takes the picture's size and background from the scene's description. `changed` is called when the scene has to be drawn
+// again.
+export function prepare(scene, changed) {
+  picture = scene;
+  const relative = scene.coordinates === "relative";
+  unitX = relative ? scene.width : 1;
+  unitY = relative ? scene.height : 1;
   repaint = changed;
 }
 
@@ -35,12 +36,12 @@ export function place() {
   fit();
 }
 
-// Shows the canvas of the frames.
+// Hides this canvas, so that the canvas of the frames shows.
 export function putAway() {
   easel.hidden = true;
 }
 
-// As many pixels as the screen has for it.
+// Gives the canvas as many pixels as it covers on the screen. Returns whether that changed.
 function fit() {
   const scale = Math.min(devicePixelRatio * (easel.clientWidth || picture.width) / picture.width, LONGEST / Math.max(picture.width, picture.height));
   const width = Math.max(1, Math.round(picture.width * scale));
@@ -50,7 +51,7 @@ function fit() {
   return true;
 }
 
-// Draws `[fields, ms]` one over the other; `ms` is how long the object has been there. Returns whether an animation plays.
+// Draws each `[fields, ms]` over the ones before; `ms` is the age of the object. Returns whether an animation plays.
 export function paint(layers) {
   brush.setTransform(1, 0, 0, 1, 0, 0);
   brush.globalAlpha = 1;
@@ -124,7 +125,7 @@ const draws = {
   },
 };
 
-// Turns about the object's origin, which lies at its x and y. Returns where its left and its top are then.
+// Moves the brush to the object's x and y, and turns it by the angle. Returns its left and top from there.
 function turned({ x, y, angle = 0, origin = [0, 0] }, width, height) {
   brush.translate(x * unitX, y * unitY);
   brush.rotate(angle * Math.PI / 180);

@@ -1,4 +1,4 @@
-// A game that several participants play together: who is there, the countdown, and what is said when a participant is missing.
+// A game of several participants: who is there, the countdown, and what the page says when a participant is missing.
 import { releaseAll } from "./actions.js";
 import { ask, send } from "./connection.js";
 import { nice } from "./controls.js";
@@ -8,8 +8,8 @@ import { data, duration, find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const GLANCE = 3_000; // ms for which a participant may look at another page in the game
-const MOST_NAMES = 4; // of more players the page shows how many are there
-const READ = 600_000; // ms for which the reason of an early end is shown, unless the participant goes on
+const MOST_NAMES = 4; // if there are more players, the page shows their number
+const READ = 600_000; // ms for which the reason of an early end is shown, if the participant does not go on before
 const STATES = { here: "", reads: TEXT.reads, awaited: TEXT.awaited, away: TEXT.away, policy: TEXT.computer };
 const COVERS = ["gathering", "held", "begins"];
 
@@ -26,7 +26,7 @@ overlays.gathering = { title: waitsForAll };
 Object.assign(overlays, { held: {}, begins: {} });
 overlays.lost.note = pair ? TEXT.otherSees : TEXT.othersSee;
 overlays.unreachable.note = TEXT.unreachableTogether;
-// By outcome, what is said of an early end if the server has not said it.
+// By outcome: the reason of an early end, if the server has sent none.
 const ENDINGS = {
   left: TEXT.youLeft,
   partnerLeft: pair ? TEXT.otherLeft : TEXT.someLeft,
@@ -37,30 +37,30 @@ hooks.overlay.push((name) => {
   presence.shown = name;
   offerNoStart();
   find("overlay").dataset.name = name;
-  // Others show where the game stands, such as the images when all are there; then it is said anew what it waits for.
+  // Other modules show these overlays too, such as sprites.js when all images have come; then this covers them again.
   if (["ready", "paused"].includes(name)) queueMicrotask(coverPicture);
 });
 const waitsToo = hooks.waits;
 hooks.waits = () => COVERS.includes(presence.shown) || waitsToo();
 
-hooks.said.push((said) => {
-  if (said.done) return noteEnd(said);
-  if (said.state !== "ended") presence.reason = said.error ?? ""; // what ends the game is said before that it has ended
-  if (said.UI) offerNoStart();
-  if (said.people instanceof Object) showPeople(said);
-  if (!said.state) return;
-  presence.beginsAt = inSeconds(said.beginsIn);
-  presence.heldUntil = inSeconds(said.heldFor);
-  tellThatRead();
+hooks.message.push((message) => {
+  if (message.done) return noteEnd(message);
+  if (message.state !== "ended") presence.reason = message.error ?? ""; // the reason comes before the state "ended"
+  if (message.UI) offerNoStart();
+  if (message.people instanceof Object) showPeople(message);
+  if (!message.state) return;
+  presence.beginsAt = inSeconds(message.beginsIn);
+  presence.heldUntil = inSeconds(message.heldFor);
+  tellHasRead();
   coverPicture();
-  queueMicrotask(() => sayWhoseTurn(said)); // after turns.js, which knows no names
+  queueMicrotask(() => sayWhoseTurn(message)); // after turns.js, which says it without names
 });
 
 const inSeconds = (seconds) => (typeof seconds === "number" ? performance.now() + 1000 * seconds : null);
 const secondsUntil = (time) => Math.max(1, Math.ceil((time - performance.now()) / 1000));
 const missing = () => Object.keys(presence.people).filter((name) => name !== presence.you && ["reads", "awaited", "away"].includes(presence.people[name]));
 
-// Where the game says who is there
+// Who is there
 
 const playerName = (name) => data.names?.[name] ?? (isNaN(name) ? nice(name) : TEXT.player(name));
 
@@ -88,7 +88,7 @@ function tellOf(name, before, now) {
   if (now === "here" && ["away", "policy"].includes(before)) showMessage(pair ? TEXT.otherBack : TEXT.back(who));
 }
 
-// Turn by turn: whose turn it is, if it is another's
+// Turn by turn: says whose turn it is, if it is not the participant's.
 function sayWhoseTurn({ state, toAct, turnOf }) {
   const names = Array.isArray(turnOf) ? turnOf.slice(0, MOST_NAMES).map((name) => playerName(String(name))) : [];
   if (state === "playing" && !toAct && names.length) setText(find("turn"), TEXT.theirTurn(names.join(", ")));
@@ -110,12 +110,12 @@ function coverPicture() {
 
 function coverName() {
   if (game.state === "ended") return game.state;
-  if (presence.heldUntil !== null) return presence.people[presence.you] === "awaited" && !missing().length ? "gathering" : "held"; // awaited: still measured
+  if (presence.heldUntil !== null) return presence.people[presence.you] === "awaited" && !missing().length ? "gathering" : "held"; // the participant is awaited while the connection is measured
   if (presence.beginsAt !== null) return "begins";
   return missing().length && ["ready", "paused"].includes(game.state) ? "gathering" : game.state;
 }
 
-// The seconds of the countdown, or until the one who is missing is waited for no longer.
+// Shows the seconds of the countdown, or those for which the game still waits for a missing participant.
 function countSeconds() {
   if (find("play").hidden) return showWhoReads();
   if (presence.shown === "begins") showCountdown();
@@ -126,13 +126,13 @@ function countSeconds() {
   setText(find("overlay-hint"), read ? TEXT.theyRead(left) : data.absentEnds ? TEXT.absentEnds(left) : TEXT.absentReplaced(left));
 }
 
-// Images that still come say so where the title is.
+// sprites.js may have put its own title in this place.
 function showCountdown() {
   setText(find("overlay-title"), overlays.begins.title);
   setText(find("overlay-score"), String(secondsUntil(presence.beginsAt)));
 }
 
-// No participant has to press Start: its button and its key are there for the pause, if that is offered.
+// No participant has to press Start: its button and key are for the pause only, if that is offered.
 function offerNoStart() {
   const line = [...find("legend").children].find((each) => [` ${TEXT.keyStart}`, ` ${TEXT.keyToggle}`].includes(each.lastChild.textContent));
   if (line?.lastChild.textContent === ` ${TEXT.keyStart}`) line.remove();
@@ -140,9 +140,9 @@ function offerNoStart() {
   for (const button of document.querySelectorAll("[data-command=toggle]")) button.hidden = !["playing", "paused"].includes(presence.shown) || !game.offered.has("pause");
 }
 
-// Pages that are read beside the game: it goes on once all have read them
+// Pages that are read beside the game: the game goes on once all participants have read them
 
-function tellThatRead() {
+function tellHasRead() {
   if (presence.people[presence.you] === "reads" && game.state === "ready" && !find("play").hidden) send({ command: "start" });
 }
 
@@ -154,21 +154,21 @@ function showWhoReads() {
 
 // The end
 
-function noteEnd(said) {
-  if (!Object.hasOwn(ENDINGS, said.outcome)) return;
-  if (!said.episodes) delete said.score; // nothing was played
-  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[said.outcome]), band: false, shown: READ });
+function noteEnd(message) {
+  if (!Object.hasOwn(ENDINGS, message.outcome)) return;
+  if (!message.episodes) delete message.score; // nothing was played
+  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false, shown: READ });
   setText(find("leave-title"), TEXT.thanks);
-  setTimeout(() => setText(find("announce"), overlays.over.note), 500); // after what the page says of every end
+  setTimeout(() => setText(find("announce"), overlays.over.note), 500); // after the announcement of every end
 }
 
 find("reading-button")?.addEventListener("click", () => {
-  tellThatRead();
+  tellHasRead();
   coverPicture();
 });
 setInterval(countSeconds, 200);
 new MutationObserver(() => presence.shown === "begins" && showCountdown()).observe(find("overlay-title"), { childList: true });
-// A page that has slept says that it is there again: without new pictures it has nothing else to say.
+// A page that has slept asks the server, so that it counts as present again: without pictures it sends nothing else.
 setInterval(() => presence.people[presence.you] === "away" && !document.hidden && ask(), 1_000);
 
 // A participant who looks at another page is away: in the game after a moment, otherwise at once.
@@ -182,4 +182,4 @@ document.addEventListener("visibilitychange", () => {
   else if (game.state === "playing") glance = setTimeout(tellIfHidden, GLANCE);
   else tellIfHidden();
 });
-hooks.said.push((said) => said.state && game.state !== "playing" && tellIfHidden());
+hooks.message.push((message) => message.state && game.state !== "playing" && tellIfHidden());

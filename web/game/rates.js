@@ -5,15 +5,15 @@ import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 import { game } from "./state.js";
 
-hooks.rates = (shown, said) => {
-  if (!said.allowFrameRateChange) return null;
+hooks.rates = (shown, message) => {
+  if (!message.allowFrameRateChange) return null;
   const buttons = commandButtons(shown, [
     ["slower", TEXT.slower, "fpsDown"],
     ["faster", TEXT.faster, "fpsUp"],
   ]);
   const box = make("div", { className: "rates" });
   if (shown.has("fpsSet")) {
-    const slider = make("input", { type: "range", id: "rate", min: said.minFrameRate, max: said.maxFrameRate });
+    const slider = make("input", { type: "range", id: "rate", min: message.minFrameRate, max: message.maxFrameRate });
     slider.addEventListener("change", () => send({ changeFrameRate: Number(slider.value) }));
     box.append(make("label", { htmlFor: "rate", textContent: TEXT.speed }), slider, make("output", { htmlFor: "rate" }));
   }
@@ -21,7 +21,7 @@ hooks.rates = (shown, said) => {
   return box.childElementCount ? box : null;
 };
 
-hooks.said.push(showRate);
+hooks.message.push(showRate);
 
 function showRate() {
   const slider = find("rate");

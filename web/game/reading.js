@@ -1,4 +1,4 @@
-// Pages of the researcher's beside the game: instructions, before it begins and in a pause, and a page between two games.
+// The researcher's pages beside the game: instructions before the game and in a pause, and a page between two games.
 import { start } from "./actions.js";
 import { hooks } from "./hooks.js";
 import { overlays } from "./overlay.js";
@@ -12,10 +12,10 @@ const texts = { instructions: find("text-instructions"), between: find("text-bet
 const noted = `read-${data.step}`;
 const again = make("button", { type: "button", id: "instructions-button", textContent: TEXT.instructions, hidden: true });
 
-let reading = ""; // which of the texts
+let reading = ""; // the name of the text that is shown
 let opening; // the timer of the page between two games
 
-// `goOn` says what the button does.
+// `goOn` is the label of the button.
 function openText(name, goOn, score = "") {
   clearTimeout(opening);
   reading = name;

@@ -2,9 +2,9 @@
 import { data, find, setText } from "./page.js";
 import { recall, remember } from "./storage.js";
 
-const RELOAD_EVERY = 5_000; // ms; whatever goes wrong, a page never reloads in a tight loop
+const RELOAD_EVERY = 5_000; // ms between reloads: a page must not reload without end, whatever goes wrong
 
-// Waits, but no longer than until the connection comes back or the participant looks at the page again.
+// Waits so many ms, or until the connection comes back or the participant looks at the page again.
 export function pause(ms) {
   return new Promise((resolve) => {
     const waking = new AbortController();
@@ -42,7 +42,7 @@ function request(address, options) {
   return fetch(address, { ...options, cache: "no-store", signal: AbortSignal.timeout?.(10_000) });
 }
 
-// Whether the control plane answers for the page. Rejects if there is no connection.
+// Whether the site answers for the page without an error of its own. Rejects if there is no connection.
 export async function pageAnswers() {
   return (await request(data.page, { method: "HEAD" })).status < 500;
 }

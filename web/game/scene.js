@@ -1,4 +1,4 @@
-// Games that are drawn by objects (docs/wire.md, "A scene"): what the server says of them, put together and shown.
+// Games that are drawn by objects (docs/wire.md, "A scene"): puts the server's changes together, and shows the scene.
 import { SUBPROTOCOLS } from "./connection.js";
 import { canDecode, DIFFERENCE, HEADER, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
@@ -9,16 +9,16 @@ import { paint, place, prepare, putAway } from "./painter.js";
 const SCENE_HEADER = 5; // bytes: kind, id
 const LARGEST_SCENE = 16 * 2 ** 20; // bytes, unpacked; trial/pictures/scene.py makes none so large
 const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
-const UNSAID = { angle: 0, alpha: 1 }; // what these are if the server leaves them out
+const DEFAULTS = { angle: 0, alpha: 1 }; // of fields that the server leaves out
 
 const utf8 = new TextDecoder();
 const things = new Map(); // id -> the object: its `fields`, and while it moves `from`, `began`, `ms`
-let layers = null; // the objects in the order in which they are drawn; null if that is to be found out again
+let layers = null; // the objects in the order in which they are drawn; null if they must be sorted again
 let waitsForPaint = false;
 
 const hud = make("span", { id: "scene-hud", hidden: true });
 find("score").closest("p").append(hud);
-const sheet = new CSSStyleSheet(); // pages of other games need none of it
+const sheet = new CSSStyleSheet(); // only these games' pages need it
 sheet.replaceSync(`.hud { flex-wrap: wrap; }
 .hud #scene-hud { flex: 1 0 100%; white-space: pre-line; overflow-wrap: anywhere; text-align: center; }
 @media (min-aspect-ratio: 5/4) {
@@ -30,36 +30,36 @@ document.adoptedStyleSheets = [...document.adoptedStyleSheets, sheet];
 async function unpackScene(kind, buffer) {
   const body = buffer.slice(SCENE_HEADER);
   const bytes = kind === 5 ? await inflate(body, 2, LARGEST_SCENE) : body;
-  const said = JSON.parse(utf8.decode(bytes));
-  return { draw: () => change(said) };
+  const scene = JSON.parse(utf8.decode(bytes));
+  return { draw: () => change(scene) };
 }
 
-// Takes what changed, and draws the scene at once: the next display of the screen shows it.
-function change(said) {
+// Applies the changes of a scene, and draws it at once: the screen shows it at its next refresh.
+function change(scene) {
   const now = performance.now();
-  if (said.new) things.clear();
-  for (const id of said.gone ?? []) things.delete(id);
-  for (const [id, fields] of Object.entries(said.set ?? {})) {
+  if (scene.new) things.clear();
+  for (const id of scene.gone ?? []) things.delete(id);
+  for (const [id, fields] of Object.entries(scene.set ?? {})) {
     const thing = things.get(id);
     if (!thing) things.set(id, { fields, since: now });
     else Object.assign(thing, fields.type ? { fields, since: now, from: null } : moved(thing, fields, now));
     if (!thing || fields.type || "depth" in fields) layers = null;
   }
-  for (const id of said.order ?? []) {
+  for (const id of scene.order ?? []) {
     const thing = things.get(id);
     things.delete(id);
     if (thing) things.set(id, thing);
   }
-  if (said.new || said.gone || said.order) layers = null;
-  if (said.hud !== undefined) {
-    setText(hud, said.hud);
-    hud.hidden = !said.hud;
+  if (scene.new || scene.gone || scene.order) layers = null;
+  if (scene.hud !== undefined) {
+    setText(hud, scene.hud);
+    hud.hidden = !scene.hud;
   }
   place();
   show(now);
 }
 
-// The object with some fields changed. With a tween it moves there from where it is shown now.
+// The changed object. With a tween it moves to its new values from those that are shown now.
 function moved(thing, fields, now) {
   const next = { ...thing.fields };
   for (const [key, value] of Object.entries(fields)) {
@@ -70,12 +70,12 @@ function moved(thing, fields, now) {
   const steps = next.tween ? TWEENED.filter((key) => key in fields) : [];
   if (!steps.length) return { fields: next, since, ...(thing.from && !next.tween ? { from: null } : {}) };
   const here = shownNow(thing, now);
-  const from = Object.fromEntries(steps.map((key) => [key, here[key] ?? UNSAID[key]]));
+  const from = Object.fromEntries(steps.map((key) => [key, here[key] ?? DEFAULTS[key]]));
   for (const key in thing.from ?? {}) from[key] ??= here[key];
   return { fields: next, since, from, began: now, ms: next.tween };
 }
 
-// The fields as they are to be shown at this time.
+// The object's fields at this time, in the middle of a tween too.
 function shownNow(thing, now) {
   if (!thing.from) return thing.fields;
   const share = (now - thing.began) / thing.ms;
@@ -85,14 +85,14 @@ function shownNow(thing, now) {
   }
   const shown = { ...thing.fields };
   for (const [key, start] of Object.entries(thing.from)) {
-    let way = (shown[key] ?? UNSAID[key]) - start;
+    let way = (shown[key] ?? DEFAULTS[key]) - start;
     if (key === "angle") way = ((((way + 180) % 360) + 360) % 360) - 180; // the shorter way round
     if (Number.isFinite(way)) shown[key] = start + share * way;
   }
   return shown;
 }
 
-// Draws, and again with each display of the screen while something moves by itself.
+// Draws the scene, and again at each refresh of the screen while something moves by itself.
 function show(now) {
   layers ??= [...things.values()].sort((one, other) => (one.fields.depth ?? 0) - (other.fields.depth ?? 0));
   const plays = paint(layers.map((thing) => [shownNow(thing, now), now - thing.since]));
@@ -116,8 +116,8 @@ for (const kind of [KEY, DIFFERENCE, JPEG, ROWS]) {
   };
 }
 hooks.kinds[6] = (buffer) => takeSpritePart(buffer, () => things.size && show(performance.now()));
-hooks.said.push((said) => {
-  if (!said.scene) return;
-  prepare(said.scene, () => things.size && show(performance.now()));
-  askForSprites(said.assets ?? []);
+hooks.message.push((message) => {
+  if (!message.scene) return;
+  prepare(message.scene, () => things.size && show(performance.now()));
+  askForSprites(message.assets ?? []);
 });

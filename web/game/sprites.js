@@ -1,4 +1,4 @@
-// The images of a game that is drawn by objects: asked for before it begins, with a bar that shows how far they are.
+// The images of a game that is drawn by objects: the page asks for them before the game, and a bar shows the progress.
 import { send } from "./connection.js";
 import { jpegSize } from "./frames.js";
 import { hooks } from "./hooks.js";
@@ -12,10 +12,10 @@ const SPRITE_SIDE = 4096; // pixels
 const AT_ONCE = 16; // images that are asked for; a server refuses more than 200 messages a second
 
 const loaded = new Map(); // hash -> `{ bitmap, frames, animations }`, kept while the page is open; null if it is broken
-let table = []; // of the server's
+let table = []; // the server's list of images
 let arrived = new Map(); // number -> the bytes so far
-let asked = 0; // numbers below this were asked for on this connection, unless they were there already
-let underWay = 0;
+let asked = 0; // images with smaller numbers were asked for on this connection, or had come before
+let underWay = 0; // how many were asked for and have not come
 let pixelsLeft = 64 * 2 ** 20; // pixels of all images, of which a browser needs four bytes each
 const bar = make("progress", { max: 1, value: 0, hidden: true });
 bar.setAttribute("aria-label", TEXT.pictures);
@@ -29,7 +29,7 @@ export function askForSprites(assets) {
   table = assets;
   for (const { bytes, hash } of assets) if (!(bytes <= LARGEST_ASSET)) loaded.set(hash, null);
   askForMore();
-  tell();
+  showProgress();
 }
 
 function askForMore() {
@@ -59,7 +59,7 @@ export async function takeSpritePart(buffer, ready) {
     askForMore();
     if (!loading()) ready();
   }
-  tell();
+  showProgress();
 }
 
 async function opened(bytes) {
@@ -73,7 +73,7 @@ async function opened(bytes) {
   return { bitmap, frames: new Map(Object.entries(frames)), animations: new Map(Object.entries(animations)) };
 }
 
-// What the file says of its size: no more is decoded than there is room for.
+// The size in the header of an image file, which is read before the image is decoded.
 function sizeOf(view) {
   if (view.getUint32(0) === 0x89504e47) return { width: view.getUint32(16), height: view.getUint32(20) }; // PNG
   if (view.getUint32(0) !== 0x52494646) return jpegSize(view) ?? {};
@@ -84,10 +84,10 @@ function sizeOf(view) {
   return { width: 1 + (bits & 0x3fff), height: 1 + ((bits >> 14) & 0x3fff) };
 }
 
-let told = false; // the overlay shows how far they are
+let progressShown = false; // whether the overlay shows the progress
 
-// Says how far they are, and when all are there what the game is waiting for.
-function tell() {
+// Shows the progress; when all images have come, shows the overlay of the state again.
+function showProgress() {
   if (loading() && ["ready", "paused"].includes(game.state)) {
     const whole = table.reduce((sum, each) => sum + each.bytes, 0);
     const there = table.reduce((sum, each, number) => sum + (loaded.has(each.hash) ? each.bytes : arrived.get(number)?.length ?? 0), 0);
@@ -96,10 +96,10 @@ function tell() {
     setText(find("overlay-hint"), "");
     find("overlay-button").hidden = true;
     bar.hidden = false;
-    told = true;
-  } else if (told) {
+    progressShown = true;
+  } else if (progressShown) {
     bar.hidden = true;
-    told = false;
+    progressShown = false;
     showOverlay(game.state);
   }
 }
@@ -108,9 +108,9 @@ const othersWait = hooks.waits;
 hooks.waits = () => loading() || othersWait();
 hooks.overlay.push((name) => {
   bar.hidden = true;
-  told = false;
+  progressShown = false;
   if (["lost", "unreachable", "elsewhere"].includes(name)) {
     arrived = new Map(); // the next connection sends them anew
     asked = underWay = 0;
-  } else if (loading()) tell();
+  } else if (loading()) showProgress();
 });

@@ -1,5 +1,5 @@
-// What the server last said of the game, and what this page adds: `state` "loading" before the first word, "elsewhere"
-// when another page has the game; `offered`, the controls of the project's `ui`; `directions`, whether there are arrows;
-// `nextAt`, when the break ends.
+// The game's state: the fields of the server's last message about it, and those of this page. `state` is also "loading"
+// before the first message, and why the last connection ended; `offered`: the controls of the project's `ui`;
+// `directions`: whether there are arrows; `nextAt`: when the break ends.
 
 export const game = { state: "loading" };

@@ -1,17 +1,17 @@
-// What the server says of the game: scores, the number of the game, its state.
+// Shows the game's scores, number and state, as the server's message says.
 import { showBreak } from "./breaks.js";
 import { showOverlay } from "./overlay.js";
 import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
 
-export function showStatus(said) {
+export function showStatus(message) {
   const before = game.state;
-  Object.assign(game, said);
+  Object.assign(game, message);
   const several = game.maxEpisodes > 1;
   setText(find("score"), points(game.episodeScore ?? game.score));
   setText(find("total"), TEXT.total(points(game.score)));
   find("total").hidden = !several || game.episodeScore === undefined;
   setText(find("episode"), several ? TEXT.gameOf(game.episode, game.maxEpisodes) : "");
-  if (game.state === "break") showBreak(said, before !== "break");
+  if (game.state === "break") showBreak(message, before !== "break");
   else if (before !== game.state) showOverlay(game.state);
 }

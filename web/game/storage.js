@@ -1,11 +1,11 @@
-// What the browser keeps for this page. Storage may be full or forbidden; then nothing is kept.
+// Values that the browser stores for this page. Storage may be full or forbidden; then nothing is stored.
 import { data } from "./page.js";
 
 export function remember(key, value) {
   try {
     sessionStorage.setItem(`hippodrome-${key}`, JSON.stringify(value));
   } catch {
-    // nothing is kept
+    // nothing is stored
   }
 }
 

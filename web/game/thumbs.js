@@ -1,4 +1,4 @@
-// Games in which one goes left and right and jumps, on a phone: the left thumb goes, the right one jumps.
+// Games with buttons for left, right and up only, on a phone: the left thumb moves, the right one jumps.
 const css = `
 @media (pointer: coarse) {
   .pad { --thumb: calc(1.25 * var(--key)); grid: var(--thumb) / var(--thumb) var(--thumb) 1fr var(--thumb); width: 100%; max-width: 30rem; }

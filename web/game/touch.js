@@ -1,4 +1,4 @@
-// Buttons that act while they are held. A finger may slide from one to the next, as thumbs do.
+// Buttons that act while they are held. A finger may slide from one to the next.
 import { press, release, tap } from "./actions.js";
 import { make } from "./page.js";
 
@@ -6,7 +6,7 @@ export function actionButton(action, label, sign) {
   const button = make("button", { type: "button", textContent: sign ? `${sign}\ufe0e` : label, className: `hold ${action}` });
   button.setAttribute("aria-label", label);
   button.dataset.action = action;
-  button.addEventListener("click", (event) => event.detail === 0 && tap(action)); // from the keyboard
+  button.addEventListener("click", (event) => event.detail === 0 && tap(action)); // a click by the keyboard
   return button;
 }
 

@@ -1,4 +1,4 @@
-// Turn by turn: whose turn it is, and the time that is left of it.
+// Games turn by turn: shows whose turn it is, and how much time is left.
 import { hooks } from "./hooks.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
@@ -9,16 +9,16 @@ let turnEndsAt = null;
 let wasMine = false;
 
 document.querySelector(".hud").append(turn);
-const turnSheet = new CSSStyleSheet(); // pages of other games need none of it
+const turnSheet = new CSSStyleSheet(); // only these games' pages need it
 turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
 .hud #turn { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
 #turn.mine { color: var(--ink); font-weight: 600; }
 @media (min-aspect-ratio: 5/4) { .hud #turn { flex: none; text-align: inherit; } }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, turnSheet];
-// A press that starts the game, or goes on with it, is no move.
+// A press that starts or resumes the game is no action.
 hooks.starts = () => true;
 
-hooks.said.push((message) => {
+hooks.message.push((message) => {
   if (!message.state) return;
   turnEndsAt = typeof message.turnEndsIn === "number" ? performance.now() + 1000 * message.turnEndsIn : null;
   showTurn();

@@ -1,13 +1,13 @@
-// The section that is shown until the server is ready: its stages, its clock, and how often the page polls meanwhile.
+// The section until the server is ready: its stages and clock, and how often the page polls.
 import { data, duration, find, setText, showSection } from "./page.js";
 import { recall, remember } from "./storage.js";
 
 const STAGES = ["queued", "starting", "naming", "ready"];
-const POLLS = { first: 1_000, growth: 1.15, longest: 4_000, naming: 1_500 }; // ms between polls; growth is a factor
+const POLLS = { first: 1_000, growth: 1.15, longest: 4_000, naming: 1_500 }; // ms between polls; `growth` is a factor
 
 const waiting = { since: 0, typical: null, stage: "" };
 
-// Milliseconds until the next poll: few at first and in the last state before `ready`, more otherwise.
+// Milliseconds until the next poll: few at first and in the state before `ready`, more otherwise.
 export function pollDelay(state, polls) {
   if (isOver(state)) return POLLS.longest;
   if (state.state === "naming") return POLLS.naming;
@@ -46,7 +46,7 @@ export function showClock() {
     : TEXT.usually(duration(waiting.typical));
 }
 
-// "Try again": the server's record stays closed for a moment after it.
+// "Try again": for a moment after it, polls still answer that the server has ended.
 
 export function noteRestart() {
   remember("again", { attempt: data.state.attempt, at: Date.now() });

@@ -1,16 +1,16 @@
-// The study's own words: for what servers say, which they say in English (`SAID` in hippodrome/model/texts.py), and on the
-// button that starts and pauses, which keeps the width of the longest that it has had: what is beside it stays in its place.
+// The study's own texts: instead of the servers' English sentences (`SAID` in hippodrome/model/texts.py), and on the button
+// that starts and pauses. That button keeps the width of its longest text, so that what is beside it does not move.
 import { hooks } from "./hooks.js";
 import { showMessage } from "./overlay.js";
 import { data } from "./page.js";
 
-function sayOwnWords(said) {
-  if (!Object.hasOwn(data.said, said.error ?? "")) return;
-  said.error = data.said[said.error]; // for what comes after this
-  showMessage(said.error);
+function sayOwnWords(message) {
+  if (!Object.hasOwn(data.said, message.error ?? "")) return;
+  message.error = data.said[message.error]; // for the hooks after this one
+  showMessage(message.error);
 }
 
-hooks.said.unshift(sayOwnWords);
+hooks.message.unshift(sayOwnWords);
 hooks.overlay.push(() => {
   for (const button of document.querySelectorAll("[data-command=toggle]")) {
     if (button.offsetWidth) button.style.minWidth = `${button.offsetWidth}px`;
