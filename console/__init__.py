@@ -1,1 +1,1 @@
-"""What commands share that people run in a terminal: output, problems, exit codes, numbers as people read them."""
+"""Output, problems, exit codes and the formatting of numbers, for all commands that people run in a terminal."""

@@ -1,17 +1,17 @@
-"""Numbers as people read them."""
+"""Formats numbers for people."""
 
 from __future__ import annotations
 
-LONG = 90  # seconds; from here on minutes are told
+_MINUTES_FROM = 90  # seconds; shorter durations are in seconds
 
 
-def count(number: int, what: str) -> str:
-    """`1 server`, `1,200 servers`."""
-    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 server`, `1,200 servers`."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def size(number: float) -> str:
-    """Bytes as `812 bytes`, `1.5 KB`, `3.2 GB`; a KB is a thousand of them."""
+    """Return a number of bytes as `812 bytes`, `1.5 KB` or `3.2 GB`; a KB is 1,000 bytes."""
     if number < 1000:
         return count(round(number), "byte")
     for unit in ("KB", "MB"):
@@ -22,5 +22,5 @@ def size(number: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """`41 s`, `12 min`."""
-    return f"{seconds:.0f} s" if seconds < LONG else f"{seconds / 60:.0f} min"
+    """Return a duration as `41 s`, or from 90 seconds on as `12 min`."""
+    return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60:.0f} min"

@@ -1,4 +1,4 @@
-"""What is told instead of a traceback: what happened, and what to do about it."""
+"""Problems that a command reports without a traceback, and the exit codes of commands."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ from enum import IntEnum
 
 
 class Exit(IntEnum):
-    """What the exit codes mean. 2 is typer's own: the command was not written rightly."""
+    """Exit codes. 2 is typer's: the command line has a mistake."""
 
     DONE = 0
-    FAILED = 1  # something is in the way; the text says what
-    CHANGES = 3  # `plan` and `--dry-run`: there is something to do
-    DECLINED = 4  # a question was answered with no; nothing was changed
-    INTERRUPTED = 130  # Ctrl-C; the next run goes on from there
+    FAILED = 1  # a Problem, which was printed
+    CHANGES = 3  # `plan` and `--dry-run`: there are changes to make
+    DECLINED = 4  # the answer to a question was no; nothing was changed
+    INTERRUPTED = 130  # Ctrl-C; the next run continues
 
 
 class Problem(Exception):
-    """Something is in the way. `str()` says what, in a sentence; `advice` what to do; `details` are lines between."""
+    """A command cannot do its work. `str()` is a sentence that says why; `advice` says what to do.
 
-    def __init__(self, what: str, advice: str = "", details: Sequence[str] = (), exit_code: Exit = Exit.FAILED) -> None:
-        super().__init__(what)
+    `details` are lines that are printed between both.
+    """
+
+    def __init__(
+        self, message: str, advice: str = "", details: Sequence[str] = (), exit_code: Exit = Exit.FAILED
+    ) -> None:
+        super().__init__(message)
         self.advice = advice
         self.details = tuple(details)
         self.exit_code = exit_code

@@ -1,4 +1,4 @@
-"""What people see: answers on stdout, progress and problems on stderr, so that scripts read only answers."""
+"""Prints a command's results on stdout, and progress and problems on stderr, so that scripts read only results."""
 
 from __future__ import annotations
 
@@ -29,47 +29,47 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def info(line: str, style: str = "") -> None:
-    """One line about what is going on (stderr)."""
+    """Print a line on the progress of the command (stderr)."""
     err.print(Text(line, style=style))
 
 
 def success(line: str) -> None:
-    """One line about what has been done (stderr)."""
+    """Print a line on a finished piece of work (stderr)."""
     err.print(Text("✓ ", style="green") + Text(line))
 
 
 def warning(line: str) -> None:
-    """One line about what should be looked at (stderr)."""
+    """Print a warning (stderr)."""
     err.print(Text("! ", style="yellow") + Text(line))
 
 
 def result(line: str) -> None:
-    """One line of the answer itself (stdout)."""
+    """Print a line of the command's result (stdout)."""
     out.print(Text(line))
 
 
 def result_json(value: Any) -> None:
-    """The answer for a script (stdout); nothing else may be printed there."""
-    sys.stdout.write(json.dumps(value, indent=2, default=_plain, ensure_ascii=False) + "\n")
+    """Print the result as JSON for a script (stdout). The command must print nothing else there."""
+    sys.stdout.write(json.dumps(value, indent=2, default=_text, ensure_ascii=False) + "\n")
 
 
-def _plain(value: Any) -> str:
-    """Times as ISO 8601 has them, anything else as it prints itself."""
+def _text(value: Any) -> str:
+    """A date or time in the form of ISO 8601, any other value as by `str()`."""
     return value.isoformat() if isinstance(value, date) else str(value)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "", right: Sequence[str] = ()) -> None:
-    """A table as the answer (stdout); the columns in `right` are numbers."""
-    made = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    """Print a table as the command's result (stdout). The columns in `right` are aligned to the right."""
+    printed = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
     for column in columns:
-        made.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        printed.add_column(column, justify="right" if column in right else "left", overflow="fold")
     for row in rows:
-        made.add_row(*(Text(str(cell)) for cell in row))
-    out.print(made)
+        printed.add_row(*(Text(str(cell)) for cell in row))
+    out.print(printed)
 
 
 class ProgressBars(Progress):
-    """Progress bars on stderr. Where that is no terminal (a log, a pipe), one line when a piece of work begins."""
+    """Progress bars on stderr. If stderr is no terminal, a line at the beginning of each task takes their place."""
 
     def __init__(self, *more: ProgressColumn, width: int = 40) -> None:
         columns = (
@@ -82,19 +82,22 @@ class ProgressBars(Progress):
         super().__init__(*columns, *more, console=err, disable=not err.is_terminal)
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
-        """A new bar."""
+        """Add a bar for a task."""
         if self.disable:
             info(f"{description} …")
         return super().add_task(description, *args, **fields)
 
 
 def progress() -> Progress:
-    """A progress bar on stderr, for work that takes longer than a breath. Use as a context manager."""
+    """Return progress bars for work that takes some seconds. Use them as a context manager."""
     return ProgressBars()
 
 
 def confirm(question: str, yes: bool = False) -> None:
-    """Go on only if the answer is yes. `yes` is the command's `--yes`. Raises `Problem` (declined) otherwise."""
+    """Ask the question and return if the answer is yes. With `yes`, the command's `--yes`, it does not ask.
+
+    Raises `Problem` with the exit code DECLINED for any other answer, and if stdin is no terminal.
+    """
     if yes:
         return
     if not sys.stdin.isatty():
@@ -106,7 +109,7 @@ def confirm(question: str, yes: bool = False) -> None:
 
 
 def read_line() -> str:
-    """Return the line that is typed; "" at the end of the input (Ctrl-D)."""
+    """Return the next line of stdin without surrounding spaces; "" at its end (Ctrl-D)."""
     try:
         return input().strip()
     except EOFError:
@@ -114,7 +117,7 @@ def read_line() -> str:
 
 
 def show_problem(problem: Problem) -> None:
-    """The last thing a failed command prints."""
+    """Print a problem with its details and advice (stderr)."""
     err.print(Text("✗ ", style="bold red") + Text(str(problem), style="bold"))
     for line in problem.details:
         err.print(Text(f"  {line}"))

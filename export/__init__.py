@@ -1,1 +1,1 @@
-"""Answers and recordings as tables and datasets, read from a bucket or from a folder with the same keys."""
+"""`make data`: converts answers and recordings into tables and datasets, from a bucket or a folder with its keys."""

@@ -1,6 +1,6 @@
-"""The tables of answers: a row per participant, or per field.
+"""Makes the tables of answers: with a row per participant, or a row per field.
 
-Everything is read from the state a row at a time, so that memory does not grow with the study.
+All rows are read from the state one at a time, so that memory does not grow with the study.
 """
 
 from __future__ import annotations
@@ -22,62 +22,63 @@ from export.table_files import Column, fit, json_text
 from hippodrome.model.project import Project
 from protocol.session import is_session_id
 
-MAX_FIELDS = (
-    1_000  # columns of answers; of more fields (every participant can send some) the rarest share the column `other`
-)
-MAX_LINK = 50  # columns of what links carried
-_MAX_PAGES = 100  # pages that are counted at one step
-_MAX_COUNTED = 50_000  # fields that are counted at once
+MAX_FIELDS = 1_000
+"""Columns of answers. Participants can send any number of fields; the rarest ones share the column `other`."""
+MAX_LINK = 50
+"""Columns of the values in participants' links."""
+_MAX_PAGES = 100  # different pages that are counted at one step
+_MAX_COUNTED = 50_000  # different fields that are counted at once
 
 
 @dataclass
 class Field:
-    """What one field's answers are like."""
+    """The answers to one field: their number and their kinds."""
 
-    place: int  # the order of appearance
+    place: int  # in the order in which fields were first read
     count: int = 0
     kinds: set[str] = field(default_factory=set)
-    asked: FieldKind = FieldKind.TEXT  # what the page says that it sends
+    page_kind: FieldKind = FieldKind.TEXT  # by the field's page
 
     @property
     def type(self) -> str:
-        """The narrowest type that holds them all; else text, with JSON for what is none."""
-        numbers = {*_SENT_NUMBERS, *_TYPED_NUMBERS} if self.asked is FieldKind.NUMBER else {*_SENT_NUMBERS}
-        if self.kinds <= {*numbers, _EMPTY} and (self.kinds != {_EMPTY} or self.asked is FieldKind.NUMBER):
+        """The narrowest type of column that holds all answers. In a column of texts, other values become JSON."""
+        is_number = self.page_kind is FieldKind.NUMBER
+        numbers = {*_SENT_NUMBERS, *_TYPED_NUMBERS} if is_number else {*_SENT_NUMBERS}
+        if self.kinds <= {*numbers, _EMPTY} and (self.kinds != {_EMPTY} or is_number):
             return "number" if self.kinds & {"number as text", "number as typed"} else "whole"
         kinds = {"text" if kind in (*_SENT_NUMBERS, *_TYPED_NUMBERS, _EMPTY) else kind for kind in self.kinds}
         if "other" in kinds:
             return "text"
-        if "texts" in kinds or (self.asked is FieldKind.LIST and kinds == {"text"}):
+        if "texts" in kinds or (self.page_kind is FieldKind.LIST and kinds == {"text"}):
             return "texts" if kinds <= {"text", "texts"} else "text"
         if kinds == {"whole", "number"}:
             return "number"
         return next(iter(kinds)) if len(kinds) == 1 else "text"
 
 
-class Moved(NamedTuple):
-    """A step with answers from another page than it has now: the study's steps were changed while people took part."""
+class ChangedPage(NamedTuple):
+    """A step with answers from another page than its present one: steps were changed while participants took part."""
 
     step: str
-    page: str  # the one that it has now
-    others: Mapping[str, int]  # of each other page, how many answers came from it
+    page: str  # the present one
+    others: Mapping[str, int]  # the number of answers from each other page
 
 
 class StudyAnswers:
-    """All answers of a study. Made by one pass that finds the columns; the tables are further passes."""
+    """All answers of a study. The constructor reads them once to find the columns; each table reads them again."""
 
     def __init__(
         self,
         state: ExportState,
         project: Project | None,
         apart: bool,
-        asked: Mapping[tuple[str, str], FieldKind] = MappingProxyType({}),
+        page_kinds: Mapping[tuple[str, str], FieldKind] = MappingProxyType({}),
     ) -> None:
-        """`asked` is what the study's pages say of their fields (`page_fields`), by step and name."""
+        """`page_kinds` has the kinds of the fields in the study's pages, by step and name (`page_fields`)."""
         self._state = state
         self._project = project
         self._apart = apart
-        self._now = {step.key: step.page for step in project.steps} if project else {}
+        self._present_pages = {step.key: step.page for step in project.steps} if project else {}
         self.scrubbed = 0
         self.finished = 0
         self.in_sessions = False
@@ -91,32 +92,32 @@ class StudyAnswers:
                 steps.add(step)
                 self._count_page(pages.setdefault(step, Counter()), step, answers)
                 for name, value in _fields(answers).items():
-                    new = Field(len(fields), asked=asked.get((step, name), FieldKind.TEXT))
-                    seen = fields.setdefault((step, name), new)
-                    seen.count += 1
-                    seen.kinds.add(_kind(value))
+                    new = Field(len(fields), page_kind=page_kinds.get((step, name), FieldKind.TEXT))
+                    known = fields.setdefault((step, name), new)
+                    known.count += 1
+                    known.kinds.add(_kind(value))
             for name in texts(participant.document.get("link")):
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
         self.moved = [
-            Moved(step, page, others)
-            for step, page in self._now.items()
+            ChangedPage(step, page, others)
+            for step, page in self._present_pages.items()
             if (others := {name: count for name, count in pages.get(step, Counter()).items() if name != page})
         ]
-        widest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
-        order = {key: place for place, key in enumerate(asked)}
+        commonest = sorted(fields, key=lambda key: (-fields[key].count, fields[key].place))[:MAX_FIELDS]
+        order = {key: place for place, key in enumerate(page_kinds)}
         self.fields = {
             key: fields[key]
             for key in sorted(
-                widest, key=lambda key: (self.steps.index(key[0]), order.get(key, len(order)), fields[key].place)
+                commonest, key=lambda key: (self.steps.index(key[0]), order.get(key, len(order)), fields[key].place)
             )
         }
         self.links = sorted(links, key=lambda name: (-links[name], name))[:MAX_LINK]
         self.crowded = len(fields) > MAX_FIELDS or len(links) > MAX_LINK
 
     def _participants(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
-        """Everybody, with their documents as they may be shown."""
+        """The participants with the documents of their answers; with `apart`, without identities."""
         for participant, found in self._state.answers():
             if not self._apart:
                 yield participant, found
@@ -125,27 +126,27 @@ class StudyAnswers:
             yield participant, {step: hide.value(answers) for step, answers in found.items()}
             self.scrubbed += hide.found
 
-    def _count_page(self, seen: Counter[str], step: str, answers: Mapping[str, Any]) -> None:
+    def _count_page(self, counts: Counter[str], step: str, answers: Mapping[str, Any]) -> None:
         page = self._page(step, answers)
-        if page is not None and (page in seen or len(seen) < _MAX_PAGES):
-            seen[page] += 1
+        if page is not None and (page in counts or len(counts) < _MAX_PAGES):
+            counts[page] += 1
 
     def _page(self, step: str, answers: Mapping[str, Any]) -> str | None:
-        """The page that a step's answer came from; the versions for groups of the page that it has now count as one."""
+        """The page that a step's answer came from. All versions of the present page count as one."""
         page = answers.get("page")
         if not isinstance(page, str):
             return None
-        now = self._now.get(step, "")
-        return now if now and now in (page, _VERSION.sub("", page)) else clean(page)
+        present = self._present_pages.get(step, "")
+        return present if present and present in (page, _VERSION.sub("", page)) else clean(page)
 
     def _in_order(self, steps: set[str]) -> list[str]:
-        """In the study's order; steps that it does not have (any more) come last."""
+        """All steps in the study's order; steps that the study does not have any more come last."""
         known = [step.key for step in self._project.steps] if self._project else []
         rest = sorted(steps - set(known), key=lambda step: (not step.isdigit(), step.zfill(64)))
         return [*known, *rest]
 
     def _finished(self, found: Mapping[str, Any]) -> bool | None:
-        """Whether every step before the last has an answer; not known without the study."""
+        """Whether every step before the last has an answer; None if the study's steps are not known."""
         return all(step.key in found for step in self._project.steps[:-1]) if self._project else None
 
     @property
@@ -167,7 +168,7 @@ class StudyAnswers:
         )
 
     def rows(self) -> Iterator[list[Any]]:
-        """The wide table: one row per participant."""
+        """Yield the rows of the wide table: one per participant."""
         shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
         self.scrubbed = self.finished = 0
         for participant, found in self._participants():
@@ -196,7 +197,7 @@ class StudyAnswers:
             yield row
 
     def _rest(self, fields: Mapping[str, Mapping[str, Any]], link: Mapping[str, str]) -> str | None:
-        """What has no column, as JSON."""
+        """The fields and the link's values that have no column, as JSON; None if there are none."""
         rest = {
             f"{step}.{name}": value
             for step, named in fields.items()
@@ -217,7 +218,7 @@ class StudyAnswers:
     )
 
     def long_rows(self) -> Iterator[list[Any]]:
-        """The long table: one row per text that was sent; of a list one for each."""
+        """Yield the rows of the long table: one per value that was sent, and one for each text of a list."""
         order = {step: place for place, step in enumerate(self.steps)}
         for participant, found in self._participants():
             for step in sorted(found, key=lambda step: order[step]):
@@ -240,7 +241,7 @@ _MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "
 
 
 def _membership(participant: ExportedParticipant) -> list[Any]:
-    """In which session a participant plays and at which seat, or that in none; seconds that they waited for others."""
+    """The participant's session and seat, whether they were unmatched, and the seconds for which they waited."""
     about = participant.membership
     session, seat, unmatched = about.get("session"), about.get("seat"), about.get("unmatched")
     fits = isinstance(seat, int) and not isinstance(seat, bool) and seat >= 0 and is_session_id(session)
@@ -251,7 +252,7 @@ def _membership(participant: ExportedParticipant) -> list[Any]:
 
 
 def _distinct(*columns: Column) -> list[Column]:
-    """No two columns by one name: hostile names may become the same when they are made fit for UTF-8."""
+    """The columns with a number after a name that comes again: `clean` may make two fields' names equal."""
     names: set[str] = set()
     made = []
     for column in columns:
@@ -265,7 +266,7 @@ def _distinct(*columns: Column) -> list[Column]:
 
 
 def _fields(answers: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The fields of an answer's document; those without a value are not there."""
+    """The fields of an answer's document that have a value."""
     found = answers.get("answers")
     return {str(n): value for n, value in found.items() if value is not None} if isinstance(found, dict) else {}
 
@@ -278,31 +279,32 @@ def _group(document: Mapping[str, Any]) -> int | None:
 
 _SENT_NUMBERS = ("whole as text", "number as text")
 _TYPED_NUMBERS = ("whole as typed", "number as typed")
-"""Such as 07 and 2.50: numbers if a field for numbers has sent them, and perhaps codes if another has."""
+"""Texts such as 07 and 2.50: from a field for numbers they are numbers, and from another field they may be codes."""
 _EMPTY = "empty text"
 _TYPED_WHOLE = re.compile(r"-?[0-9]{1,15}", re.ASCII)
 _TYPED = re.compile(r"-?(?:[0-9]{1,15}(?:\.[0-9]{1,17})?|\.[0-9]{1,17})(?:[eE][+-]?[0-9]{1,3})?", re.ASCII)
-"""HTML's "valid floating-point number", which a field for numbers sends; those with more digits stay texts."""
-_VERSION = re.compile(r"-[0-9]+\Z", re.ASCII)  # of a page for a group
+"""HTML's "valid floating-point number", which a field for numbers sends. Numbers with more digits stay texts."""
+_VERSION = re.compile(r"-[0-9]+\Z", re.ASCII)  # the number of a group after a page's name
 _WHOLE = re.compile(r"-?[1-9][0-9]{0,15}|0", re.ASCII)
 _DECIMAL = re.compile(r"-?[0-9]{1,16}\.[0-9]{1,17}", re.ASCII)
 
 
 def _kind(value: Any) -> str:
+    """The kind of a value that was sent: the type of its column, "other", or a kind of text (`_kind_of_text`)."""
     if isinstance(value, str):
         return _kind_of_text(value)
     if isinstance(value, bool):
         return "truth"
     if isinstance(value, int):
-        return "whole" if -(2**53) <= value <= 2**53 else "other"  # a column may become one of floats
+        return "whole" if -(2**53) <= value <= 2**53 else "other"  # the column may be one of floats
     if isinstance(value, float):
         return "number"
     return "texts" if isinstance(value, list) and all(isinstance(item, str) for item in value) else "other"
 
 
 def _kind_of_text(text: str) -> str:
-    """Forms send texts. A text is a number only if the number, written by Python, is that very text again: `007`,
-    `+1`, `1e3` and `2.50` stay texts, because they may be codes and not quantities."""
+    """The kind of a text. It is a number only if Python writes the number as the same text: `007`, `+1`, `1e3` and
+    `2.50` may be codes and not quantities."""
     if not text:
         return _EMPTY
     if _WHOLE.fullmatch(text):
@@ -315,7 +317,7 @@ def _kind_of_text(text: str) -> str:
 
 
 def _only_common(fields: dict[tuple[str, str], Field]) -> None:
-    """Forget the rarest if there are too many: they come from a participant's requests, and end in `other`."""
+    """Drop the rarest fields if there are too many: participants can send any fields. They go into `other`."""
     if len(fields) > _MAX_COUNTED:
         rarest = sorted(fields, key=lambda key: fields[key].count)[: _MAX_COUNTED // 2]
         for key in rarest:

@@ -1,17 +1,17 @@
-"""From converted recordings to Minari datasets: one per game step, or several where the game changed on the way.
+"""Makes Minari datasets from converted recordings: one per game step, or several if the game changed during the study.
 
-In sessions, one for each human player.
+In sessions, each human player has a dataset.
 
-Minari wants an observation for every step. Recordings hold them if the study said `recordObservations`; where they do
-not, the number of the step stands in their place, and the dataset's description says so. Episodes are written one at a
-time. Images are kept exactly: Minari would write them as JPEG, which loses something.
+Minari needs an observation for every step. Recordings hold observations if the study has `recordObservations`.
+Otherwise the number of the step takes their place, and the dataset's description says so. Episodes are written one at a
+time. Images are stored without loss, not as JPEG, which is Minari's default.
 
 Facts (minari 0.5.4, read in its source): `load_dataset(id)` reads `$MINARI_DATASETS_PATH/{id}/data`; observations and
-infos have one entry more than actions; its own collector marks the last step of an episode that was broken off as
-truncated. All of that is done here too.
+infos have one entry more than actions; its own collector marks the last step of an unfinished episode as truncated. The
+datasets here follow all of them.
 """
 
-# ruff: noqa: PLC0415 - minari brings gymnasium, h5py and pyarrow, which nothing else here needs
+# ruff: noqa: PLC0415 - minari imports gymnasium, h5py and pyarrow, which no other module here needs
 
 from __future__ import annotations
 
@@ -31,36 +31,39 @@ from export.episodes import Spec
 from export.state import ExportState
 
 OF_HUMAN = (
-    "Several players played: actions, rewards and observations are those of {who}. An action by none is the "
-    "idle one, also where it was not the human's turn. Episodes end where the human left the game. "
-    "infos: players (what each did and got, as JSON). "
+    "Several players played: actions, rewards and observations are those of {player}. An action by none is the "
+    "idle action; it was taken also when it was not the human's turn. Episodes end when the human left the game. "
+    "infos: players (actions, rewards and more of each player, as JSON). "
 )
 IN_SESSIONS = (
-    "Several people played together: the others' steps of the same games are in datasets of their own. A policy took "
-    "actions by policy while the participant was away. "
+    "Several people played together: the others' steps of the same games are in other datasets. A policy took "
+    "the actions by policy while the participant was away. "
 )
-STEP_NUMBERS = "The observations were not recorded; in their place stands the number of the step."
+STEP_NUMBERS = "The observations were not recorded; the number of the step takes their place."
 
 
 @dataclass
 class Dataset:
-    """A dataset in the making."""
+    """A dataset that is being made."""
 
     spec: Spec
     id: str = ""
-    began: str = "~"  # the first episode's time, for the order
-    highest: int = -1  # action
-    files: list[str] = field(default_factory=list)
+    began: str = "~"  # the first episode's time; it orders the datasets of a step
+    highest: int = -1  # the highest number of an action
+    files: list[str] = field(default_factory=list)  # converted recordings
     episodes: int = 0
     steps: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)  # episodes, by the reason
 
 
 def build(folder: Path, state: ExportState, project: str, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
-    """Make `folder/minari` anew from the converted recordings; what there is now. Raises OSError."""
+    """Make `folder/minari` anew from the converted recordings, and return a summary of each dataset.
+
+    `progress` is called with the number of recordings, and the number of those that are done. Raises OSError.
+    """
     import minari
 
-    folder = folder.resolve()  # Minari joins a relative path to itself when it asks for a dataset's size
+    folder = folder.resolve()  # to get a dataset's size, Minari joins a relative path with itself
     datasets = _datasets(folder, state, project)
     part, target = folder / "private" / "minari.part", folder / "minari"
     shutil.rmtree(part, ignore_errors=True)
@@ -95,7 +98,7 @@ def _datasets(folder: Path, state: ExportState, project: str) -> list[Dataset]:
     found: dict[Spec, Dataset] = {}
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         first = next(several)[2]
-        for spec, highest in episodes.look(folder / path, str(first["step"]), first.get("people")):
+        for spec, highest in episodes.specs(folder / path, str(first["step"]), first.get("people")):
             dataset = found.setdefault(spec, Dataset(spec))
             dataset.files.append(path)
             dataset.highest = max(dataset.highest, highest)
@@ -106,15 +109,15 @@ def _datasets(folder: Path, state: ExportState, project: str) -> list[Dataset]:
     versions: Counter[str] = Counter()
     for dataset in sorted(found.values(), key=lambda dataset: (dataset.spec.step, dataset.began, dataset.spec.human)):
         spec = dataset.spec
-        named = spec.human and (spec.together or len(humans[spec.step]) > 1)
-        name = f"{project}-{spec.step}" + (f"-{_NO_NAME.sub('_', spec.human)}" if named else "")
+        has_player = spec.human and (spec.together or len(humans[spec.step]) > 1)
+        name = f"{project}-{spec.step}" + (f"-{_NOT_ALLOWED.sub('_', spec.human)}" if has_player else "")
         dataset.id = f"{name}-v{versions[name]}"
         versions[name] += 1
     return sorted(found.values(), key=lambda dataset: dataset.id)
 
 
-_NO_NAME = re.compile("[^A-Za-z0-9_-]")
-"""What the name of a dataset may not have (`DATASET_ID_RE` of minari 0.5.4)."""
+_NOT_ALLOWED = re.compile("[^A-Za-z0-9_-]")
+"""Characters that the name of a dataset may not have (`DATASET_ID_RE` of minari 0.5.4)."""
 
 
 def _storage(data: Path, dataset: Dataset, version: str) -> Any:
@@ -141,20 +144,18 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
             action_space=Discrete(max(len(spec.actions), dataset.highest + 1, 1)),
             jpeg_encoding=False,
         )
-    description = "Recorded by Hippodrome: what people did, and what came of it. " + (
-        "" if spec.dtype else STEP_NUMBERS + " "
-    )
-    who = f"the player {spec.human}" if spec.together else "the first human"
-    description += OF_HUMAN.format(who=who) if spec.players else ""
+    description = "Recorded by Hippodrome: the actions of people and their results. "
+    description += "" if spec.dtype else STEP_NUMBERS + " "
+    player = f"the player {spec.human}" if spec.together else "the first human"
+    description += OF_HUMAN.format(player=player) if spec.players else ""
     description += IN_SESSIONS if spec.together else ""
     storage.update_metadata(
         {
             "dataset_id": dataset.id,
             "minari_version": version,
-            "description": description
-            + "infos: by (who chose the action), human (what the keys asked for; -1: nothing), "
-            "info (the environment's, as JSON), extra (what else step() returned, as JSON). "
-            "Episodes that were broken off end as truncated; metadata say why.",
+            "description": description + "infos: by (who chose the action), human (the action of the keys; -1: none), "
+            "info (the environment's, as JSON), extra (further values that step() returned, as JSON). "
+            "Unfinished episodes end as truncated; metadata say why.",
             "action_names": list(spec.actions),
         }
     )
@@ -162,46 +163,47 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
 
 
 def _append(storage: Any, path: Path, dataset: Dataset) -> None:
-    """Add a recording's episodes."""
-    first, abouts = storage.total_episodes, []
+    """Add a recording's episodes, with their metadata."""
+    first, metadata = storage.total_episodes, []
     shared = dataset.spec.together
 
     def buffers() -> Iterator[Any]:
         for rows, why in episodes.read(path, dataset.spec):
-            made = _buffer(rows, dataset)
-            if isinstance(made, str):
-                dataset.left_out[made] += 1
+            buffer = _buffer(rows, dataset)
+            if isinstance(buffer, str):
+                dataset.left_out[buffer] += 1
                 continue
             dataset.episodes += 1
-            dataset.steps += len(made.rewards)
-            abouts.append(
+            dataset.steps += len(buffer.rewards)
+            metadata.append(
                 {
                     "participant": rows[0]["participant"] or "",
                     **({"session": rows[0]["session"] or "", "player": _clean(dataset.spec.human)} if shared else {}),
                     "attempt": -1 if rows[0]["attempt"] is None else rows[0]["attempt"],
-                    "trial": (rows[0]["trial"] or "").replace("\0", ""),
+                    "trial": _clean(rows[0]["trial"]),
                     "episode": -1 if rows[0]["episode"] is None else rows[0]["episode"],
-                    "why": why.replace("\0", ""),
+                    "why": _clean(why),
                 }
             )
-            yield made
+            yield buffer
 
     storage.update_episodes(buffers())
-    if abouts:
-        storage.update_episode_metadata(abouts, range(first, first + len(abouts)))
+    if metadata:
+        storage.update_episode_metadata(metadata, range(first, first + len(metadata)))
 
 
-def _clean(text: str) -> str:
-    return text.replace("\0", "")
+def _clean(value: Any) -> str:
+    """The value as text for HDF5, which takes no null characters; "" for None."""
+    return str(value or "").replace("\0", "")
 
 
 def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
-    """An episode as Minari takes it; else a sentence that says why not."""
+    """An episode as Minari's EpisodeBuffer; if it cannot be one, a text that says why."""
     import numpy as np
     from minari.data_collector import EpisodeBuffer
 
     spec = dataset.spec
-    rows = episodes.own(rows, spec.human) if spec.human else rows
+    rows = episodes.until_end_of(rows, spec.human) if spec.human else rows
     first = rows[0] if rows[0]["kind"] == "reset" else None
     steps = rows[1:] if first else rows
     if any(row["action"] is None or row["action"] < 0 for row in steps):
@@ -225,7 +227,7 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
     terminations = [bool(row["terminated"]) for row in steps]
     truncations = [bool(row["truncated"]) for row in steps]
     truncations[-1] = truncations[-1] or not terminations[-1]
-    told: list[dict[str, Any]] = [first or {}, *steps]
+    all_rows: list[dict[str, Any]] = [first or {}, *steps]
     return EpisodeBuffer(
         seed=first["seed"] if first else None,
         observations=observations,
@@ -234,18 +236,18 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
         terminations=np.array(terminations),
         truncations=np.array(truncations),
         infos={
-            "by": [str(row.get("by") or "").replace("\0", "") for row in told],
-            "human": np.array([-1 if row.get("human") is None else row["human"] for row in told], np.int64),
-            "info": [str(row.get("info") or "").replace("\0", "") for row in told],
-            **_more(told, "extra"),
-            **(_more(told, "players") if spec.players else {}),
+            "by": [_clean(row.get("by")) for row in all_rows],
+            "human": np.array([-1 if row.get("human") is None else row["human"] for row in all_rows], np.int64),
+            "info": [_clean(row.get("info")) for row in all_rows],
+            **_other_field(all_rows, "extra"),
+            **(_other_field(all_rows, "players") if spec.players else {}),
         },
     )
 
 
-def _more(rows: list[dict[str, Any]], name: str) -> dict[str, list[str]]:
-    """A field without a column, as JSON, if a line of this episode has it."""
-    kept = [json.loads(row.get("other") or "{}").get(name) for row in rows]
-    if all(value is None for value in kept):
+def _other_field(rows: list[dict[str, Any]], name: str) -> dict[str, list[str]]:
+    """A field that has no column, as JSON for each row; {} if no row has this field."""
+    values = [json.loads(row.get("other") or "{}").get(name) for row in rows]
+    if all(value is None for value in values):
         return {}
-    return {name: ["" if value is None else json.dumps(value).replace("\0", "") for value in kept]}
+    return {name: ["" if value is None else _clean(json.dumps(value)) for value in values]}

@@ -1,4 +1,4 @@
-"""What a converted recording is like, and the rows of each of its episodes, for datasets (`datasets.py`)."""
+"""Reads converted recordings for datasets (`datasets.py`): the properties of each, and the rows of its episodes."""
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when a recording is read
 
@@ -15,21 +15,22 @@ from export.recording_columns import humans_of, players_of, unpack_array
 
 
 class Spec(NamedTuple):
-    """What must be the same for two recordings to stand in one dataset."""
+    """The properties of a recording. All recordings of one dataset have the same."""
 
     step: str
     actions: tuple[str, ...]
-    dtype: str  # of the observations; "" where there are none
-    shape: tuple[int, ...]
-    players: tuple[str, ...] = ()  # if several play
-    human: str = ""  # whose steps these are
-    together: bool = False  # with other people, in a session
+    dtype: str  # of the observations; "" if there are none
+    shape: tuple[int, ...]  # of an observation
+    players: tuple[str, ...] = ()  # all players, if there are several
+    human: str = ""  # the player whose steps these are, if there are several
+    together: bool = False  # with other participants, in a session
 
 
-def look(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
-    """What a converted recording is like for each human, and their highest action, without reading it all.
+def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
+    """Yield the properties of a converted recording for each human, and the highest number of an action.
 
-    `people` are the participants of a session's players. A player whose participant was erased has no dataset.
+    Only the file's metadata and its first rows are read. In a session, `people` has the participants' numbers by
+    player; a player whose participant was erased is left out.
     """
     import pyarrow.parquet as pq
 
@@ -49,24 +50,24 @@ def look(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iter
         known = [human for human in humans if people.get(human)] or humans
         for human in known if any(people.values()) or not people else ():
             own = (header["players"][human] or {}).get("actionSpace")
-            theirs = tuple(map(str, own)) if isinstance(own, list) else actions
+            own_actions = tuple(map(str, own)) if isinstance(own, list) else actions
             dtype, shape = _observed(rows, "" if human == humans[0] else human)
             highest = _highest(file, f"action.{human}")
-            yield Spec(step, theirs, dtype, shape, players, human, together=True), highest
+            yield Spec(step, own_actions, dtype, shape, players, human, together=True), highest
 
 
 def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
-    """A recording's rows of `reset` and `step`, cut where an episode begins, and why each ended.
+    """Yield for each episode of a recording its rows of the kinds `reset` and `step`, and why it ended.
 
-    Episodes that end before the first step are left out. In a session the rows say what the dataset's human did.
+    Episodes that end before the first step are left out. In a session the rows have the values of the dataset's human.
     """
     import pyarrow.parquet as pq
 
     columns = ["participant", "attempt", "trial", "kind", "episode", "step", "time", "action", "by", "human"]
     columns += ["reward", "terminated", "truncated", "info", "seed", "observation", "observationDtype"]
     columns += ["observationShape", "why", "other"]
-    whose = f"participant.{spec.human}"
-    columns += ["session", whose] if spec.together else []
+    participant = f"participant.{spec.human}"
+    columns += ["session", participant] if spec.together else []
     rows: list[dict[str, Any]] = []
     why = "cut off"
     with pq.ParquetFile(path) as file:
@@ -80,7 +81,7 @@ def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
                 if row["kind"] not in ("reset", "step"):
                     continue
                 if spec.together:
-                    row = row | {"participant": row[whose]}
+                    row = row | {"participant": row[participant]}
                     row |= _as_of(row, spec.human, header) if spec.human != humans[0] else {}
                 if rows and (row["kind"] == "reset" or row["episode"] != rows[0]["episode"]):
                     if rows[-1]["kind"] == "step":
@@ -91,8 +92,8 @@ def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
         yield rows, why
 
 
-def own(rows: list[dict[str, Any]], human: str) -> list[dict[str, Any]]:
-    """The rows up to the human's own end, after which the others may play on."""
+def until_end_of(rows: list[dict[str, Any]], human: str) -> list[dict[str, Any]]:
+    """Return the rows up to the step at which the game ended for this human. The others may have played on."""
     for place, row in enumerate(rows):
         part = _part(row, human)
         if row["kind"] == "step" and (part.get("terminated") or part.get("truncated")):
@@ -102,11 +103,11 @@ def own(rows: list[dict[str, Any]], human: str) -> list[dict[str, Any]]:
 
 
 def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dict[str, Any]:
-    """What a row says of another human than the first, under the names of the columns."""
+    """The values of a human in a row, by the names of the columns, which have those of the first human."""
     part = _part(row, human)
     idle = header.get("idleActions")
     action = part.get("action")
-    if action is None and isinstance(idle, dict):  # not their turn: the environment took the idle action
+    if action is None and isinstance(idle, dict):  # it was not the human's turn: the environment took the idle action
         action = idle.get(human)
     found = {
         "action": _whole(action),
@@ -119,13 +120,13 @@ def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dic
         "observationShape": None,
     }
     with contextlib.suppress(KeyError, TypeError, ValueError, zlib.error):
-        seen = unpack_array(part["observation"])
-        found |= dict(zip(("observation", "observationDtype", "observationShape"), seen, strict=True))
+        array = unpack_array(part["observation"])
+        found |= dict(zip(("observation", "observationDtype", "observationShape"), array, strict=True))
     return found
 
 
 def _part(row: Mapping[str, Any], player: str) -> dict[str, Any]:
-    """What a row says of one player."""
+    """The values of one player in a row, which are JSON in `other`."""
     players = json.loads(row.get("other") or "{}").get("players")
     part = players.get(player) if isinstance(players, dict) else None
     return part if isinstance(part, dict) else {}
@@ -137,6 +138,7 @@ def _header(file: Any) -> dict[str, Any]:
 
 
 def _highest(file: Any, column: str) -> int:
+    """The highest number in a column, from the file's statistics; -1 if there is none."""
     place = file.schema_arrow.get_field_index(column)
     highest = -1
     for number in range(file.metadata.num_row_groups if place >= 0 else 0):
@@ -147,19 +149,19 @@ def _highest(file: Any, column: str) -> int:
 
 
 def _leaf(file: Any, column: str) -> int:
-    """The place of a column among Parquet's leaves: one of lists has a path of several parts."""
+    """The position of a column among the leaf columns of Parquet: a column of lists is not a leaf itself."""
     return next(n for n in range(file.metadata.num_columns) if file.metadata.schema.column(n).path == column)
 
 
 def _observed(rows: list[dict[str, Any]], player: str) -> tuple[str, tuple[int, ...]]:
-    """The type and shape of the first observation: that of the columns, or that of another `player`."""
+    """The dtype and shape of the first observation: in the columns, or of another `player` than the first human."""
     for row in rows:
         if not player and row["observationDtype"] is not None:
             return row["observationDtype"], tuple(row["observationShape"])
-        seen = _part(row, player).get("observation") if player else None
-        if isinstance(seen, dict):
+        observation = _part(row, player).get("observation") if player else None
+        if isinstance(observation, dict):
             try:
-                _, dtype, shape = unpack_array(seen)
+                _, dtype, shape = unpack_array(observation)
             except (KeyError, TypeError, ValueError, zlib.error):
                 continue
             return dtype, tuple(shape)

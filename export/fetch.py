@@ -1,7 +1,7 @@
-"""From the source into the folder: what is new or changed (`listing.py`), a participant at a time, several at once.
+"""Fetches new and changed files (`listing.py`) from the source into the folder, for several participants at once.
 
-A file appears under its name whole or not at all, and is written down only then: whatever cuts a run off, the next one
-goes on from there.
+A file appears under its name whole or not at all, and only then the state records it. So an interrupted run can be
+continued.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from export.keys import Item, KeyKind
 from export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
 from export.recording_columns import when
 from export.source import PARALLEL, FileGone, Source, TooLarge
-from export.state import ExportedParticipant, ExportState, File, Kept
+from export.state import ExportedFile, ExportedParticipant, ExportState, SourceFile
 from protocol import session as sessions
 from protocol.session import is_session_id
 
-MAX_WAITING = 4 * PARALLEL  # participants listed and not yet written down
-COMMIT_EVERY = 2  # seconds: as much work may have to be done again after a power cut
-LARGEST_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step takes answers of 256 KB
+MAX_WAITING = 4 * PARALLEL  # participants and sessions whose files are being fetched
+COMMIT_EVERY = 2  # seconds; after a power cut, the work of these seconds may have to be repeated
+MAX_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step accepts answers of 256 KB
 
 
 @dataclass
 class Work:
-    """What one worker is to fetch for one participant or one session."""
+    """The files of one participant or one session that a worker fetches."""
 
     owner: ExportedParticipant | Members | None
     fetch: list[Item]
-    seen: list[str]
-    then: Unit | None = None  # what follows when the session's own document is here
+    unchanged: list[str]  # keys
+    then: Unit | None = None  # the session's other files, which follow when its document was read
 
     @property
     def user(self) -> str:
@@ -53,7 +53,8 @@ class Work:
 
 
 class Fetcher:
-    """Workers that fetch and convert. `progress` is told how many files are known of and how many are done."""
+    """Fetches and converts files with several workers. `progress` is called with the number of listed files, and the
+    number of those that are done. `damaged` are paths in the folder whose files have changed or are missing."""
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class Fetcher:
         self.incoming = folder / "private" / "incoming"
 
     def run(self) -> Tally:
-        """Bring the folder up to date. Whatever is raised, what was done so far is written down."""
+        """Bring the folder up to date, and return what was done. If this raises, the state has the files so far."""
         tally = Tally()
         self.incoming.mkdir(parents=True, exist_ok=True)
         for left in self.incoming.iterdir():
@@ -88,7 +89,7 @@ class Fetcher:
         return tally
 
     def _all(self, tally: Tally, commit: Callable[[], None]) -> None:
-        running: dict[Future[list[File]], Work] = {}
+        running: dict[Future[list[SourceFile]], Work] = {}
         committed = time.monotonic()
         pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
 
@@ -96,7 +97,7 @@ class Fetcher:
             if work.fetch:
                 running[pool.submit(self._fetch, work)] = work
             else:
-                self._keep(work, [])
+                self._save(work, [])
                 follow(work)
 
         def follow(work: Work) -> None:
@@ -110,7 +111,7 @@ class Fetcher:
         try:
             for unit in units(self._project, lines(self._source, self._project, self._state)):
                 while unit.is_session and any(isinstance(work.owner, ExportedParticipant) for work in running.values()):
-                    collect()  # who plays there has to be known first
+                    collect()  # the participants of a session must be known first
                 begin(self._work(unit, tally))
                 while len(running) >= MAX_WAITING:
                     collect()
@@ -123,44 +124,45 @@ class Fetcher:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, work in running.items():
                 if future.done() and not future.cancelled() and future.exception() is None:
-                    self._keep(work, future.result())
+                    self._save(work, future.result())
             raise
         pool.shutdown()
 
     def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
-        """What is to be done for a unit. Of a session first its own document; the rest when its members are `known`."""
+        """The work for a unit. For a session it is first the session's document, and then, when its members are
+        `known`, the other files."""
         owner: ExportedParticipant | Members | None = known
         then = None
         if unit.is_session and known is None:
-            about, rest = list[Item](), list[Item]()
-            for item in unit.items:
-                (about if item.kind is KeyKind.SESSION else rest).append(item)
-            owner, unit, then = Members(unit.user), Unit(unit.user, about), Unit(unit.user, rest)
+            document = [item for item in unit.items if item.kind is KeyKind.SESSION]
+            others = [item for item in unit.items if item.kind is not KeyKind.SESSION]
+            owner, unit, then = Members(unit.user), Unit(unit.user, document), Unit(unit.user, others)
         elif unit.user and known is None:
             owner = self._state.find_or_add(unit.user, self._wanted.apart)
         mark = known.mark if known else ""
-        fetch, seen = choose(self._state, unit, self._wanted, tally, self._damaged, mark=mark)
+        fetch, unchanged = choose(self._state, unit, self._wanted, tally, self._damaged, mark=mark)
         self._listed += len(unit.items)
-        self._done += len(seen)
+        self._done += len(unchanged)
         self._progress(self._listed, self._done)
-        return Work(owner, fetch, seen, then)
+        return Work(owner, fetch, unchanged, then)
 
-    def _collect(self, running: dict[Future[list[File]], Work]) -> list[Work]:
+    def _collect(self, running: dict[Future[list[SourceFile]], Work]) -> list[Work]:
         done, _ = wait(running, return_when=FIRST_COMPLETED)
         collected = []
         for future in done:
-            files = future.result()  # raises what the worker did not expect; the others are kept by `run`
+            files = future.result()  # may raise; then `_all` saves the results of the other workers
             work = running.pop(future)
-            self._keep(work, files)
+            self._save(work, files)
             self._done += len(work.fetch)
             collected.append(work)
         self._progress(self._listed, self._done)
         return collected
 
-    def _keep(self, work: Work, files: list[File]) -> None:
+    def _save(self, work: Work, files: list[SourceFile]) -> None:
+        """Save the files in the state, and remove their earlier versions from the folder."""
         user = work.user
         before = self._state.files_of(user) if files else {}
-        self._state.keep(user, work.seen, files)
+        self._state.save(user, work.unchanged, files)
         for file in files:
             old = before.get(file.key)
             for path, now in ((old.path, file.made), (old.raw, file.raw)) if old else ():
@@ -169,21 +171,21 @@ class Fetcher:
 
     # -- in the workers
 
-    def _fetch(self, work: Work) -> list[File]:
+    def _fetch(self, work: Work) -> list[SourceFile]:
         made = []
         owner = work.owner
         for item in work.fetch:  # participant.json comes first
             mark = owner.mark if isinstance(owner, Members) else ""
-            file = File(item.listed.key, item.kind, version_of(item, mark), item.listed.size, step=item.step)
+            file = SourceFile(item.listed.key, item.kind, version_of(item, mark), item.listed.size, step=item.step)
             try:
                 if item.kind is KeyKind.FOREIGN or owner is None:
-                    file.problems.append(f"not one of ours: {item.why}")
+                    file.problems.append(f"no file of Hippodrome: {item.why}")
                 elif item.kind is KeyKind.RECORDING:
                     self._recording(item, owner, file)
                 else:
                     self._document(item, owner, file)
             except FileGone:
-                continue  # the next run sees what has become of it
+                continue  # the next run lists its new version, if there is one
             if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.PARTICIPANT:
                 owner = owner._replace(document=file.document or {})
             if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.MEMBERSHIP:
@@ -191,11 +193,11 @@ class Fetcher:
             made.append(file)
         return made
 
-    def _document(self, item: Item, owner: ExportedParticipant | Members, file: File) -> None:
+    def _document(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
         try:
-            body = self._source.read(item.listed.key, LARGEST_DOCUMENT)
+            body = self._source.read(item.listed.key, MAX_DOCUMENT)
         except TooLarge:
-            file.problems.append(f"it is larger than {LARGEST_DOCUMENT:,} bytes and was not read")
+            file.problems.append(f"it is larger than {MAX_DOCUMENT:,} bytes and was not read")
             return
         if self._wanted.raw:
             parts = item.listed.key.split("/")[3:]
@@ -211,21 +213,21 @@ class Fetcher:
         file.document = found
         file.problems += _doubts(item, found)
 
-    def _recording(self, item: Item, owner: ExportedParticipant | Members, file: File) -> None:
+    def _recording(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
         attempt = keys.attempt(self._project, item.user, item.server)
         place = str(attempt) if attempt is not None else f"other-{self._token(item.server)}"
         if isinstance(owner, ExportedParticipant):
-            whose, theirs, people = {"participant": owner.number}, scrub.identities(owner), None
+            column, identities, people = {"participant": owner.number}, scrub.identities(owner), None
         else:
-            whose, theirs, people = {"session": owner.session}, dict(owner.identities), owner.people
-        folder, names = _folder(owner), theirs | {item.server: place}
+            column, identities, people = {"session": owner.session}, dict(owner.identities), owner.people
+        folder, names = _folder(owner), identities | {item.server: place}
         label = item.server.rpartition("-")[0]
         hide = scrub.Scrub(names | ({label: "(server)"} if label else {})) if self._wanted.apart else scrub.nothing()
         packed, made = self._temporary(), self._temporary()
         try:
             self._source.fetch(item.listed, packed)
-            who = {**whose, "studyStep": item.step, "attempt": attempt}
-            converted = recording.convert(packed, made, who, hide, shown=not self._wanted.apart, people=people)
+            constants = {**column, "studyStep": item.step, "attempt": attempt}
+            converted = recording.convert(packed, made, constants, hide, shown=not self._wanted.apart, people=people)
             path = f"recordings/{folder}/{place}/{item.name}.parquet"
             file.made = self._move(made, path)
             if self._wanted.raw:
@@ -237,7 +239,7 @@ class Fetcher:
         file.episodes += [{**episode, "step": item.step, "attempt": attempt} for episode in converted.episodes]
 
     def _token(self, server: str) -> str:
-        """Stands for a server's name that says nothing to us; it may say something to others."""
+        """A token in the place of a server's name that Hippodrome has not made, and that may identify someone."""
         return hashlib.blake2b(server.encode(), key=self._salt, digest_size=5).hexdigest()
 
     @property
@@ -247,27 +249,28 @@ class Fetcher:
     def _temporary(self) -> Path:
         return self.incoming / f"{uuid.uuid4().hex}.part"
 
-    def _put(self, body: bytes, path: str) -> Kept:
+    def _put(self, body: bytes, path: str) -> ExportedFile:
         written = self._temporary()
         written.write_bytes(body)
         return self._move(written, path)
 
-    def _move(self, file: Path, path: str) -> Kept:
-        """Give a whole file its name."""
+    def _move(self, file: Path, path: str) -> ExportedFile:
+        """Move a finished file to its path in the folder."""
         size, digest = file.stat().st_size, sha256(file)
         target = self._folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(file, target)
-        return Kept(path, size, digest)
+        return ExportedFile(path, size, digest)
 
 
 def _folder(owner: ExportedParticipant | Members) -> str:
-    """The name of a participant's or a session's folder among ours."""
+    """The name of a participant's or a session's folder in the export folder."""
     return owner.folder if isinstance(owner, ExportedParticipant) else owner.session
 
 
 def forget_gone(state: ExportState, folder: Path) -> int:
-    """Remove here what is gone from the source, such as an erased participant. Return how many files that were."""
+    """Remove the files that the source does not have any more, such as those of an erased participant, and return how
+    many there were."""
     count = 0
     with state.in_transactions():
         for key, user, kind, step, path, raw in state.unseen():
@@ -281,7 +284,7 @@ def forget_gone(state: ExportState, folder: Path) -> int:
 
 
 def remove_empty(empty: Path, top: Path) -> None:
-    """Remove this folder and those above it that are empty then, up to `top`, which stays."""
+    """Remove this folder if it is empty, and then the empty folders above it, up to `top`, which stays."""
     with contextlib.suppress(OSError):  # not empty
         while empty != top:
             empty.rmdir()
@@ -289,13 +292,13 @@ def remove_empty(empty: Path, top: Path) -> None:
 
 
 def sha256(path: Path) -> str:
-    """The SHA-256 of a file, in hex."""
+    """Return the SHA-256 of a file, in hex digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
-    """What is not as `docs/data.md` says. The document is used as far as it goes."""
+    """The differences between a document and its description in `docs/data.md`. The export uses the valid parts."""
     doubts = []
     group = found.get("group")
     if group is not None and (not isinstance(group, int) or isinstance(group, bool)):
@@ -307,8 +310,8 @@ def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
             doubts.append("link is no object")
         return doubts
     if item.kind is KeyKind.MEMBERSHIP:
-        known = found.get("session")
-        return doubts if known is None or is_session_id(known) else [*doubts, "session is the id of none"]
+        session = found.get("session")
+        return doubts if session is None or is_session_id(session) else [*doubts, "session is no id of a session"]
     if item.kind is KeyKind.SESSION:
         try:
             sessions.parse(json.dumps(found).encode())
@@ -320,5 +323,5 @@ def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
     if when(found.get("answered")) is None:
         doubts.append("answered is no time")
     if found.get("step") != item.step:
-        doubts.append("step is another one than the file's name says")
+        doubts.append("step is not the one in the file's name")
     return doubts

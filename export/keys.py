@@ -1,6 +1,6 @@
-"""What lies under which key of a study's participants and sessions, as `docs/data.md` has it.
+"""Reads the keys of a study's participants and sessions (`docs/data.md`).
 
-Keys may be anything: only parts that fit are used.
+A key can be any text. Only its valid parts are used.
 """
 
 from __future__ import annotations
@@ -13,22 +13,24 @@ from hippodrome.model import ids
 from protocol.keys import NAME, SERVER_NAME, sessions_folder
 from protocol.session import is_session_id
 
-RESERVED = {"answered", "link", "page"}  # names that the tables use before a dot themselves
+RESERVED = {"answered", "link", "page"}  # the tables have own columns with these names before a dot
 _RECORDING = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64}?)-(?P<rest>(?:trial|episode-[0-9]{1,9})(?:-[0-9]{1,4})?)")
 _END = ".jsonl.gz"
 
 
 class KeyKind(StrEnum):
+    """The kind of the file with a key."""
+
     PARTICIPANT = "participant"
     ANSWER = "answer"
     RECORDING = "recording"
-    MEMBERSHIP = "membership"  # in which session a participant plays
-    SESSION = "session"  # who plays in it
-    FOREIGN = "foreign"  # nothing that Hippodrome writes there
+    MEMBERSHIP = "membership"  # names a participant's session
+    SESSION = "session"  # a session's document
+    FOREIGN = "foreign"  # a file that Hippodrome does not write
 
 
 class Listed(NamedTuple):
-    """One line of a listing: the key, its version (an ETag, or what stands for one) and its size in bytes."""
+    """A file in a listing: its key, its version (in a bucket the ETag) and its size in bytes."""
 
     key: str
     version: str
@@ -36,9 +38,9 @@ class Listed(NamedTuple):
 
 
 class Item(NamedTuple):
-    """A listed file, and what its key says. `server` and `name` are for recordings, `step` for them and answers.
+    """A listed file, and the parts of its key. Recordings have `server`, `name` and `step`; answers have `step`.
 
-    `user` is whose file it is: a participant's id, or a session's, which no participant can have.
+    `user` is the id of the file's participant or session. (No participant's id is a valid id of a session.)
     """
 
     kind: KeyKind
@@ -47,18 +49,18 @@ class Item(NamedTuple):
     step: str = ""
     server: str = ""
     name: str = ""
-    why: str = ""  # of a foreign file: what is wrong with it
+    why: str = ""  # says why the file is foreign
 
 
 def prefix(project: str) -> str:
-    """Where everything of a study's participants lies."""
+    """Return the prefix of the keys of all participants of a study."""
     return f"{project}/users/"
 
 
 def read(project: str, listed: Listed) -> Item:
-    """What a key stands for, below `prefix` or the sessions' folder.
+    """Read a key below `prefix` or the sessions' folder.
 
-    Only parts that fit are ever made part of a path of ours.
+    All parts of the result are valid, so they can be used in paths of the export folder.
     """
     if listed.key.startswith(sessions_folder(project)):
         return _read_session(project, listed)
@@ -110,6 +112,6 @@ def _recording(listed: Listed, user: str, server: str, name: str) -> Item | None
 
 
 def attempt(project: str, user: str, server: str) -> int | None:
-    """Which of the servers of a participant or a session this is; None for a name that is not of our making."""
+    """Return the attempt of the server with this name; None if it is no server of this participant or session."""
     parsed = ids.parse_server_name(server)
     return parsed[1] if parsed and parsed[0] == ids.server_label(project, user) else None

@@ -1,4 +1,4 @@
-"""What the source lists, by participant and session, and what of it is new or changed here."""
+"""Groups the listing of the source by participant and session, and finds the files that are new or changed."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from protocol.session import is_session_id
 
 
 class Wanted(NamedTuple):
-    """What a run is to bring."""
+    """The data that a run fetches."""
 
     recordings: bool = True
-    raw: bool = False
-    apart: bool = False
+    raw: bool = False  # also the files of the source, unchanged
+    apart: bool = False  # ids are kept apart, in `private/`
 
 
 class Unit(NamedTuple):
-    """All that the source has of one participant, or of a session; of the project itself where `user` is empty."""
+    """All files of one participant or one session in the source. `user` is "" for files of neither."""
 
     user: str
     items: list[Item]
@@ -37,10 +37,10 @@ class Unit(NamedTuple):
 
 
 class Members(NamedTuple):
-    """Who plays in a session. `people`: their numbers, by seat.
+    """The members of a session. `people` has their numbers by seat.
 
-    `identities`: texts that would show who they are, each with what to write instead. `mark` changes with all of this,
-    so that the session's recordings are converted again.
+    `identities` has the texts that identify them, each with its replacement. `mark` changes with all of this, so that
+    the session's recordings are converted again.
     """
 
     session: str
@@ -51,15 +51,15 @@ class Members(NamedTuple):
 
 @dataclass
 class Tally:
-    """What a run did, or would do."""
+    """What a run has done, or would do: numbers of participants, files and bytes."""
 
     participants: int = 0
     new: int = 0
     changed: int = 0
     unchanged: int = 0
-    gone: int = 0
-    bytes: int = 0
-    damaged: int = 0
+    gone: int = 0  # from the source
+    bytes: int = 0  # to fetch
+    damaged: int = 0  # files in the folder that have changed or are missing
 
     @property
     def to_fetch(self) -> int:
@@ -67,7 +67,7 @@ class Tally:
 
 
 def lines(source: Source, project: str, state: ExportState) -> Iterator[Listed]:
-    """Everything that participants have left, then what their sessions have, if there are any."""
+    """Yield the listing of all participants' files, then that of the sessions' files, if the study has sessions."""
     found = state.has_sessions()
     for line in source.list(keys.prefix(project)):
         found = found or _is_session(line.key)
@@ -77,22 +77,22 @@ def lines(source: Source, project: str, state: ExportState) -> Iterator[Listed]:
 
 
 def members(state: ExportState, session: str) -> Members:
-    """Who plays in a session, as far as it is known here by now."""
+    """Return the members of a session, as far as the state has its document and its participants."""
     version = next((known.version for key, known in state.files_of(session).items() if _is_session(key)), "")
     if not version:
         return Members(session)
     try:
-        seated = sessions.parse(json.dumps(state.session(session)).encode()).members
+        in_document = sessions.parse(json.dumps(state.session(session)).encode()).members
     except sessions.BadSession:
-        seated = ()
+        in_document = ()
     people: dict[int, str] = {}
     identities: dict[str, str] = {}
-    for member in seated:
+    for member in in_document:
         if participant := state.present(member.user_id):
             people[member.seat] = participant.number
             identities |= scrub.identities(participant)
-    told = json.dumps([version, sorted(people.items()), sorted(identities.items())])
-    mark = hashlib.blake2b(told.encode("utf-8", "replace"), digest_size=8).hexdigest()
+    facts = json.dumps([version, sorted(people.items()), sorted(identities.items())])
+    mark = hashlib.blake2b(facts.encode("utf-8", "replace"), digest_size=8).hexdigest()
     return Members(session, f"~{mark}", people, identities)
 
 
@@ -101,7 +101,7 @@ def _is_session(key: str) -> bool:
 
 
 def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
-    """The listing by participant and session: all lines of one, in any order, then all of the next."""
+    """Group the listing by participant and session. In `listed` all files of one must stand together."""
     user, items = "", list[Item]()
     for line in listed:
         item = keys.read(project, line)
@@ -117,12 +117,12 @@ def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
 def choose(
     state: ExportState, unit: Unit, wanted: Wanted, tally: Tally, damaged: frozenset[str], *, mark: str = ""
 ) -> tuple[list[Item], list[str]]:
-    """What of a unit has to be fetched, and the keys that may stay as they are. `damaged` are paths of ours.
+    """Return the files of a unit that have to be fetched, and the keys of those that have not. Counts them in `tally`.
 
-    `mark` is that of a session's members.
+    `damaged` are paths in the folder whose files have changed or are missing. `mark` is that of a session's members.
     """
     known = state.files_of(unit.user)
-    fetch, seen = [], []
+    fetch, unchanged = [], []
     everything = False
     for item in sorted(unit.items, key=lambda item: _ORDER.get(item.kind, len(_ORDER))):
         before = known.get(item.listed.key)
@@ -136,23 +136,23 @@ def choose(
         raw_missing = wanted.raw and item.kind is not KeyKind.FOREIGN and (before is None or before.raw is None)
         if skipped or (same and not raw_missing):
             tally.unchanged += 1
-            seen.append(item.listed.key)
+            unchanged.append(item.listed.key)
             continue
         tally.new, tally.changed = tally.new + (before is None), tally.changed + (before is not None)
         tally.bytes += item.listed.size if item.kind is not KeyKind.FOREIGN else 0
         fetch.append(item)
-        # With another participant.json a participant has other identities, which must leave all their files; with
-        # another document a session may have other members.
+        # A changed participant.json may have other identities, which must be replaced in all files of the participant.
+        # A changed document of a session may have other members.
         everything = everything or (item.kind in _NAMING and wanted.apart) or item.kind is KeyKind.SESSION
     tally.participants += bool(unit.user) and not unit.is_session
-    return fetch, seen
+    return fetch, unchanged
 
 
 _NAMING = (KeyKind.PARTICIPANT, KeyKind.MEMBERSHIP)
 _ORDER = {kind: order for order, kind in enumerate((*_NAMING, KeyKind.SESSION))}
-"""Documents of these kinds come first, in this order: what they say is needed to read the others."""
+"""Documents of these kinds come first, in this order: the other files are read with their content."""
 
 
 def version_of(item: Item, mark: str) -> str:
-    """The version of what is made of a file: of a recording it changes with the session's members too."""
+    """Return the version of the exported file: for a recording it also changes with the session's members."""
     return item.listed.version + (mark if item.kind is KeyKind.RECORDING else "")

@@ -1,4 +1,4 @@
-"""`manifest.json`: what is in the folder, with sizes and hashes, and whether it still is."""
+"""Writes `manifest.json`, the list of the folder's files with sizes and hashes, and compares the folder with it."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any
 
 from console.problem import Problem
 from export.fetch import sha256
-from export.state import Kept
+from export.state import ExportedFile
 
 NAME = "manifest.json"
 SCHEMA = 1
-_AT_ONCE = 256  # files
+_AT_ONCE = 256  # files that are compared in a batch
 
 
-def kept(folder: Path, path: Path) -> Kept:
-    """A file that lies in the folder, as the manifest lists it."""
-    return Kept(path.relative_to(folder).as_posix(), path.stat().st_size, sha256(path))
+def entry(folder: Path, path: Path) -> ExportedFile:
+    """Return the manifest's entry for a file in the folder."""
+    return ExportedFile(path.relative_to(folder).as_posix(), path.stat().st_size, sha256(path))
 
 
-def write(target: Path, about: Mapping[str, Any], files: Iterable[Kept]) -> None:
-    """Write the manifest, one line per file; `files` are in the order that they come in."""
+def write(target: Path, about: Mapping[str, Any], files: Iterable[ExportedFile]) -> None:
+    """Write the manifest `target`: the fields of `about`, then a line for each of the `files`, in their order."""
     part = target.with_name(f"{target.name}.part")
     with part.open("w", encoding="utf-8") as out:
         head = json.dumps({"schema": SCHEMA, **about}, indent=1, ensure_ascii=False)
@@ -39,10 +39,11 @@ def write(target: Path, about: Mapping[str, Any], files: Iterable[Kept]) -> None
 
 
 def read(folder: Path) -> dict[str, Any] | None:
-    """The folder's manifest; None if there is none. Raises `Problem` if it is damaged."""
+    """Return the folder's manifest, with ExportedFile in `files`; None if there is none. Raises `Problem` if it is
+    damaged."""
     try:
         found = json.loads((folder / NAME).read_text(encoding="utf-8"))
-        files = [Kept(str(line["path"]), int(line["bytes"]), str(line["sha256"])) for line in found["files"]]
+        files = [ExportedFile(str(line["path"]), int(line["bytes"]), str(line["sha256"])) for line in found["files"]]
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError):
@@ -52,10 +53,10 @@ def read(folder: Path) -> dict[str, Any] | None:
     return {**found, "files": files}
 
 
-def damaged(folder: Path, files: Iterable[Kept]) -> Iterator[tuple[str, str]]:
-    """Files that are not what they were when they were written: their paths, and what is wrong."""
+def damaged(folder: Path, files: Iterable[ExportedFile]) -> Iterator[tuple[str, str]]:
+    """Yield the path of each file that differs from its entry, and the difference, such as "is missing"."""
 
-    def look(file: Kept) -> str:
+    def compare(file: ExportedFile) -> str:
         path = folder / file.path
         try:
             if not path.is_file():
@@ -69,13 +70,13 @@ def damaged(folder: Path, files: Iterable[Kept]) -> Iterator[tuple[str, str]]:
     rest = iter(files)
     with ThreadPoolExecutor(4) as pool:
         while batch := [*islice(rest, _AT_ONCE)]:
-            for file, wrong in zip(batch, pool.map(look, batch), strict=True):
-                if wrong:
-                    yield file.path, wrong
+            for file, difference in zip(batch, pool.map(compare, batch), strict=True):
+                if difference:
+                    yield file.path, difference
 
 
-def unlisted(folder: Path, files: Iterable[Kept]) -> Iterator[str]:
-    """Files in the folder that the manifest does not know, but for `private/`."""
+def unlisted(folder: Path, files: Iterable[ExportedFile]) -> Iterator[str]:
+    """Yield the paths of the files in the folder that are not in `files`, without those in `private/`."""
     known = {file.path for file in files} | {NAME}
     for top, folders, names in os.walk(folder):
         if Path(top) == folder and "private" in folders:

@@ -1,7 +1,7 @@
-"""What the pages of a study say of their fields: in which order they stand, which send numbers, and which send lists.
+"""Reads the fields in the pages of a study: their order, and which of them send numbers or lists.
 
-So a column has the same place and the same type whatever was sent so far: `2.50` in a field for numbers is a number,
-and one ticked box of several is a list.
+So a column has the same place and type whatever the participants have sent so far: `2.50` in a field for numbers is a
+number, and one ticked box of several is a list.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from export.source import FileGone, Source, TooLarge
 from hippodrome.model.project import Project
 from hippodrome.participants.page_parser import PageParser
 
-_MOST = 1024 * 1024  # bytes of a page, as in docs/config.md
+_MAX_PAGE = 1024 * 1024  # bytes, as in docs/config.md
 
 
 class FieldKind(StrEnum):
-    """What a field sends, as far as its page tells."""
+    """The kind of the values that a field sends, by its page."""
 
     NUMBER = "number"
     LIST = "list"
-    TEXT = "text"  # or whatever else
+    TEXT = "text"  # and all other kinds
 
 
 def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str], FieldKind]:
-    """By step and name, the fields of the pages that are there, in the order of the pages.
+    """Return the kinds of the fields in the study's pages, by step and name, in the order of the pages.
 
-    A field that is not of one kind on all pages of its step is one of texts.
+    A field whose kind differs between the pages of its step (those of groups) has the kind TEXT. Pages that cannot be
+    read are left out.
     """
     found: dict[tuple[str, str], set[FieldKind]] = {}
     if project is None:
@@ -43,7 +44,7 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
 
 
 def fields_of(page: str) -> Mapping[str, FieldKind]:
-    """The fields of one page. Jinja stays as it is: what it makes of a field is not known here."""
+    """Return the kinds of the fields of one page, by name, in the order of the page. Jinja is not rendered."""
     reader = _Reader()
     reader.feed(page)
     reader.close()
@@ -52,32 +53,36 @@ def fields_of(page: str) -> Mapping[str, FieldKind]:
 
 def _page(source: Source, key: str) -> str:
     try:
-        return source.read(key, _MOST).decode("utf-8", "replace")
-    except (FileGone, TooLarge, ClientError):  # the types of columns then follow from what was sent
+        return source.read(key, _MAX_PAGE).decode("utf-8", "replace")
+    except (FileGone, TooLarge, ClientError):  # the types of columns then follow from the answers
         return ""
 
 
 class _Reader(PageParser):
-    """Counts, by name, the kinds of a page's fields."""
+    """Counts the kinds of a page's fields, by name."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._seen: dict[str, Counter[str]] = {}
+        self._counts: dict[str, Counter[str]] = {}
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in reversed(attrs)}  # of equal attributes the first counts
-        kind = {"input": given.get("type", "").strip().lower(), "select": f"select {'multiple' in given}"}.get(tag, tag)
-        if tag in ("input", "select", "textarea", "button") and given.get("name"):
-            self._seen.setdefault(given["name"], Counter())[kind] += 1
+        attributes = {name: value or "" for name, value in reversed(attrs)}  # of equal attributes the first counts
+        kind = tag
+        if tag == "input":
+            kind = attributes.get("type", "").strip().lower()
+        elif tag == "select" and "multiple" in attributes:
+            kind = "select multiple"
+        if tag in ("input", "select", "textarea", "button") and attributes.get("name"):
+            self._counts.setdefault(attributes["name"], Counter())[kind] += 1
 
     def kinds(self) -> Iterator[tuple[str, FieldKind]]:
-        for name, seen in self._seen.items():
-            match [*seen.items()]:
+        for name, counts in self._counts.items():
+            match [*counts.items()]:
                 case [("number" | "range", 1)]:
                     yield name, FieldKind.NUMBER
                 case [("checkbox", count)] if count > 1:
                     yield name, FieldKind.LIST
-                case [("select True", 1)]:
+                case [("select multiple", 1)]:
                     yield name, FieldKind.LIST
                 case _:
                     yield name, FieldKind.TEXT

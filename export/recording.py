@@ -1,6 +1,7 @@
-"""From a recording (gzip of JSON lines, `docs/data.md`) to a Parquet file: one row per line, and nothing left out.
+"""Converts a recording (gzip of JSON lines, `docs/data.md`) into a Parquet file with one row per line.
 
-Memory stays bounded however long the recording is: it is read in pieces and written in row groups.
+No field of a line is lost. Memory is bounded however long the recording is: it is read in pieces, and written in row
+groups.
 """
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when something is converted
@@ -15,38 +16,41 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from export.recording_columns import MOST_PLAYERS, Rows, as_number, as_text, as_whole, players_of, seats_of
+from export.recording_columns import Rows, as_number, as_text, as_whole, players_of, seats_of
 from export.recording_lines import lines
 from export.scrub import Scrub
+from protocol.players import MAX_PLAYERS
 
 SCHEMA = 1
 
 
 @dataclass
 class Converted:
-    """What a recording held. `problems` are sentences; what came before them is in the file."""
+    """A summary of a converted recording."""
 
     frames: int = 0
     rows: int = 0
-    complete: bool = False
-    callbacks: int = 0
+    complete: bool = False  # its last line is the end of an episode
+    callbacks: int = 0  # lines that callbacks have recorded
     episodes: list[dict[str, Any]] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # sentences
 
 
 def convert(
     source: Path,
     target: Path,
-    who: Mapping[str, Any],
+    constants: Mapping[str, Any],
     scrub: Scrub,
     *,
     shown: bool = True,
     people: Mapping[int, str] | None = None,
 ) -> Converted:
-    """Write `target` from `source`. `who` fills participant, studyStep and attempt.
+    """Convert the recording `source` into the Parquet file `target`.
 
-    Without `shown`, the names of user and server stay out of the file's metadata. In a session, `people` are the
-    members' numbers by seat, and `who` says `session` instead of participant. Raises OSError of the target's disk.
+    `constants` has the columns with one value in all rows: participant, studyStep and attempt. In a session, `people`
+    has the members' numbers by seat, and `constants` has `session` instead of participant. `scrub` replaces identities.
+    Without `shown`, the file's metadata leave out user, server and session. Raises OSError if `source` cannot be read
+    or `target` cannot be written.
     """
     import pyarrow.parquet as pq
 
@@ -58,8 +62,8 @@ def convert(
     seats = None if people is None else seats_of(head)
     playing = {name: people.get(seat) for name, seat in (seats or {}).items()} if people is not None else {}
     if seats is not None:
-        who = {**who, **{f"participant.{name}": number for name, number in playing.items()}}
-    rows = Rows(who, scrub, players_of(head), None if seats is None else tuple(seats))
+        constants = {**constants, **{f"participant.{name}": number for name, number in playing.items()}}
+    rows = Rows(constants, scrub, players_of(head), None if seats is None else tuple(seats))
     with pq.ParquetWriter(target, rows.schema, compression="zstd") as writer:
         for line in itertools.chain(first, read):
             kind = line.get("kind")
@@ -79,36 +83,36 @@ def convert(
         if not header:
             done.problems.append("there is no header")
         hidden = set() if shown else {"user", "server", "session"}
-        about = {
+        metadata = {
             "schema": SCHEMA,
             "complete": done.complete,
             "header": {name: scrub.value(value) for name, value in header.items() if name not in hidden},
         }
-        writer.add_key_value_metadata({"hippodrome": json.dumps(about)})
+        writer.add_key_value_metadata({"hippodrome": json.dumps(metadata)})
     done.problems[:] = _summed(done.problems + rows.problems)
     if done.callbacks and done.episodes:
-        done.episodes[0]["callbacks"] = done.callbacks  # in all of the file
+        done.episodes[0]["callbacks"] = done.callbacks  # of the whole file
     for episode in done.episodes:
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
         episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}
         episode["players"] = _who_plays(header, scrub)
         if seats is not None:
-            episode |= {"session": who.get("session"), "people": playing}
+            episode |= {"session": constants.get("session"), "people": playing}
     return done
 
 
 def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
-    """Keep the books of episodes: one begins with `reset`, and ends with `end`, or not at all."""
+    """Count a line in its episode. An episode begins with `reset`, and ends with `end` or is cut off."""
     if kind == "callback":
         done.callbacks += 1
         return
-    if kind != "break":  # it follows an episode's end, and takes nothing from it
+    if kind != "break":  # a break after an episode's end does not make the recording incomplete
         done.complete = kind == "end"
     number = line.get("episode")
     now = done.episodes[-1] if done.episodes else None
     if kind == "reset":
         if now is not None and now["why"] is None and not now["frames"] and now["episode"] == as_whole(number):
-            done.episodes.pop()  # the reset before it failed: it was not played
+            done.episodes.pop()  # that reset failed, so its episode was not played
         seed = as_whole(line.get("seed"))
         done.episodes.append(_episode(line, as_whole(number), seed))
         return
@@ -144,35 +148,35 @@ def _episode(line: Mapping[str, Any], number: int | None, seed: int | None) -> d
 
 
 def _add_rewards(scores: dict[str, float], players: Any) -> None:
-    """Add what each player of a step got; what is no number counts nothing, as in `score`."""
+    """Add the reward of each player of a step. A value that is no number counts as 0, as in `score`."""
     if isinstance(players, Mapping):
-        for name, did in itertools.islice(players.items(), MOST_PLAYERS):
-            reward = as_number(did.get("reward")) if isinstance(did, Mapping) else None
+        for name, part in itertools.islice(players.items(), MAX_PLAYERS):
+            reward = as_number(part.get("reward")) if isinstance(part, Mapping) else None
             scores[str(name)] = scores.get(str(name), 0.0) + (reward or 0.0)
 
 
 def _count_policies(steps: dict[str, int], players: Any) -> None:
     """Count the steps at which a policy chose a player's action."""
     if isinstance(players, Mapping):
-        for name, did in itertools.islice(players.items(), MOST_PLAYERS):
-            if isinstance(did, Mapping) and did.get("by") == "policy":
+        for name, part in itertools.islice(players.items(), MAX_PLAYERS):
+            if isinstance(part, Mapping) and part.get("by") == "policy":
                 steps[str(name)] = steps.get(str(name), 0) + 1
 
 
 def _who_plays(header: Mapping[str, Any], scrub: Scrub) -> dict[str, str | None]:
-    """By player: `human`, or the policy or program as config.yml has it."""
+    """Who plays each player: `human`, or the policy or program as in config.yml."""
     players = header.get("players")
     if not isinstance(players, Mapping):
         return {}
-    found = {}
+    kinds = {}
     for name in players_of(header):
-        about = players.get(name)
-        said = about.get("policy", about.get("kind")) if isinstance(about, Mapping) else None
-        found[name] = scrub.value(said) if isinstance(said, str) else None
-    return found
+        player = players.get(name)
+        kind = player.get("policy", player.get("kind")) if isinstance(player, Mapping) else None
+        kinds[name] = scrub.text(kind) if isinstance(kind, str) else None
+    return kinds
 
 
 def _summed(problems: list[str]) -> list[str]:
-    """Each problem once, with how often."""
+    """Each problem once, with the number of times if there are several."""
     counted = {problem: problems.count(problem) for problem in dict.fromkeys(problems)}
     return [problem if times == 1 else f"{problem} ({times} times)" for problem, times in counted.items()]

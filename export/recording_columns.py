@@ -1,4 +1,4 @@
-"""The columns of a converted recording: their names and types, which players have some, and the rows that fill them."""
+"""The columns of a converted recording: their names and types, the columns of each player, and the rows."""
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when something is converted
 
@@ -15,21 +15,21 @@ from typing import Any
 
 from export.scrub import Scrub
 from export.table_files import json_text
+from protocol.players import MAX_PLAYERS
 
 GROUP_ROWS = 8_192  # rows written at once
-GROUP_BYTES = 16 * 1024 * 1024  # of observations, if that is less
-MOST_PLAYERS = 64  # as many as `trial.players` may name
-_BIGGEST = 256 * 1024 * 1024  # bytes in an observation
+GROUP_BYTES = 16 * 1024 * 1024  # of observations, after which fewer rows are written at once
+_MAX_OBSERVATION = 256 * 1024 * 1024  # bytes
 _DTYPE = re.compile(r"bool|(?:u?int|float)(8|16|32|64)")
 _NOT_STORED = {"kind", "v", "session", "trial", "observation"}
 
 
 @functools.cache
 def schema(players: tuple[str, ...] = (), humans: tuple[str, ...] | None = None) -> Any:
-    """The columns of every converted recording. Names are those of the recording's lines.
+    """Return the Arrow schema of a converted recording. The columns have the names of the fields in its lines.
 
-    If several `players` play, each has columns of its own besides: `action.NAME`, `by.NAME`, `reward.NAME`. That of a
-    session has `session`, and `participant.NAME` for each of the `humans`.
+    If there are several `players`, each has further columns: `action.NAME`, `by.NAME` and `reward.NAME`. The recording
+    of a session has `session`, and `participant.NAME` for each of the `humans`.
     """
     import pyarrow as pa
 
@@ -72,22 +72,22 @@ def schema(players: tuple[str, ...] = (), humans: tuple[str, ...] | None = None)
 
 
 def players_of(header: Mapping[str, Any]) -> tuple[str, ...]:
-    """The players that the head of a recording names; empty if there is one."""
+    """Return the players in the header of a recording; () if the environment has one player."""
     players = header.get("players")
-    return tuple(map(str, players))[:MOST_PLAYERS] if isinstance(players, Mapping) else ()
+    return tuple(map(str, players))[:MAX_PLAYERS] if isinstance(players, Mapping) else ()
 
 
 def humans_of(header: Mapping[str, Any]) -> tuple[str, ...]:
-    """The players of people, from the head of a recording; empty if one player plays."""
+    """Return the human players in the header of a recording; () if the environment has one player."""
     players = header.get("players")
-    said = ((name, players.get(name)) for name in players_of(header)) if isinstance(players, Mapping) else ()
-    return tuple(name for name, each in said if isinstance(each, Mapping) and each.get("kind") == "human")
+    named = ((name, players.get(name)) for name in players_of(header)) if isinstance(players, Mapping) else ()
+    return tuple(name for name, player in named if isinstance(player, Mapping) and player.get("kind") == "human")
 
 
 def seats_of(header: Mapping[str, Any]) -> dict[str, int]:
-    """The seats of a session's humans by player, from the head of its recording.
+    """Return the seats of a session's human players, from the header of its recording.
 
-    A player's `seat` stands there; in recordings without it, it is the player's place among the humans.
+    A player in an older header has no `seat`: then the seat is the player's position among the humans.
     """
     seats = (as_whole(header["players"][name].get("seat")) for name in humans_of(header))
     return {
@@ -96,17 +96,17 @@ def seats_of(header: Mapping[str, Any]) -> dict[str, int]:
     }
 
 
-# Values of the columns: None for what does not fit; that is kept in `other`
+# Values of the columns. None stands for a value that does not fit; the column `other` has such values
 
 
 def as_whole(value: Any) -> int | None:
-    """A whole number that fits its column."""
+    """Return a whole number that fits into 64 bits; None for any other value."""
     fits = isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
     return value if fits else None
 
 
 def as_number(value: Any) -> float | None:
-    """A number as a float."""
+    """Return a number as a float; None for any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -120,12 +120,12 @@ def _as_truth(value: Any) -> bool | None:
 
 
 def as_text(value: Any) -> str | None:
-    """A text."""
+    """Return a text; None for any other value."""
     return value if isinstance(value, str) else None
 
 
 def when(value: Any) -> datetime | None:
-    """A time as records have it: `2026-11-21T14:46:40.123456Z`."""
+    """Return the time in a text such as `2026-11-21T14:46:40.123456Z`; None for any other value."""
     try:
         found = datetime.fromisoformat(value)
     except (TypeError, ValueError):
@@ -159,7 +159,7 @@ _PLAYERS_COLUMNS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     "by": (lambda: _arrow("string"), as_text),
     "reward": (lambda: _arrow("float64"), as_number),
 }
-"""What each player's columns hold: Arrow's type, and the value or None if it does not fit."""
+"""The columns of each player: the Arrow type, and the function that returns a fitting value or None."""
 
 
 def _arrow(name: str) -> Any:
@@ -172,16 +172,16 @@ _TEXTS = ("kind", "actionName", "by", "info", "messages", "why", "error", "other
 
 
 class Rows:
-    """Rows that wait to be written: a list per column."""
+    """Rows that wait to be written: a list per column. `constants` has the columns with one value in all rows."""
 
     def __init__(
         self,
-        who: Mapping[str, Any],
+        constants: Mapping[str, Any],
         scrub: Scrub,
         players: tuple[str, ...] = (),
         humans: tuple[str, ...] | None = None,
     ) -> None:
-        self._who = who
+        self._constants = constants
         self._scrub = scrub
         self._players = players
         self.schema = schema(players, humans)
@@ -194,11 +194,11 @@ class Rows:
 
     @property
     def full(self) -> bool:
-        """Whether as many wait as are written at once."""
+        """Whether enough rows wait to be written at once."""
         return self.waiting >= GROUP_ROWS or self._bytes >= GROUP_BYTES
 
     def add(self, line: Mapping[str, Any]) -> None:
-        """A row from a line of the recording."""
+        """Add a row for a line of the recording."""
         columns = self._columns
         other = {name: value for name, value in line.items() if name not in _TYPED and name not in _NOT_STORED}
         kind = line.get("kind")
@@ -212,17 +212,17 @@ class Rows:
             if value is not None and fitting is None:
                 other[name] = value
             columns[name].append(fitting)
-        kept, dtype, shape = self._observation(line, other)
-        columns["observation"].append(kept)
+        observation, dtype, shape = self._observation(line, other)
+        columns["observation"].append(observation)
         columns["observationDtype"].append(dtype)
         columns["observationShape"].append(shape)
         columns["other"].append(json_text(other) if other else None)
         self._add_players(line.get("players"))
-        self._bytes += len(kept or b"")
+        self._bytes += len(observation or b"")
         self.waiting += 1
 
     def _add_players(self, parts: Any) -> None:
-        """What each player did and got, if several play. All else of them is in `other`."""
+        """Add the values of each player, if there are several. `other` has the players' further fields."""
         for player in self._players:
             part = parts.get(player) if isinstance(parts, Mapping) else None
             for name, (_, fit) in _PLAYERS_COLUMNS.items():
@@ -232,7 +232,7 @@ class Rows:
     def _observation(
         self, line: Mapping[str, Any], other: dict[str, Any]
     ) -> tuple[bytes | None, str | None, list[int] | None]:
-        """An array by itself is kept as its bytes; anything else stays as it was recorded, in `other`."""
+        """The bytes, dtype and shape of an observation that is an array. Any other observation goes into `other`."""
         value = line.get("observation")
         if value is None:
             return None, None, None
@@ -243,14 +243,14 @@ class Rows:
             return None, None, None
 
     def table(self) -> Any:
-        """The waiting rows; none wait afterwards."""
+        """Return the waiting rows as an Arrow table. No rows wait afterwards."""
         import pyarrow as pa
 
         columns = self._columns
         for name in (*_TEXTS, *(f"by.{player}" for player in self._players)):
             columns[name] = [None if text is None else self._scrub.text(text) for text in columns[name]]
-        for name in ("participant", *self._who):
-            columns[name] = [self._who.get(name)] * self.waiting
+        for name in ("participant", *self._constants):
+            columns[name] = [self._constants.get(name)] * self.waiting
         made = pa.table([pa.array(columns[f.name], f.type) for f in self.schema], schema=self.schema)
         self._columns = {name: [] for name in columns}
         self.written += self.waiting
@@ -258,17 +258,18 @@ class Rows:
         return made
 
 
-def unpack_array(kept: Any) -> tuple[bytes, str, list[int]]:
-    """The bytes (C order), dtype and shape of a recorded array. Raises KeyError, TypeError, ValueError, zlib.error."""
-    dtype, shape = kept["dtype"], [int(side) for side in kept["shape"]]
+def unpack_array(recorded: Any) -> tuple[bytes, str, list[int]]:
+    """Return the bytes (C order), dtype and shape of a recorded array. Raises KeyError, TypeError, ValueError or
+    zlib.error for any other value."""
+    dtype, shape = recorded["dtype"], [int(side) for side in recorded["shape"]]
     found = _DTYPE.fullmatch(dtype)
     if not found or dtype == "float8" or any(side < 0 or side >= 2**31 for side in shape):
         raise ValueError("no array")
     size = math.prod(shape) * (int(found[1] or 8) // 8)
-    if size > _BIGGEST:
+    if size > _MAX_OBSERVATION:
         raise ValueError("too large")
     unpack = zlib.decompressobj()
-    data = unpack.decompress(base64.b64decode(kept["zlib"], validate=True), size + 1)
+    data = unpack.decompress(base64.b64decode(recorded["zlib"], validate=True), size + 1)
     if len(data) != size:
         raise ValueError("another size")
     return data, dtype, shape

@@ -1,6 +1,6 @@
-"""The lines of a recording (gzip of JSON lines, `docs/data.md`).
+"""Reads the lines of a recording (gzip of JSON lines, `docs/data.md`).
 
-It is read in pieces, so that memory stays bounded however long it is.
+The recording is read in pieces, so that memory is bounded however long it is.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from typing import Any
 import msgspec
 
 _PIECE = 256 * 1024  # bytes
-_LONGEST = 64 * 1024 * 1024  # bytes in a line
+_MAX_LINE = 64 * 1024 * 1024  # bytes
 
 
 def lines(source: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
-    """The lines of a recording, up to where it can be read; what was in the way is added to `problems`."""
+    """Yield the lines of a recording, up to the place where it cannot be read. Adds a sentence to `problems` for each
+    line that is left out, and for a recording that cannot be read to its end."""
     for text in texts(source, problems):
         line = parsed(text)
         if line is not None:
@@ -28,15 +29,15 @@ def lines(source: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 
 def texts(source: Path, problems: list[str]) -> Iterator[bytes]:
-    """The same lines as they are written, without their ends."""
-    begun: list[bytes] = []  # of a line whose end has not come yet
+    """Yield the same lines as bytes, without their line ends. Adds to `problems` as `lines` does."""
+    begun: list[bytes] = []  # the parts of a line whose end was not read yet
     length = 0
     for piece in _unpacked(source, problems):
         first, *whole = piece.split(b"\n")
         begun.append(first)
         length += len(first)
-        if length > _LONGEST:
-            problems.append("a line is too long to be one; nothing behind it was read")
+        if length > _MAX_LINE:
+            problems.append("a line is too long; it and the lines after it were not read")
             return
         if not whole:
             continue
@@ -59,11 +60,11 @@ def _unpacked(source: Path, problems: list[str]) -> Iterator[bytes]:
                 try:
                     piece = unpack.decompress(packed, 4 * _PIECE)
                 except zlib.error:
-                    problems.append("the file is damaged: what comes before that place is kept")
+                    problems.append("the file is damaged: only the lines before the damage are kept")
                     return
                 yield piece
                 packed = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
-        while begun and not unpack.eof:  # what a full output buffer has held back
+        while begun and not unpack.eof:  # the rest, which did not fit into the last piece
             piece = unpack.decompress(b"", 4 * _PIECE)
             if not piece:
                 break
@@ -75,12 +76,12 @@ def _unpacked(source: Path, problems: list[str]) -> Iterator[bytes]:
 
 
 def parsed(text: bytes) -> dict[str, Any] | None:
-    """The JSON object in a line; None if the line holds no JSON object."""
+    """Return the JSON object in a line; None if there is none."""
     line: Any
     try:
         line = msgspec.json.decode(text)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-        try:  # json takes NaN and lone surrogates, which msgspec refuses
+        try:  # json accepts NaN and unpaired surrogates, which msgspec refuses
             line = json.loads(text)
         except (ValueError, RecursionError):
             return None

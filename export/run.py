@@ -1,15 +1,16 @@
-"""One run of `data`: fetch, forget, write the tables and datasets, write the manifest."""
+"""A run of `make data`: fetches files, removes those that are gone, and writes tables, datasets and the manifest."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import errno
+import itertools
 import os
 import secrets
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,34 +26,34 @@ from export.fetch import Fetcher
 from export.listing import Tally, Wanted
 from export.page_fields import read_fields
 from export.source import FileGone, Source, TooLarge
-from export.state import ExportState, Kept
+from export.state import ExportedFile, ExportState
 from hippodrome.model.project import MASTER_LIST, Project, read_list
 
 PRIVATE = "private"
 _STATE = f"{PRIVATE}/state.sqlite"
-_MASTER_LIST_MOST = 64 * 1024 * 1024  # bytes
+_MAX_MASTER_LIST = 64 * 1024 * 1024  # bytes
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the command was asked for."""
+    """The options of the command."""
 
     formats: frozenset[str] = frozenset({"csv", "parquet"})
-    apart: bool = False
-    raw: bool = False
-    long: bool = False
-    spreadsheet: bool = False
+    apart: bool = False  # ids only in `private/`, and numbers everywhere else
+    raw: bool = False  # also the files of the source, unchanged
+    long: bool = False  # also answers-long, with a row per field
+    spreadsheet: bool = False  # CSV for spreadsheets (`table_files.Style`)
 
     @property
     def wanted(self) -> Wanted:
-        """Recordings are only fetched for a format that can hold them."""
+        """The data to fetch: recordings only if a format needs them."""
         return Wanted(bool(self.formats & {"parquet", "minari"}), self.raw, self.apart)
 
 
 def find_project(source: Source, project_id: str) -> Project | None:
-    """The study as it is registered: its steps and their order. None if that is not known here."""
+    """Return the registered study, which has the order of its steps; None if it cannot be read, or is not there."""
     try:
-        listed = read_list(source.read(MASTER_LIST, _MASTER_LIST_MOST))
+        listed = read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST))
     except FileGone:
         return None
     except (TooLarge, ValueError, RecursionError):
@@ -65,12 +66,12 @@ def find_project(source: Source, project_id: str) -> Project | None:
 
 
 def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:
-    """What a run would do. Changes nothing."""
+    """Return what a run would do. Changes nothing. Raises `Problem`."""
     with _checked(folder, source, project_id, options) as (state, damaged):
         tally, known = Tally(damaged=len(damaged)), 0
         for unit in listing.units(project_id, listing.lines(source, project_id, state)):
-            there = state.files_of(unit.user)
-            known += sum(item.listed.key in there for item in unit.items)
+            before = state.files_of(unit.user)
+            known += sum(item.listed.key in before for item in unit.items)
             mark = listing.members(state, unit.user).mark if unit.is_session else ""
             listing.choose(state, unit, options.wanted, tally, damaged, mark=mark)
         tally.gone = state.file_count() - known
@@ -81,6 +82,7 @@ def look(source: Source, project_id: str, folder: Path, options: Options) -> Tal
 def _checked(
     folder: Path, source: Source, project_id: str, options: Options
 ) -> Iterator[tuple[ExportState, frozenset[str]]]:
+    """The folder's state, which cannot be changed, and the paths of damaged files."""
     _refuse_foreign(folder)
     try:
         state = ExportState.read_only(folder / _STATE)
@@ -96,9 +98,9 @@ def _checked(
 
 
 def run(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
-    """Bring the folder up to date with the source; what is in it then. Raises `Problem`.
+    """Bring the folder up to date with the source, and return its manifest with a summary of the run. Raises `Problem`.
 
-    Answers are personal data: what is written can be read by its owner alone.
+    Answers are personal data, so only the files' owner can read them.
     """
     mask = os.umask(0o077)
     try:
@@ -146,19 +148,19 @@ def _run(
     if not salt.exists():
         salt.write_bytes(secrets.token_bytes(32))
     damaged = _damaged(folder, state)
-    had = state.file_count()
-    with _bar("Fetching") as told:
+    files_before = state.file_count()
+    with _bar("Fetching") as progress:
         tally = Fetcher(
             project_id,
             source=source,
             state=state,
             folder=folder,
             wanted=options.wanted,
-            progress=told,
+            progress=progress,
             damaged=damaged,
         ).run()
     tally.damaged = len(damaged)
-    if had and not tally.participants:
+    if files_before and not tally.participants:
         raise Problem(
             f"There are no participants of {project_id} in the {source.where}, and this folder holds theirs.",
             "If that is right, delete the folder. If not, look at --project, --stack and --region.",
@@ -166,7 +168,7 @@ def _run(
     tally.gone = fetch.forget_gone(state, folder)
     style = table_files.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
     written: list[Path] = []
-    with _bar("Writing tables") as told:
+    with _bar("Writing tables") as progress:
         answers = StudyAnswers(state, project, options.apart, read_fields(source, project))
         either = style if style.csv or style.parquet else table_files.Style(parquet=False)
         columns = answers.columns
@@ -177,23 +179,23 @@ def _run(
         if options.wanted.recordings:
             players, shared = tables.players(state), tables.in_sessions(state)
             rows = tables.episodes(state, players, shared)
-            written += table_files.write(folder / "episodes", tables.of_episodes(players, shared), rows, either)
+            written += table_files.write(folder / "episodes", tables.episode_columns(players, shared), rows, either)
             if any(found.get("callbacks") for _, _, found in state.episodes()):
                 lines = tables.callbacks(state, folder, shared)
-                written += table_files.write(folder / "callbacks", tables.of_callbacks(shared), lines, either)
+                written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, either)
             if shared:
-                seen = tables.presence(state, folder)
-                written += table_files.write(folder / "presence", tables.PRESENCE, seen, either)
+                rows = tables.presence(state, folder)
+                written += table_files.write(folder / "presence", tables.PRESENCE, rows, either)
         only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
         written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)
-        private = [manifest.kept(folder, salt)]
+        private = [manifest.entry(folder, salt)]
         if options.apart:
-            who, rows = tables.identities(state, answers.links)
-            (made,) = table_files.write(folder / PRIVATE / "identities", who, rows, only_csv)
-            made.chmod(0o600)
-            private.append(manifest.kept(folder, made))
-        told(1, 1)
+            identity_columns, rows = tables.identities(state, answers.links)
+            (path,) = table_files.write(folder / PRIVATE / "identities", identity_columns, rows, only_csv)
+            path.chmod(0o600)
+            private.append(manifest.entry(folder, path))
+        progress(1, 1)
     datasets = _datasets(folder, state, project_id, options)
     _remove_stale(folder, written)
 
@@ -210,19 +212,15 @@ def _run(
         "moved": [moved._asdict() for moved in answers.moved],
         "minari": datasets,
     }
-    shown = [*(manifest.kept(folder, path) for path in written), *_tree(folder, "minari")]
-    manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.kept_raw()])
-    manifest.write(folder / manifest.NAME, about, _chain(shown, state))
+    made_now = [*(manifest.entry(folder, path) for path in written), *_tree(folder, "minari")]
+    manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.raw_files()])
+    manifest.write(folder / manifest.NAME, about, itertools.chain(made_now, state.converted_files()))
     return {"folder": str(folder), **about, **{"run": asdict(tally)}}
 
 
-def _chain(shown: list[Kept], state: ExportState) -> Iterator[Kept]:
-    yield from shown
-    yield from state.kept()
-
-
 def _datasets(folder: Path, state: ExportState, project_id: str, options: Options) -> list[dict[str, Any]]:
-    """Minari datasets: made if asked for; thrown away where they no longer fit the recordings."""
+    """Make the Minari datasets if the options ask for them, and return their summaries. Datasets that no longer fit
+    the recordings are removed."""
     now, before = state.recordings_fingerprint(), state.fact("minari")
     if "minari" not in options.formats and before != now:
         shutil.rmtree(folder / "minari", ignore_errors=True)
@@ -231,15 +229,15 @@ def _datasets(folder: Path, state: ExportState, project_id: str, options: Option
         made: list[dict[str, Any]] = msgspec.json.decode(state.fact("datasets") or "[]")
         return made if state.fact("minari") == now else []
     state.set_fact("minari", "")
-    with _bar("Writing Minari datasets") as told:
-        made = datasets.build(folder, state, project_id, told)
+    with _bar("Writing Minari datasets") as progress:
+        made = datasets.build(folder, state, project_id, progress)
     state.set_fact("datasets", msgspec.json.encode(made).decode())
     state.set_fact("minari", now)
     return made
 
 
 def _sound_minari(folder: Path) -> bool:
-    """Whether the datasets are as the last manifest says."""
+    """Whether the datasets' files are those of the last manifest."""
     try:
         last = manifest.read(folder)
     except Problem:
@@ -249,30 +247,32 @@ def _sound_minari(folder: Path) -> bool:
 
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
-    """Tables of an earlier run that this one did not write would be out of date; half-written files are of no use."""
+    """Remove the tables of an earlier run that this run did not write, and half-written tables."""
     for name in ("answers", "answers-long", "episodes", "callbacks", "presence", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:
                 path.unlink()
 
 
-def _tree(folder: Path, name: str) -> Iterator[Kept]:
+def _tree(folder: Path, name: str) -> Iterator[ExportedFile]:
+    """All files below a folder in the export folder."""
     for path in sorted((folder / name).rglob("*")):
         if path.is_file():
-            yield manifest.kept(folder, path)
+            yield manifest.entry(folder, path)
 
 
 def check(folder: Path) -> list[str]:
-    """What is wrong with a folder: a sentence per file. Reads no source, and changes nothing. Raises `Problem`."""
+    """Return a sentence for each file that differs from the folder's manifest. Reads no source, and changes nothing.
+    Raises `Problem` without a manifest, or if it is damaged."""
     about = manifest.read(folder)
     if about is None:
         raise Problem(f"There is no {manifest.NAME} in {folder}.", "Name the folder that `data` has filled.")
-    wrong = [f"{path} {what}" for path, what in manifest.damaged(folder, about["files"])]
+    wrong = [f"{path} {difference}" for path, difference in manifest.damaged(folder, about["files"])]
     wrong += [f"{path} is not in the manifest" for path in manifest.unlisted(folder, about["files"])]
     private = folder / PRIVATE
     if (private / manifest.NAME).exists():
-        kept = [Kept(file["path"], file["bytes"], file["sha256"]) for file in _private_files(private)]
-        wrong += [f"{path} {what}" for path, what in manifest.damaged(folder, kept)]
+        files = [ExportedFile(file["path"], file["bytes"], file["sha256"]) for file in _private_files(private)]
+        wrong += [f"{path} {difference}" for path, difference in manifest.damaged(folder, files)]
     return wrong
 
 
@@ -288,18 +288,19 @@ def _private_files(private: Path) -> list[dict[str, Any]]:
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """A folder with other things in it is not ours to fill."""
+    """Raise `Problem` for a folder with other files, which is not an export folder."""
     if folder.exists() and not folder.is_dir():
         raise Problem(f"{folder} is a file.", "Name a folder, or none.")
     ours = (folder / manifest.NAME).exists() or (folder / PRIVATE).is_dir()
     if folder.is_dir() and not ours and any(folder.iterdir()):
-        raise Problem(f"{folder} holds other things already.", "Name an empty folder, or one that does not exist yet.")
+        raise Problem(f"{folder} has other files already.", "Name an empty folder, or one that does not exist yet.")
 
 
 def _same_study(
     state: ExportState, folder: Path, source: Source, project_id: str, options: Options, *, write: bool
 ) -> None:
-    """What must not change from run to run in one folder."""
+    """Raise `Problem` if an earlier run of this folder had another study, source or mode of identities. With `write`,
+    save them."""
     mode = "apart" if options.apart else "together"
     fixed = {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
     words = {
@@ -308,24 +309,25 @@ def _same_study(
         "source": "was filled from the {}",
         "place": "was filled from the {}",
     }
-    fresh = state.fact("project") is None
+    is_new = state.fact("project") is None
     for name, value in fixed.items():
         before = state.fact(name)
         if before is not None and before != value:
-            said = f"{before} of this machine" if before == "folder" else before
-            wish = "--aws " if source.where.startswith("bucket") else ""
+            other = f"{before} of this machine" if before == "folder" else before
+            option = "--aws " if source.where.startswith("bucket") else ""
             raise Problem(
-                f"{folder} {words[name].format(said)}.",
-                f'Name another folder, such as {folder}-2 (with make: ARGS="{wish}{folder}-2"), or rename this one.',
+                f"{folder} {words[name].format(other)}.",
+                f'Name another folder, such as {folder}-2 (with make: ARGS="{option}{folder}-2"), or rename this one.',
             )
         if before is None and write:
             state.set_fact(name, value)
-    if fresh and options.apart:
-        _numbers_of_before(state, folder, write)
+    if is_new and options.apart:
+        _restore_numbers(state, folder, write)
 
 
-def _numbers_of_before(state: ExportState, folder: Path, write: bool) -> None:
-    """The state is gone: the numbers that people had stand in identities.csv."""
+def _restore_numbers(state: ExportState, folder: Path, write: bool) -> None:
+    """Read the participants' numbers from identities.csv, in case the state was deleted. Raises `Problem` if the folder
+    has data and this file is missing."""
     path = folder / PRIVATE / "identities.csv"
     if not path.exists():
         if (folder / manifest.NAME).exists():
@@ -344,17 +346,18 @@ def _numbers_of_before(state: ExportState, folder: Path, write: bool) -> None:
 
 
 def _damaged(folder: Path, state: ExportState) -> frozenset[str]:
-    """Files of ours that have changed or are gone: their sources are fetched again."""
+    """The exported files that have changed or are missing. The run fetches their sources again."""
     if not state.file_count():
         return frozenset()
     with _bar("Checking what is here"):
-        found = {path for files in (state.kept(), state.kept_raw()) for path, _ in manifest.damaged(folder, files)}
-    return frozenset(found)
+        files = itertools.chain(state.converted_files(), state.raw_files())
+        return frozenset(path for path, _ in manifest.damaged(folder, files))
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """One run at a time in a folder; the lock goes with the process."""
+    """Hold the folder's lock, which the system releases when the process ends. Raises `Problem` if another run has
+    it."""
     import fcntl  # noqa: PLC0415 - not on every system
 
     with (folder / PRIVATE / "lock").open("w") as file:
@@ -379,23 +382,23 @@ _NO_RIGHT = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def _refused(folder: Path, error: OSError) -> Problem:
-    """What a file system has refused, and what to do about that very cause."""
-    told = error.strerror or str(error) or type(error).__name__
-    what = f"{told} ({error.filename})" if error.filename else told
+    """The problem for an error of the file system, with advice for its cause."""
+    reason = error.strerror or str(error) or type(error).__name__
+    reason = f"{reason} ({error.filename})" if error.filename else reason
     if error.errno in _NO_ROOM:
-        return Problem(f"A file cannot be written: {what}.", "Make room; the same command goes on from here.")
+        return Problem(f"A file cannot be written: {reason}.", "Make room; the same command goes on from here.")
     if error.errno in _NO_RIGHT:
         advice = f"See who may read and write {error.filename or folder}; the same command goes on from here."
-        return Problem(f"A file cannot be read or written: {what}.", advice)
+        return Problem(f"A file cannot be read or written: {reason}.", advice)
     return Problem(
-        f"The operating system has refused something with a file: {what}.",
+        f"The operating system has refused something with a file: {reason}.",
         "Run the command again: it goes on from here. If that does not help, HIPPODROME_DEBUG=1 shows where it fails.",
     )
 
 
 @contextlib.contextmanager
-def _bar(what: str) -> Iterator[Any]:
-    """A progress bar; what it yields is told how many there are, and how many are done."""
-    with screen.progress() as shown:
-        task = shown.add_task(what, total=None)
-        yield lambda total, done: shown.update(task, total=total, completed=done)
+def _bar(description: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar. Yields a function that updates it: call it with the total, and the number done."""
+    with screen.progress() as bars:
+        task = bars.add_task(description, total=None)
+        yield lambda total, done: bars.update(task, total=total, completed=done)

@@ -1,4 +1,4 @@
-"""Taking a participant's identities out of what is to be shared: out of texts, and out of JSON written as text."""
+"""Replaces a participant's identities in data that are shared: in texts, and in JSON."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import Any
 
 from export.state import ExportedParticipant
 
-SHORTEST = 6  # characters; a shorter id or value stands in too many texts by chance
+SHORTEST = 6  # characters; a shorter identity would be found in too many texts by chance
 _SURROGATES = re.compile("[\ud800-\udfff]")
 
 
 class Scrub:
-    """Replaces identities wherever they stand in a text. `found` counts how often."""
+    """Replaces identities at any place in a text, in upper and lower case. `found` counts the replacements."""
 
     def __init__(self, identities: Mapping[str, str]) -> None:
-        """From each identity to what stands in its place. Those shorter than `SHORTEST` are left where they are."""
+        """`identities` maps each identity to its replacement. Those shorter than SHORTEST are not replaced."""
         self.found = 0
-        self._instead: dict[str, str] = {}
-        for identity, instead in identities.items():
+        self._replacements: dict[str, str] = {}
+        for identity, replacement in identities.items():
             if len(identity) >= SHORTEST:
                 for form in (identity, json.dumps(identity)[1:-1], json.dumps(identity, ensure_ascii=False)[1:-1]):
-                    self._instead.setdefault(form, instead)
-                    self._instead.setdefault(form.lower(), instead)
-        longest_first = sorted(self._instead, key=len, reverse=True)
+                    self._replacements.setdefault(form, replacement)
+                    self._replacements.setdefault(form.lower(), replacement)
+        longest_first = sorted(self._replacements, key=len, reverse=True)
         self._pattern = re.compile("|".join(map(re.escape, longest_first)), re.IGNORECASE) if longest_first else None
 
     def text(self, text: str) -> str:
-        """The text without identities, and fit for UTF-8."""
+        """Return the text without identities, and without unpaired surrogates (`clean`)."""
         return clean(self._pattern.sub(self._replace, text) if self._pattern else text)
 
     def value(self, value: Any) -> Any:
-        """The same for every text in a JSON value, keys too."""
+        """Return a JSON value with all its texts and keys as by `text`."""
         if isinstance(value, str):
             return self.text(value)
         if isinstance(value, Mapping):
@@ -44,16 +44,17 @@ class Scrub:
 
     def _replace(self, found: re.Match[str]) -> str:
         self.found += 1
-        return self._instead.get(found[0]) or self._instead.get(found[0].lower(), "(id)")
+        return self._replacements.get(found[0]) or self._replacements.get(found[0].lower(), "(id)")
 
 
 def nothing() -> Scrub:
-    """One that takes nothing out."""
+    """Return a Scrub that replaces nothing."""
     return Scrub({})
 
 
 def identities(participant: ExportedParticipant) -> dict[str, str]:
-    """What gives a participant away, from `participant.json` and `session.json`, and what to write instead."""
+    """Return the texts that identify a participant, each with its replacement: the id, the values of the link, and the
+    completion codes in `participant.json` and `session.json`."""
     found = {value: f"({name})" for name, value in texts(participant.document.get("link")).items()}
     for document in (participant.document, participant.membership):
         if isinstance(code := document.get("completionCode"), str) and code:
@@ -62,18 +63,19 @@ def identities(participant: ExportedParticipant) -> dict[str, str]:
 
 
 def completion_code(participant: ExportedParticipant) -> str | None:
-    """The code that the participant was shown at the end: one without a partner has another than the usual one."""
+    """Return the completion code of the participant. The code of an unmatched participant, in `session.json`, comes
+    before that in `participant.json`."""
     codes = (document.get("completionCode") for document in (participant.membership, participant.document))
     return next((clean(code) for code in codes if isinstance(code, str) and code), None)
 
 
 def texts(link: Any) -> dict[str, str]:
-    """A link's values, all as texts; nothing for what is no object."""
+    """Return the values of a link as texts; {} if `link` is no object."""
     if not isinstance(link, Mapping):
         return {}
     return {str(name): value if isinstance(value, str) else json.dumps(value) for name, value in link.items()}
 
 
 def clean(text: str) -> str:
-    """Half characters, which UTF-8 cannot hold, as the replacement character."""
+    """Return the text with the replacement character for each unpaired surrogate, which UTF-8 cannot hold."""
     return text if text.isascii() else _SURROGATES.sub("\ufffd", text)

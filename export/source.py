@@ -1,4 +1,4 @@
-"""Where the data come from: an installation's bucket, or a folder that `make run` filled. Both have the same keys."""
+"""The source of data: an installation's bucket, or a folder that `make run` has filled. Both have the same keys."""
 
 from __future__ import annotations
 
@@ -22,42 +22,42 @@ from export.keys import Listed
 from hippodrome.aws import errors
 from hippodrome.aws.retry import retry_while_busy
 
-PARALLEL = 10  # requests at once: as many connections as botocore keeps for a client
+PARALLEL = 10  # requests at once: the number of connections in botocore's pool for a client
 _PIECE = 256 * 1024  # bytes
 _CUT_OFF = (ConnectionClosedError, IncompleteReadError, ReadTimeoutError, ResponseStreamingError)
 
 
 class FileGone(Exception):
-    """The file was there when it was listed, and is not any more, or is another one now."""
+    """The file was deleted or changed after it was listed."""
 
 
 class TooLarge(Exception):
-    """A document that is larger than any that Hippodrome writes."""
+    """A document is larger than the caller allows."""
 
 
 class Source(Protocol):
-    """Methods but `list` may be called from several threads at once."""
+    """A bucket or a folder. Several threads may call its methods at once, except `list`."""
 
     @property
     def where(self) -> str:
-        """What the manifest says: `bucket …` or `folder`."""
+        """The kind of the source, and the name of a bucket, for the manifest: `bucket …` or `folder`."""
 
     @property
     def place(self) -> str:
-        """What tells it from every other source: for a folder, its path."""
+        """A text that differs between all sources: for a folder, it has the path."""
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """Everything below a prefix, however much there is; all of one participant stand together."""
+        """Yield all files whose keys begin with `prefix`; those of one participant stand together."""
 
     def read(self, key: str, most: int) -> bytes:
-        """A small document. Raises `FileGone`, `TooLarge`."""
+        """Return a document. Raises FileGone, and TooLarge if it has more than `most` bytes."""
 
     def fetch(self, listed: Listed, to: Path) -> None:
-        """The very version that was listed, into a file. Raises `FileGone`."""
+        """Write the listed version of a file into the file `to`. Raises FileGone if it is not there any more."""
 
 
 class Bucket:
-    """An S3 bucket. botocore retries what is transient; a body that is cut off is asked for again here."""
+    """An S3 bucket. botocore repeats requests after transient errors; this class repeats them if a body is cut off."""
 
     def __init__(self, client: Any, name: str, owner: str) -> None:
         self._client = client
@@ -65,7 +65,6 @@ class Bucket:
         self.where = self.place = f"bucket {name}"
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """1,000 keys a request."""
         pages = self._client.get_paginator("list_objects_v2").paginate(Prefix=prefix, **self._place)
         for page in pages:
             for line in page.get("Contents", ()):
@@ -91,17 +90,18 @@ class Bucket:
 
         retry_while_busy(whole, _is_cut_off, time.sleep)
 
-    def _get(self, **what: str) -> Any:
+    def _get(self, **request: str) -> Any:
         try:
-            return self._client.get_object(**what, **self._place)
+            return self._client.get_object(**request, **self._place)
         except ClientError as error:
             if errors.code(error) in {"NoSuchKey", "PreconditionFailed", "404", "412"}:
-                raise FileGone(what["Key"]) from None
+                raise FileGone(request["Key"]) from None
             raise
 
 
 class Folder:
-    """A folder on this machine. A file's version is its time of change and its size; links are not followed."""
+    """A folder on this machine. A file's version is its modification time and its size. Symbolic links are not
+    followed. Raises `Problem` if there is no such folder."""
 
     where = "folder"
 
@@ -147,7 +147,7 @@ class Folder:
                 continue
             try:
                 facts = entry.stat(follow_symlinks=False)
-            except FileNotFoundError:  # a moment ago it was there
+            except FileNotFoundError:  # deleted after the scan
                 continue
             regular = stat.S_ISREG(facts.st_mode)
             name = entry.name if regular else f"{entry.name} (no regular file)"

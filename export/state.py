@@ -1,6 +1,7 @@
-"""What a folder of data holds already, in a SQLite file: a run goes on where another was cut off, in little memory.
+"""The state of an export folder, in a SQLite file: the files that earlier runs have fetched, and what they hold.
 
-It holds ids and answers: it lies in the folder's `private/`.
+So an interrupted run can be continued, and memory does not grow with the study. The file holds ids and answers, so it
+lies in the folder's `private/`.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ CREATE VIEW IF NOT EXISTS people AS
 CREATE TABLE IF NOT EXISTS episodes (
   key TEXT NOT NULL, place INTEGER NOT NULL, document TEXT NOT NULL, PRIMARY KEY (key, place)) WITHOUT ROWID;
 """
-_LETTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # those that are not mistaken for others
-_RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(1, 10))}
+_LETTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # characters that are not mistaken for others
+_DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(1, 10))}
 
 
-class Kept(NamedTuple):
-    """A file of ours: its path in the folder, its size in bytes, its SHA-256."""
+class ExportedFile(NamedTuple):
+    """A file in the export folder: its path in the folder, its size in bytes, its SHA-256."""
 
     path: str
     bytes: int
@@ -47,24 +48,24 @@ class Kept(NamedTuple):
 
 
 @dataclass
-class File:
-    """What became of one file of the source."""
+class SourceFile:
+    """A file of the source, and the result of fetching it."""
 
     key: str
     kind: str
     version: str
-    size: int
-    made: Kept | None = None
-    raw: Kept | None = None
+    size: int  # bytes
+    made: ExportedFile | None = None  # the converted recording
+    raw: ExportedFile | None = None  # the unchanged copy
     frames: int = 0
     problems: list[str] = field(default_factory=list)
-    document: Mapping[str, Any] | None = None  # of an answer or a participant
-    step: str = ""
+    document: Mapping[str, Any] | None = None  # of any kind but a recording
+    step: str = ""  # of an answer
     episodes: list[Mapping[str, Any]] = field(default_factory=list)
 
 
-class Known(NamedTuple):
-    """What the state says of a file."""
+class KnownFile(NamedTuple):
+    """A file of the source in the state: its version, and the paths of the converted file and of the raw one."""
 
     version: str
     path: str | None
@@ -72,9 +73,9 @@ class Known(NamedTuple):
 
 
 class ExportedParticipant(NamedTuple):
-    """A participant: the id, the number that stands for it, the folder's name, and participant.json.
+    """A participant: the id, the number that replaces it, the name of the folder, and participant.json.
 
-    `membership` says in which session they play (`session.json` of their folder); empty if in none.
+    `membership` is `session.json` of their folder, which names their session; {} if they have none.
     """
 
     user: str
@@ -84,24 +85,25 @@ class ExportedParticipant(NamedTuple):
     membership: Mapping[str, Any] = {}
 
 
-_OF_SESSIONS = ("membership", "session")
-"""Kinds of `session.json`: that of a participant's folder, and that of the session's. Both are kept in one table."""
+_SESSION_KINDS = ("membership", "session")
+"""The kinds of `session.json`: that in a participant's folder, and that in a session's. One table has both."""
 
 
 class ExportState:
-    """One connection; use it in one thread. Nothing is lost that was committed."""
+    """The state of an export folder. Use it in one thread only. Committed changes survive a crash."""
 
     def __init__(self, path: Path | None) -> None:
-        """Open or make it; None is an empty one in memory. Raises sqlite3.DatabaseError for another file."""
+        """Open or create the state; with None it is an empty one in memory. Raises sqlite3.DatabaseError if the file
+        is no state."""
         self._db = sqlite3.connect(path or ":memory:", isolation_level=None)
         self._db.execute("PRAGMA synchronous=NORMAL")
         self._db.executescript(_TABLES)
 
     @classmethod
     def read_only(cls, path: Path) -> ExportState:
-        """For a look: nothing can be written. An empty one if there is no such file.
+        """Return a state that cannot be changed; an empty one if there is no such file.
 
-        Opened like any other all the same: what a killed run left half-written must be taken back first.
+        SQLite opens the file for writing all the same, because it must roll back the last transaction of a killed run.
         """
         if not path.exists():
             return cls(None)
@@ -131,21 +133,22 @@ class ExportState:
         return _participant(row) if row else None
 
     def present(self, user: str) -> ExportedParticipant | None:
-        """The participant, if the source still has something of them."""
+        """Return the participant if the last run has found files of them in the source, otherwise None."""
         seen = self._db.execute("SELECT 1 FROM participants WHERE user=? AND seen=?", (user, self.run)).fetchone()
         return self.participant(user) if seen else None
 
     def session(self, session: str) -> Mapping[str, Any]:
-        """The document of a session; empty if it is not known."""
+        """Return the document of a session; {} if it is not known."""
         row = self._db.execute("SELECT document FROM sessions WHERE owner=?", (session,)).fetchone()
         return json.loads(row[0]) if row else {}
 
     def has_sessions(self) -> bool:
-        """Whether anything of sessions is known here."""
+        """Return whether the state has documents of sessions."""
         return self._db.execute("SELECT 1 FROM files WHERE kind IN ('session', 'membership')").fetchone() is not None
 
     def find_or_add(self, user: str, apart: bool, number: str = "") -> ExportedParticipant:
-        """The participant. A new one gets this number; else a random one if ids are kept `apart`, or their id."""
+        """Return the participant. A new one gets `number`, or if that is "", a random number with `apart`, otherwise
+        their id."""
         known = self.participant(user)
         if known:
             return known
@@ -157,7 +160,7 @@ class ExportState:
                     (user, number, self._free_folder(number)),
                 )
             except sqlite3.IntegrityError:
-                number = ""  # the same number twice: one in 20 million million
+                number = ""  # another participant has this number: for a random one, 1 in 20 million million
                 continue
             return ExportedParticipant(user, number, self._folder_of(user), {})
 
@@ -165,8 +168,9 @@ class ExportState:
         return str(self._db.execute("SELECT folder FROM participants WHERE user=?", (user,)).fetchone()[0])
 
     def _free_folder(self, number: str) -> str:
-        """Ann and ann are two people, but one folder on some machines; and some names mean devices on others."""
-        base = f"{number}~" if number.lower() in _RESERVED else number
+        """A name for the participant's folder. Names that differ only by case are one folder on some systems, and
+        others reserve some names for devices."""
+        base = f"{number}~" if number.lower() in _DEVICES else number
         name, count = base, 1
         while self._db.execute("SELECT 1 FROM participants WHERE folder=?", (name,)).fetchone():
             count += 1
@@ -174,7 +178,7 @@ class ExportState:
         return name
 
     def participants(self) -> Iterator[ExportedParticipant]:
-        """Everybody who was seen in the last run, in the order of their numbers."""
+        """Yield the participants whose files the last run has found, in the order of their numbers."""
         query = "SELECT user, number, folder, document, membership FROM people WHERE seen=? ORDER BY number"
         for row in self._db.execute(query, (self.run,)):
             yield _participant(row)
@@ -190,15 +194,15 @@ class ExportState:
         self.run += 1
         self.set_fact("run", str(self.run))
 
-    def files_of(self, user: str) -> dict[str, Known]:
+    def files_of(self, user: str) -> dict[str, KnownFile]:
         rows = self._db.execute("SELECT key, version, path, raw FROM files WHERE user=?", (user,))
-        return {key: Known(version, path, raw) for key, version, path, raw in rows}
+        return {key: KnownFile(version, path, raw) for key, version, path, raw in rows}
 
     @contextlib.contextmanager
     def in_transactions(self) -> Iterator[Callable[[], None]]:
-        """Write what follows in transactions. Call what this yields to commit one: the disk takes its time for each.
+        """Write all changes in the block in transactions. Yields a function that commits one and begins the next.
 
-        The last one is committed when the block is left, even by an error.
+        The last transaction is committed at the end of the block, even after an error. Each commit waits for the disk.
         """
         self._db.execute("BEGIN")
 
@@ -211,17 +215,17 @@ class ExportState:
         finally:
             self._db.execute("COMMIT")
 
-    def keep(self, user: str, seen: Iterable[str], made: Iterable[File]) -> None:
-        """Write down what one participant's files have become, and that they and those in `seen` are still there."""
+    def save(self, user: str, unchanged: Iterable[str], fetched: Iterable[SourceFile]) -> None:
+        """Save the fetched files of a participant or session, and that the source still has those in `unchanged`."""
         run = self.run
         if user:
             self._db.execute("UPDATE participants SET seen=? WHERE user=?", (run, user))
-        self._db.executemany("UPDATE files SET seen=? WHERE key=?", ((run, key) for key in seen))
-        for file in made:
-            self._keep_file(user, file, run)
+        self._db.executemany("UPDATE files SET seen=? WHERE key=?", ((run, key) for key in unchanged))
+        for file in fetched:
+            self._save_file(user, file, run)
 
-    def _keep_file(self, user: str, file: File, run: int) -> None:
-        made, raw = file.made or Kept("", 0, ""), file.raw or Kept("", 0, "")
+    def _save_file(self, user: str, file: SourceFile, run: int) -> None:
+        none = (None, None, None)
         self._db.execute(
             "INSERT OR REPLACE INTO files VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?)",
             (
@@ -230,8 +234,8 @@ class ExportState:
                 file.kind,
                 file.version,
                 file.size,
-                *(made if file.made else (None, None, None)),
-                *(raw if file.raw else (None, None, None)),
+                *(file.made or none),
+                *(file.raw or none),
                 file.frames,
                 json.dumps(file.problems),
                 run,
@@ -239,7 +243,7 @@ class ExportState:
         )
         if file.kind == "participant":
             self._db.execute("UPDATE participants SET document=? WHERE user=?", (_json(file.document), user))
-        if file.kind in _OF_SESSIONS:
+        if file.kind in _SESSION_KINDS:
             self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
             if file.document is not None:
                 self._db.execute("INSERT INTO sessions VALUES (?, ?)", (user, _json(file.document)))
@@ -257,43 +261,44 @@ class ExportState:
         )
 
     def unseen(self) -> Iterator[tuple[str, str, str, str, str | None, str | None]]:
-        """Files that the last run did not find in the source: key, user, kind, step, path, raw path."""
+        """Yield the files that the last run did not find in the source: key, user, kind, step, path, raw path."""
         rows = self._db.execute("SELECT key, user, kind, path, raw FROM files WHERE seen<>?", (self.run,)).fetchall()
         for key, user, kind, path, raw in rows:
             yield key, user, kind, key.rpartition("/")[2].removesuffix(".json"), path, raw
 
     def forget(self, key: str, user: str, kind: str, step: str) -> None:
-        """The file is gone from the source, and from here."""
+        """Remove a file that the source does not have any more from the state."""
         self._db.execute("DELETE FROM files WHERE key=?", (key,))
         self._db.execute("DELETE FROM episodes WHERE key=?", (key,))
         if kind == "answer":
             self._db.execute("DELETE FROM answers WHERE user=? AND step=?", (user, step))
         if kind == "participant":
             self._db.execute("UPDATE participants SET document=NULL WHERE user=?", (user,))
-        if kind in _OF_SESSIONS:
+        if kind in _SESSION_KINDS:
             self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
 
     def forget_participants(self) -> int:
-        """Those who were not seen in the last run: their numbers too. How many there were."""
+        """Remove the participants without files in the last run, with their numbers; return how many there were."""
         return self._db.execute("DELETE FROM participants WHERE seen<>?", (self.run,)).rowcount
 
     def file_count(self) -> int:
-        """How many files of the source are known here."""
+        """Return the number of files in the state."""
         return int(self._db.execute("SELECT count(*) FROM files").fetchone()[0])
 
-    # -- reading it all, in order, a row at a time
+    # -- reading all rows in order, one at a time
 
-    def kept(self) -> Iterator[Kept]:
-        """Everything made from a file of the source, with the hash it had."""
+    def converted_files(self) -> Iterator[ExportedFile]:
+        """Yield the converted recordings."""
         for row in self._db.execute("SELECT path, bytes, sha256 FROM files WHERE path IS NOT NULL ORDER BY path"):
-            yield Kept(*row)
+            yield ExportedFile(*row)
 
-    def kept_raw(self) -> Iterator[Kept]:
+    def raw_files(self) -> Iterator[ExportedFile]:
+        """Yield the unchanged copies of the source's files."""
         for row in self._db.execute("SELECT raw, raw_bytes, raw_sha256 FROM files WHERE raw IS NOT NULL ORDER BY raw"):
-            yield Kept(*row)
+            yield ExportedFile(*row)
 
     def answers(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
-        """Everybody in the order of their numbers, each with the documents of their answers by step."""
+        """Yield the participants in the order of their numbers, each with the documents of their answers by step."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, a.step, a.document FROM people p"
             " LEFT JOIN answers a ON a.user = p.user WHERE p.seen=? ORDER BY p.number, a.step",
@@ -312,9 +317,9 @@ class ExportState:
             yield participant, found
 
     def episodes(self) -> Iterator[tuple[ExportedParticipant | None, str, Mapping[str, Any]]]:
-        """Every episode with its participant and its file, in the order of numbers and files; first those of sessions.
+        """Yield each episode after its participant and its file: first those of sessions, then by number and file.
 
-        A session's episode has no participant here; it says `session` and, by player, the `people`'s numbers.
+        A session's episode has None for the participant. It has `session`, and in `people` the numbers by player.
         """
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, f.path, e.document FROM files f"
@@ -325,7 +330,7 @@ class ExportState:
             yield _participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
 
     def problems(self) -> Iterator[tuple[ExportedParticipant | None, str, str]]:
-        """Who, which file, what is wrong with it."""
+        """Yield the participant (None for a file of no participant), the key and the problem of each bad file."""
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, f.key, f.problems FROM files f"
             " LEFT JOIN people p ON p.user = f.user WHERE f.problems<>'[]' ORDER BY p.number, f.key"
@@ -335,6 +340,7 @@ class ExportState:
                 yield _participant(row[:5]) if row[0] else None, row[5], problem
 
     def counts(self) -> dict[str, int]:
+        """Return the counts for the manifest."""
         one = self._db.execute
         kinds = dict(one("SELECT kind, count(*) FROM files GROUP BY kind").fetchall())
         sessions = {"sessions": kinds["session"]} if "session" in kinds else {}
@@ -348,12 +354,12 @@ class ExportState:
         }
 
     def recordings_fingerprint(self) -> str:
-        """Another one whenever a recording is added, changed or gone."""
+        """Return a hash that changes whenever a recording is added, changed or removed."""
         import hashlib  # noqa: PLC0415 - only for this
 
         digest = hashlib.sha256()
-        for kept in self.kept():
-            digest.update(f"{kept.path}\0{kept.sha256}\n".encode())
+        for file in self.converted_files():
+            digest.update(f"{file.path}\0{file.sha256}\n".encode())
         return digest.hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Tables as files: CSV and Parquet, written a row at a time, and the values that their columns hold."""
+"""Writes tables as CSV and Parquet files, in batches of rows, and converts values to the types of their columns."""
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when a table is written
 
@@ -33,7 +33,8 @@ class Column(NamedTuple):
 
 @dataclass
 class Style:
-    """How tables are written. `spreadsheet`: cells that a spreadsheet would run as formulas get an apostrophe."""
+    """The formats of tables. With `spreadsheet`, an apostrophe stands before each cell that a spreadsheet would run as
+    a formula."""
 
     csv: bool = True
     parquet: bool = True
@@ -41,7 +42,7 @@ class Style:
 
 
 def types() -> dict[str, Any]:
-    """The Arrow types of columns."""
+    """Return the Arrow types of columns, by the names of types in `Column`."""
     import pyarrow as pa
 
     return {
@@ -55,24 +56,27 @@ def types() -> dict[str, Any]:
 
 
 def write(base: Path, columns: Sequence[Column], rows: Iterable[Sequence[Any]], style: Style) -> list[Path]:
-    """Write `base`.csv and `base`.parquet, whole or not at all. Values fit their columns; None is nothing."""
-    made = []
+    """Write `base`.csv and `base`.parquet, each whole or not at all, and return their paths.
+
+    Values must have the types of their columns (`fit`); None is an empty cell.
+    """
+    paths = []
     with contextlib.ExitStack() as stack:
         sheet = parquet = None
         if style.csv:
-            made.append(base.with_name(f"{base.name}.csv"))
-            file = stack.enter_context(_part(made[-1]).open("w", encoding="utf-8", newline=""))
+            paths.append(base.with_name(f"{base.name}.csv"))
+            file = stack.enter_context(_part(paths[-1]).open("w", encoding="utf-8", newline=""))
             if style.spreadsheet:
-                file.write("\ufeff")  # or Excel takes it for another encoding
+                file.write("\ufeff")  # without this mark Excel takes another encoding than UTF-8
             sheet = csv.writer(file)
             sheet.writerow([_cell(column.name, style.spreadsheet) for column in columns])
         if style.parquet:
             import pyarrow as pa
             import pyarrow.parquet as pq
 
-            made.append(base.with_name(f"{base.name}.parquet"))
+            paths.append(base.with_name(f"{base.name}.parquet"))
             schema = pa.schema([(column.name, types()[column.type]) for column in columns])
-            parquet = stack.enter_context(pq.ParquetWriter(_part(made[-1]), schema, compression="zstd"))
+            parquet = stack.enter_context(pq.ParquetWriter(_part(paths[-1]), schema, compression="zstd"))
         for batch in _batches(rows):
             if sheet:
                 sheet.writerows([_cell(value, style.spreadsheet) for value in row] for row in batch)
@@ -82,9 +86,9 @@ def write(base: Path, columns: Sequence[Column], rows: Iterable[Sequence[Any]], 
                     for place, column in enumerate(columns)
                 ]
                 parquet.write_table(pa.table(arrays, schema=schema))
-    for path in made:
+    for path in paths:
         os.replace(_part(path), path)
-    return made
+    return paths
 
 
 def _part(path: Path) -> Path:
@@ -103,7 +107,7 @@ def _batches(rows: Iterable[Sequence[Any]]) -> Iterator[list[Sequence[Any]]]:
 
 
 def _cell(value: Any, spreadsheet: bool) -> str:
-    """A value in CSV: a list joined, a time as in the records, nothing as an empty cell."""
+    """A value as text in CSV: a list is joined, a time is written as in documents, and None is an empty cell."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -118,7 +122,7 @@ def _cell(value: Any, spreadsheet: bool) -> str:
 
 
 def _typed(value: Any, kind: str) -> Any:
-    """A value as Parquet's column holds it: in a column of numbers, a text that a form has sent becomes its number."""
+    """A value for a column of Parquet: in a column of numbers, the text of a form becomes a number."""
     if not isinstance(value, str) or kind not in _FROM_TEXT:
         return value
     return _FROM_TEXT[kind](value) if value else None
@@ -128,7 +132,8 @@ _FROM_TEXT: Mapping[str, Callable[[str], Any]] = {"whole": int, "number": float}
 
 
 def fit(value: Any, kind: str) -> Any:
-    """A value as its column holds it; texts that are numbers stay as they were sent (`_typed`)."""
+    """Return a value for a column of this type. Texts that are numbers stay texts: in CSV they stand as they were sent,
+    and for Parquet `_typed` converts them."""
     if kind == "texts":
         return [clean(item) for item in (value if isinstance(value, list) else [value])]
     if kind == "text":
@@ -137,4 +142,5 @@ def fit(value: Any, kind: str) -> Any:
 
 
 def json_text(value: Any) -> str:
+    """Return a value as compact JSON, with all characters unescaped."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False)

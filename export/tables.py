@@ -1,6 +1,6 @@
-"""The tables besides the answers': episodes, callbacks, presence, identities and problems.
+"""Makes the tables of episodes, callbacks, presence, identities and problems. (`answers.py` makes those of answers.)
 
-Everything is read from the state a row at a time, so that memory does not grow with the study.
+All rows are read one at a time, so that memory does not grow with the study.
 """
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when a recording is read
@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from export import scrub
-from export.recording_columns import MOST_PLAYERS, as_number, when
+from export.recording_columns import as_number, when
 from export.scrub import clean, texts
 from export.state import ExportedParticipant, ExportState
 from export.table_files import BATCH, Column, fit
 from protocol.keys import sessions_folder
+from protocol.players import MAX_PLAYERS
 from protocol.session import is_session_id
 
 EPISODES = (
@@ -38,36 +39,36 @@ EPISODES = (
 )
 
 
-_OF_SESSIONS = (Column("session"), Column("player"))
+_SESSION_COLUMNS = (Column("session"), Column("player"))
 _BY_POLICY = Column("framesByPolicy", "whole")
-"""Of an episode of a session: the frames in which the substitute played in the participant's place."""
+"""In an episode of a session: the frames in which the substitute played in the participant's place."""
 
 
 def in_sessions(state: ExportState) -> bool:
-    """Whether there are episodes of sessions."""
+    """Return whether there are episodes of sessions."""
     return any("session" in found for _, _, found in state.episodes())
 
 
 def players(state: ExportState) -> tuple[str, ...]:
-    """The players of all episodes; none if no game has several players."""
+    """Return the players of all episodes, at most MAX_PLAYERS; () if no game has several players."""
     names = (name for _, _, found in state.episodes() for name in (*found.get("players", ()), *found.get("scores", ())))
-    return tuple(dict.fromkeys(names))[:MOST_PLAYERS]
+    return tuple(dict.fromkeys(names))[:MAX_PLAYERS]
 
 
-def of_episodes(players: Sequence[str], in_sessions: bool = False) -> list[Column]:
-    """The columns of `episodes`."""
-    who = (Column(f"player.{clean(name)}") for name in players)
+def episode_columns(players: Sequence[str], in_sessions: bool = False) -> list[Column]:
+    """Return the columns of `episodes`."""
+    kinds = (Column(f"player.{clean(name)}") for name in players)
     scores = (Column(f"score.{clean(name)}", "number") for name in players)
-    return [*EPISODES, *((*_OF_SESSIONS, _BY_POLICY) if in_sessions else ()), *who, *scores]
+    return [*EPISODES, *((*_SESSION_COLUMNS, _BY_POLICY) if in_sessions else ()), *kinds, *scores]
 
 
 def episodes(state: ExportState, players: Sequence[str], in_sessions: bool = False) -> Iterator[list[Any]]:
-    """One row per episode: its outcome, where its frames are, and of each player who played it and its score.
+    """Yield a row per episode: its outcome, the file with its frames, and who played each player with which score.
 
     An episode of a session has a row for each human player, with their own score.
     """
     for participant, path, found in state.episodes():
-        for number, player, score in _whose(participant, found):
+        for number, player, score in _humans(participant, found):
             yield [
                 number,
                 found["step"],
@@ -92,19 +93,20 @@ def _text(value: Any) -> str | None:
 
 
 def _in_session(found: Mapping[str, Any], player: str | None) -> list[Any]:
-    """Session, player, and the frames that the substitute played: unknown if an earlier version read the recording."""
+    """The session, the player, and the frames that the substitute played; None for the frames if an earlier version
+    has converted the recording."""
     if player is None:
         return [found.get("session"), None, None]
     steps = found.get("byPolicy")
     return [found.get("session"), clean(player), None if steps is None else steps.get(player, 0)]
 
 
-def _whose(
+def _humans(
     participant: ExportedParticipant | None, found: Mapping[str, Any]
 ) -> list[tuple[str | None, str | None, float | None]]:
-    """Whose an episode is: number, player and score. A session's is each human player's.
+    """The number, player and score of each human in an episode; the player is None if one participant played alone.
 
-    The number is missing if the participant was erased, or if no participant ever played this player.
+    The number is None if the participant was erased, or if no participant ever played this player.
     """
     people = found.get("people")
     if participant is not None or not people:
@@ -130,25 +132,25 @@ CALLBACKS = (
 )
 
 
-def of_callbacks(in_sessions: bool) -> list[Column]:
-    """The columns of `callbacks`."""
-    return [*CALLBACKS, *(_OF_SESSIONS if in_sessions else ())]
+def callback_columns(in_sessions: bool) -> list[Column]:
+    """Return the columns of `callbacks`."""
+    return [*CALLBACKS, *(_SESSION_COLUMNS if in_sessions else ())]
 
 
 def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> Iterator[list[Any]]:
-    """One row per line that a callback of the agent left. `folder` holds the converted recordings.
+    """Yield a row per line that a callback of the agent has recorded. `folder` holds the converted recordings.
 
-    In a session, a line has the participant whose player it names, if it names one.
+    In a session, the row's participant is the one whose player the line names, if it names one.
     """
     for participant, first, path, row in _lines(state, folder, "callbacks", ("callback",)):
-        more = _more(row)
-        player = more.get("player") if isinstance(more.get("player"), str) else None
+        other = _other_fields(row)
+        player = other.get("player") if isinstance(other.get("player"), str) else None
         number = participant.number if participant else first.get("people", {}).get(player)
         yield [
             number,
             first["step"],
             first["attempt"],
-            *_callback(row, more),
+            *_callback(row, other),
             path,
             *([first.get("session"), None if player is None else clean(player)] if in_sessions else ()),
         ]
@@ -171,13 +173,13 @@ PRESENCE = (
 
 
 def presence(state: ExportState, folder: Path) -> Iterator[list[Any]]:
-    """Who of a session came, left and was back, and each round trip: a row for each member whom a line names.
+    """Yield a row for each time that a member of a session came, left or was back, and for each round trip.
 
     `folder` holds the converted recordings. Round trips are in milliseconds.
     """
     for _, first, path, row in _lines(state, folder, "session", ("presence", "ping")):
-        more, people = _more(row), first.get("people", {})
-        for player, what, trip in _seen(more):
+        people = first.get("people", {})
+        for player, what, trip in _presence(_other_fields(row)):
             yield [
                 people.get(player),
                 first["session"],
@@ -194,9 +196,9 @@ def presence(state: ExportState, folder: Path) -> Iterator[list[Any]]:
             ]
 
 
-def _seen(more: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
-    """Of whom a line says what; of a round trip also how long it took."""
-    player, what, trips = more.get("player"), more.get("what"), more.get("roundTrip")
+def _presence(line: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
+    """For each player in a line: the player, the event, and the milliseconds if the event is a round trip."""
+    player, what, trips = line.get("player"), line.get("what"), line.get("roundTrip")
     if isinstance(player, str) and isinstance(what, str):
         yield player, clean(what), None
     elif isinstance(trips, Mapping):
@@ -206,41 +208,41 @@ def _seen(more: Mapping[str, Any]) -> Iterator[tuple[str, str, float | None]]:
 def _lines(
     state: ExportState, folder: Path, has: str, kinds: Sequence[str]
 ) -> Iterator[tuple[ExportedParticipant | None, Mapping[str, Any], str, Mapping[str, Any]]]:
-    """The lines of these kinds, of the recordings in one of whose episodes `has` stands.
+    """The lines of these kinds, from all recordings that have an episode with a value for `has`.
 
-    Whose the recording is, what is known of its first episode, its file, and the line.
+    Each comes with the recording's participant, its first episode, and its file.
     """
     import pyarrow.parquet as pq
 
-    wanted = ["kind", "trial", "episode", "step", "time", "error", "other"]
+    columns = ["kind", "trial", "episode", "step", "time", "error", "other"]
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         rows = list(several)
         if not any(found.get(has) for _, _, found in rows):
             continue
         participant, _, first = rows[0]
         with pq.ParquetFile(folder / path) as file:
-            for batch in file.iter_batches(batch_size=BATCH, columns=wanted):
+            for batch in file.iter_batches(batch_size=BATCH, columns=columns):
                 yield from ((participant, first, path, row) for row in batch.to_pylist() if row["kind"] in kinds)
 
 
-def _more(row: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What the recording's line has beside its common fields, which is JSON in `other`."""
+def _other_fields(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The fields of a recording's line that have no columns: `other` has them as JSON."""
     try:
-        more = json.loads(row["other"] or "{}")
-    except ValueError:  # no JSON any more, once an id was taken out
+        other = json.loads(row["other"] or "{}")
+    except ValueError:  # the replacement of an id has made it invalid
         return {"value": row["other"]}
-    return more if isinstance(more, dict) else {}
+    return other if isinstance(other, dict) else {}
 
 
-def _callback(row: Mapping[str, Any], more: Mapping[str, Any]) -> list[Any]:
-    """From `trial` to `skipped`."""
-    value, skipped = more.get("value"), more.get("skipped")
+def _callback(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[Any]:
+    """The values of the columns from `trial` to `skipped`."""
+    value, skipped = other.get("value"), other.get("skipped")
     return [
         None if row["trial"] is None else clean(row["trial"]),
         row["episode"],
         row["step"],
         row["time"],
-        *(clean(more[name]) if isinstance(more.get(name), str) else None for name in ("callback", "name")),
+        *(clean(other[name]) if isinstance(other.get(name), str) else None for name in ("callback", "name")),
         None if value is None else fit(value, "text"),
         None if row["error"] is None else clean(row["error"]),
         skipped if isinstance(skipped, int) else None,
@@ -248,7 +250,7 @@ def _callback(row: Mapping[str, Any], more: Mapping[str, Any]) -> list[Any]:
 
 
 def identities(state: ExportState, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
-    """The table of identities, which is kept apart."""
+    """Return the columns and rows of the table of identities, which is kept in `private/`."""
     columns = [Column("participant"), Column("userId"), Column("completionCode")]
     columns += [Column(f"link.{clean(name)}") for name in links]
 
@@ -269,7 +271,7 @@ PROBLEMS = (Column("participant"), Column("file"), Column("problem"))
 
 
 def problems(state: ExportState, project: str, apart: bool) -> Iterator[list[Any]]:
-    """What could not be read as it should be, with the file's key; without ids where they are apart."""
+    """Yield a row for each problem with a file of the source, with its key. With `apart` the key has no ids."""
     for participant, key, problem in state.problems():
         shown = key.removeprefix(f"{project}/users/")
         if apart and key.startswith(sessions_folder(project)):
@@ -281,7 +283,8 @@ def problems(state: ExportState, project: str, apart: bool) -> Iterator[list[Any
 
 
 def _of_session(key: str) -> str:
-    """A key below `sessions/`. A session's id says nothing of its members; what else stands there is left out."""
+    """A key below `sessions/` without ids of participants. The session's id stays, since it does not identify anyone;
+    unknown parts are left out."""
     match key.split("/"):
         case [top, session, "session.json"] if is_session_id(session):
             return f"{top}/{session}/session.json"
@@ -294,7 +297,7 @@ _RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:trial|episode)[0-9-]*\.jsonl\.gz
 
 
 def _without_ids(key: str, participant: ExportedParticipant | None, project: str) -> str:
-    """A key without ids: known parts stay, others are left out."""
+    """A participant's key without ids. Known parts stay; unknown parts are left out."""
     if participant is None:
         return "(somewhere in users/)"
     parts = key.split("/")

@@ -1,9 +1,9 @@
-"""Takes what one member alone has sent out of a session's recording, for the erasure of that participant.
+"""Removes the data of one member from a session's recording, for the erasure of that participant.
 
-What goes: their messages (with their feedback and key presses), when they pressed, what their keys asked for, their
-round trips, the lines on their presence, what callbacks recorded on their feedback, how the game ended for them, and
-their id wherever it stands. What stays: the actions, rewards and scores of their player, without which the game of the
-others cannot be read or repeated. Lines that are not concerned stay byte for byte.
+It removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
+their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id in any
+place. The actions, rewards and scores of their player stay: without them the game of the others cannot be read or
+repeated. Lines without data of the member stay byte for byte.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from export import recording_columns, recording_lines
 from export.scrub import SHORTEST, Scrub
 
 ABOUT_ONE = frozenset({"on_feedback", "on_join", "on_leave", "on_return"})
-"""Callbacks on what one participant did. Without a `player`, such a line may be about anyone."""
+"""Callbacks on one participant. A line of theirs without `player` may be about any member."""
 OF_EACH = ("roundTrip", "outcomes")
-"""Fields of lines with a value for each player."""
+"""Fields of lines that map each player to a value."""
 OF_KEYS = ("human", "pressedAt")
-"""What the participant's keys asked for, and when they were pressed."""
+"""Fields with the action of the participant's keys, and the time at which they were pressed."""
 
 
 def rewrite(source: Path, target: Path, seat: int, user: str) -> bool:
-    """Write the recording `source` without what the member of this seat has sent; return whether that differs.
+    """Write the recording `source` into `target` without the data of the member at this seat, whose id is `user`.
 
-    `user` is their id. A recording that was cut off stays cut off; what cannot be read is left out. Raises OSError.
+    Returns whether the two differ. A recording that was cut off stays cut off; lines that cannot be read are left out.
+    Raises OSError.
     """
     problems: list[str] = []
     pack = zlib.compressobj(6, zlib.DEFLATED, 31)
@@ -49,7 +50,7 @@ def rewrite(source: Path, target: Path, seat: int, user: str) -> bool:
 
 
 class _Erased:
-    """Who is to be taken out of a recording with this first line."""
+    """Removes a member's data from the lines of a recording, of which `header` is the first."""
 
     def __init__(self, header: Mapping[str, Any], seat: int, user: str) -> None:
         humans = recording_columns.humans_of(header)
@@ -60,12 +61,12 @@ class _Erased:
         self._hide = Scrub({user: ""})
 
     def without(self, line: Mapping[str, Any], text: bytes) -> dict[str, Any] | None:
-        """The line without the member; None if it is theirs alone. `text` is the line as it is written."""
+        """Return the line without the member's data; None if it is only about them. `text` is the line as written."""
         if self._is_theirs(line):
             return None
         left = dict(line)
-        if isinstance(said := line.get("messages"), list):
-            left["messages"] = [each for each in said if not self._sent(each)]
+        if isinstance(messages := line.get("messages"), list):
+            left["messages"] = [message for message in messages if not self._sent(message)]
         for name in OF_EACH:
             if isinstance(values := line.get(name), Mapping):
                 left[name] = {player: value for player, value in values.items() if not self._is(player)}
@@ -83,12 +84,12 @@ class _Erased:
         return self._players is None or player in self._players
 
     def _sent(self, message: Any) -> bool:
-        """Whether a message is theirs. One that does not say whose it is may be."""
+        """Whether the member has sent a message, or may have sent it because it names no player."""
         return not isinstance(message, Mapping) or "player" not in message or self._is(message["player"])
 
     def _is_theirs(self, line: Mapping[str, Any]) -> bool:
         kind = line.get("kind")
-        if kind == "presence":  # a policy that took their place needs its seed, if the game is to be repeated
+        if kind == "presence":  # a line with a `seed` stays: to repeat the game, the policy in their place needs it
             return self._is(line.get("player")) and "seed" not in line
         if kind == "ping":
             trips = line.get("roundTrip")

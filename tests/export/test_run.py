@@ -388,7 +388,7 @@ def test_killed_between_a_file_and_its_note(place: Place) -> None:
     """The file is there and nobody wrote it down: it is made again."""
     crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Fetcher, "_keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Fetcher, "_save", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert place.run().code == Exit.INTERRUPTED
     left = place.out / "private" / "incoming" / "half.part"
     left.write_bytes(b"half a file")
@@ -491,7 +491,7 @@ def test_broken_input_is_listed_and_nothing_is_dropped_silently(place: Place) ->
     assert problems[f"{users[1]}/answers/2.json"] == ["it is no JSON object"]
     assert len(problems[f"{users[1]}/answers/7.json"]) == 4
     assert len(problems[f"{users[2]}/participant.json"]) == 3
-    foreign = [name for name, why in problems.items() if why[0].startswith("not one of ours")]
+    foreign = [name for name, why in problems.items() if why[0].startswith("no file of Hippodrome")]
     assert len(foreign) == 9
     half = pq.read_table(place.out / "recordings" / users[0] / "1" / "3-episode-0002.parquet")
     assert 100 < half.num_rows < 2000

@@ -20,7 +20,7 @@ from export import table_files, tables
 from export.answers import MAX_LINK, StudyAnswers
 from export.keys import KeyKind, Listed, read
 from export.scrub import Scrub, clean, identities
-from export.state import ExportedParticipant, ExportState, File
+from export.state import ExportedParticipant, ExportState, SourceFile
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
 from trial.recordings.recording import line
@@ -58,10 +58,10 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
     state.begin_run()
     for user, steps in people.items():
         state.find_or_add(user, apart)
-        made = [File(f"{user}/participant.json", "participant", "1", 1, document=participant(user, **changes))]
+        made = [SourceFile(f"{user}/participant.json", "participant", "1", 1, document=participant(user, **changes))]
         for step, sent in steps.items():
-            made.append(File(f"{user}/{step}", "answer", "1", 1, step=step, document=answer(step, sent)))
-        state.keep(user, [], made)
+            made.append(SourceFile(f"{user}/{step}", "answer", "1", 1, step=step, document=answer(step, sent)))
+        state.save(user, [], made)
     return state
 
 
