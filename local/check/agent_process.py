@@ -169,7 +169,7 @@ def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> Pict
     return PictureReader(config.scene, found, progress.undrawn.append)
 
 
-def _assigned(document: str) -> assignment.Found:
+def _assigned(document: str) -> assignment.AssignmentDocument:
     """The document that tells a server for whom it runs: the handover itself, or that of the session that it names."""
     found = handover.parse(document.encode())
     if not is_session_id(found.user_id):

@@ -141,7 +141,7 @@ def test_what_was_played_with_one_whose_data_were_erased_counts_for_the_others(l
 
 @for_all(user_id=st.one_of(st.none(), st.text(), st.sampled_from(MEMBERS)), token=st.one_of(st.none(), st.text()))
 def test_whatever_a_client_says_only_a_member_with_their_own_token_gets_in(user_id, token):
-    settings = assignment.formed(TrialSettings.from_env(ENV), document())
+    settings = assignment.with_members(TrialSettings.from_env(ENV), document())
 
     class Socket:
         subprotocol = "hippodrome.3"

@@ -193,7 +193,7 @@ def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_nex
 
 def recorder_of(tmp_path, *members):
     settings = TrialSettings.from_env({**ENV, "STORE": str(tmp_path), "TRIAL": json.dumps(TRIAL)})
-    formed = assignment.formed(settings, SessionDocument(SID, len(members), members))
+    formed = assignment.with_members(settings, SessionDocument(SID, len(members), members))
     store = FolderStore(tmp_path)
     return Recorder(formed, "3", "the-trial", store, Spool(formed, store)), store
 

@@ -285,7 +285,7 @@ def test_the_settings_of_a_session():
     assert (settings.session, settings.user_id, settings.group, settings.assigned) == (SID, "", None, False)
     assert settings.plain_origins == frozenset()
     assert settings.private == ()
-    formed = assignment.formed(settings, document(("anna", "", "carl"), players=4, group=2))
+    formed = assignment.with_members(settings, document(("anna", "", "carl"), players=4, group=2))
     assert formed.assigned
     assert (formed.players, formed.group) == (4, 2)
     assert formed.seats == {"anna": 0, "carl": 2}
@@ -296,7 +296,7 @@ def test_the_settings_of_a_session():
 def test_a_handed_over_session_has_the_settings_of_a_session_that_was_started_for_it():
     warm = TrialSettings.from_env({**ENV, **WARM})
     assert not warm.assigned
-    given = assignment.assigned(warm, Handover(SID, None, "pair-1"))
+    given = assignment.with_handover(warm, Handover(SID, None, "pair-1"))
     assert given == TrialSettings.from_env(ENV)
 
 

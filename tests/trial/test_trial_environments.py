@@ -29,7 +29,7 @@ from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
 from trial.programs import environments
-from trial.programs.environments import LARGEST_REQUEST, MOST, REQUESTS_A_SECOND
+from trial.programs.environments import LARGEST_REQUEST, MAX_PROGRAMS, REQUESTS_A_SECOND
 
 TOKEN = "the-secret-token"
 SERVES = {"gym": "environments", "startingFrameRate": 30}
@@ -163,9 +163,9 @@ def test_unless_the_project_says_so_there_are_none(launch: Any, gym: str, words:
 def test_programs_are_limited(launch: Any) -> None:
     server = launch(agent(), SERVES)
     with contextlib.ExitStack() as stack:
-        for _ in range(MOST):
+        for _ in range(MAX_PROGRAMS):
             stack.enter_context(served(server))
-        with pytest.raises(ConnectionLost, match=f"{MOST} programs"), served(server):
+        with pytest.raises(ConnectionLost, match=f"{MAX_PROGRAMS} programs"), served(server):
             pass
     until(lambda: len(processes(server)) == 2, SECONDS)  # who listens and who starts processes
     with served(server) as env:

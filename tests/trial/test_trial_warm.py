@@ -407,7 +407,7 @@ def test_whatever_stands_there_is_read_or_refused(body):
         found = handover.parse(body)
     except BadHandover:
         return
-    own = assignment.assigned(TrialSettings.from_env(ENV), found)
+    own = assignment.with_handover(TrialSettings.from_env(ENV), found)
     assert own.user_id or own.session
 
 
@@ -490,7 +490,7 @@ def test_a_warm_server_needs_no_participant_and_believes_in_none():
 
 
 def test_what_is_given_makes_an_ordinary_server_of_it():
-    settings = assignment.assigned(TrialSettings.from_env(ENV), Handover("P1", 3, "a-2"))
+    settings = assignment.with_handover(TrialSettings.from_env(ENV), Handover("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == TrialSettings.from_env(ordinary)
 

@@ -12,7 +12,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.trial.two_players import TRIAL, two_players
-from trial.programs.watch import MOST, Watchers
+from trial.programs.watch import MAX_PROGRAMS, Watchers
 from trial.recordings import resume
 
 PROOF = "?token=the-secret-token"
@@ -198,7 +198,7 @@ def test_programs_that_watch_are_limited(launch, grid):
 
     async def come() -> int | None:
         async with contextlib.AsyncExitStack() as stack:
-            for _ in range(MOST):
+            for _ in range(MAX_PROGRAMS):
                 await ask(await stack.enter_async_context(program(server)), "watch")
             async with program(server) as websocket:
                 return await closed(websocket)

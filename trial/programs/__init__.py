@@ -1,1 +1,1 @@
-"""What programs get at the path /gym of a trial: to watch, to advise, environments."""
+"""The path /gym of a trial server, for programs that watch, advise, or use environments."""

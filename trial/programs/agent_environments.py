@@ -1,4 +1,4 @@
-"""Imported where environments are made beside a participant's game: agent.py, which may register some."""
+"""Imports agent.py, which may register environments, in the process that makes environments for programs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Environments for programs, beside the game of a participant: the path /gym of its server (docs/gym.md).
+"""Environments for programs: the path /gym of a trial server with `gym: environments` (docs/gym.md).
 
-A process of its own makes them (`trial/programs/environments_process.py`), as `make gym` does. It is started for the
-first program. It listens nowhere: this process hands it one end of a socket pair for each program that has the token,
-and passes messages on between the other end and the program.
+A separate process makes the environments (`trial/programs/environments_process.py`), as for `make gym`. The first
+program starts it. It listens on no port: for each program that has the token, this process hands it one end of a socket
+pair, and passes messages on between the other end and the program.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ from trial.gym.server import SUBPROTOCOL as _NAME
 log = logging.getLogger("trial")
 
 SUBPROTOCOL = Subprotocol(_NAME)
-MOST = 4
-"""Programs that may be connected at a time."""
+MAX_PROGRAMS = 4
+"""The most programs that may be connected at a time."""
 LARGEST_REQUEST = 2**20
-"""Bytes in one message of a program."""
+"""The most bytes in a program's message."""
 LARGEST_REPLY = 8 * 2**20
-"""Bytes of observations in one answer."""
+"""The most bytes of observations in one answer."""
 REQUESTS_A_SECOND = 500
-"""Of all programs together. More of them wait, so that the game has the time that it needs."""
+"""The most requests of all programs together that are passed on in a second. The others wait: the game comes first."""
 _LARGEST_ANSWER = 8 * LARGEST_REPLY  # bytes of a message: JSON takes several for each byte of an observation
-_AHEAD_SECONDS = 0.02  # so much sooner than evenly spread may requests be passed on
+_AHEAD_SECONDS = 0.02  # a request may be passed on so much sooner than an even rate would allow
 _START_SECONDS = 60.0
 _CLOSE_SECONDS = 2.0
-_SEND_SECONDS = 30.0  # that a program may leave an answer unread
-_NOT_SENT = (1005, 1006, 1015)  # close codes that no message has (RFC 6455, 7.4.1)
+_SEND_SECONDS = 30.0  # the time in which a program must read an answer
+_NOT_SENT = (1005, 1006, 1015)  # close codes that an endpoint must not send (RFC 6455, 7.4.1)
 _GONE = "The process of the environments has ended."
 
 
 def prepare(websocket: ServerConnection, request: Request) -> Response | None:
-    """Let a program that has the token send what `make gym` lets it send. An answer if it asks for an unknown form."""
+    """Set a program's connection up as `make gym` does. Return a refusal if its address names an unknown form."""
     if _form(request.path) not in FORMS:
         return websocket.respond(http.HTTPStatus.BAD_REQUEST, f"form must be one of {', '.join(FORMS)}.\n")
     websocket.protocol.max_message_size = LARGEST_REQUEST
@@ -63,16 +63,16 @@ class Environments:
 
     def __init__(self, agent_dir: Path) -> None:
         self._agent_dir = agent_dir
-        self._folder = Path.cwd()  # the agent may change it
+        self._folder = Path.cwd()  # now, since the agent may change it later
         self._process: asyncio.subprocess.Process | None = None
-        self._handing: socket.socket | None = None
+        self._handing: socket.socket | None = None  # hands connections to the process
         self._starting = asyncio.Lock()
-        self._next = 0.0  # when the next request may be passed on, if they were evenly spread
+        self._next = 0.0  # when the next request may be passed on at an even rate
         self.connections = 0
-        """Programs that are connected."""
+        """The number of programs that are connected."""
 
     async def serve(self, websocket: ServerConnection) -> None:
-        """Pass on messages until the program or the process is gone, and the close of one to the other."""
+        """Pass on messages until the program or the process closes; then close the other one, too."""
         self.connections += 1
         try:
             await self._serve(websocket)
@@ -80,10 +80,10 @@ class Environments:
             self.connections -= 1
 
     async def close(self) -> None:
-        """End the process, with all that it has started."""
+        """End the process, and all processes that it has started."""
         process, self._process = self._process, None
         if self._handing is not None:
-            self._handing.close()  # it ends by itself
+            self._handing.close()  # the process ends when it notices this
             self._handing = None
         if process is not None:
             try:
@@ -127,9 +127,10 @@ class Environments:
             process.transport.abort()
 
     async def _pass_on(self, source: Connection, target: Connection, *, paced: bool = False) -> None:
-        """Pass on messages until one of the two is closed; then close the other with the same words.
+        """Pass on messages until one of the two is closed; then close the target with the source's code and reason.
 
-        Raises TimeoutError if a program does not read its answers.
+        With `paced`, the source is a program, and its requests are limited to `REQUESTS_A_SECOND`. Raises TimeoutError
+        if a program does not read its answers.
         """
         with contextlib.suppress(ConnectionClosed):
             while True:
@@ -139,21 +140,21 @@ class Environments:
                 async with asyncio.timeout(None if paced else _SEND_SECONDS):
                     await target.send(message)
         if source.close_code is None:
-            return  # the target is gone, which the other direction tells the source
+            return  # the target is closed: the other direction closes the source
         code, words = source.close_code, source.close_reason or ""
         if code in _NOT_SENT:
             code, words = (1000, "") if paced else (1011, _GONE)
         await target.close(code, reason(words))
 
     async def _turn(self) -> None:
-        """Wait until a request may be passed on."""
+        """Wait until the next request may be passed on."""
         now = asyncio.get_running_loop().time()
         self._next = max(self._next, now) + 1.0 / REQUESTS_A_SECOND
         if self._next - now > _AHEAD_SECONDS:
             await asyncio.sleep(self._next - now)
 
     async def _connection(self) -> socket.socket:
-        """A connection to the process, which is started if there is none. Raises OSError."""
+        """Return a connection to the process, which is started if it does not run. Raises OSError."""
         async with self._starting:
             if self._process is None or self._process.returncode is not None:
                 await self._start()
@@ -188,5 +189,5 @@ class Environments:
 
 
 def _form(path: str) -> str:
-    """The form that an address asks for, as the server of environments reads it."""
+    """Return the form that an address asks for; the first of FORMS if it names none, as for `make gym`."""
     return parse_qs(urlsplit(path).query).get("form", [FORMS[0]])[0]

@@ -1,7 +1,7 @@
-"""The process that makes environments beside a participant's game: `python -m trial.programs.environments_process FD`.
+"""`python -m trial.programs.environments_process FD`: the process that makes environments beside a participant's game.
 
-FD is one end of a socket pair, over which the trial's server hands it connections. It ends with that server, and its
-environments with it. The game goes first, in time and in memory.
+FD is one end of a socket pair, over which the trial server hands connections to this process. The process ends with
+that server, and the environments end with the process. The game has priority in processor time and memory.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any
 from trial.gym import linux
 from trial.gym.limits import Limits
 from trial.gym.processes import serve_from
-from trial.programs.environments import LARGEST_REPLY, LARGEST_REQUEST, MOST
+from trial.programs.environments import LARGEST_REPLY, LARGEST_REQUEST, MAX_PROGRAMS
 
 LIMITS = Limits(
-    connections=2 * MOST,  # one that is closing may still be counted here
-    workers=MOST,
+    connections=2 * MAX_PROGRAMS,  # one that is closing may still be counted here
+    workers=MAX_PROGRAMS,
     environments=16,
     seconds=30.0,
     idle_seconds=600.0,
@@ -31,18 +31,21 @@ LIMITS = Limits(
 )
 
 
-class Handed:
-    """Stands for a listening socket: connections come as descriptors over another one."""
+class HandedConnections:
+    """Acts as a listening socket whose connections come as file descriptors over the socket `handing`."""
 
     def __init__(self, handing: socket.socket) -> None:
         self._handing = handing
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection. Raises BlockingIOError if there is none, and KeyboardInterrupt without the trial."""
-        told, found, _, _ = socket.recv_fds(self._handing, 1, 1)
-        if not told:
+        """Return the next connection. Raises BlockingIOError if none waits.
+
+        Raises KeyboardInterrupt, which ends this process, if the trial server has closed its end.
+        """
+        data, descriptors, _, _ = socket.recv_fds(self._handing, 1, 1)
+        if not data:
             raise KeyboardInterrupt
-        return socket.socket(fileno=found[0]), None
+        return socket.socket(fileno=descriptors[0]), None
 
     def fileno(self) -> int:
         return self._handing.fileno()
@@ -55,13 +58,13 @@ class Handed:
 
 
 def main() -> int:
-    """Serve until the trial's server is gone; the exit status."""
-    sys.dont_write_bytecode = True  # as the trial: it imports agent.py
+    """Serve until the trial server ends, and return the exit status."""
+    sys.dont_write_bytecode = True  # for agent.py, as in trial/__main__.py
     linux.die_with_parent()
     os.nice(19)
-    with contextlib.suppress(OSError):  # Linux alone has it; the kernel ends the highest first (proc(5))
+    with contextlib.suppress(OSError):  # Linux only; without memory, it kills the highest score first (proc(5))
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-    handing = Handed(socket.socket(fileno=int(sys.argv[1])))
+    handing = HandedConnections(socket.socket(fileno=int(sys.argv[1])))
     return serve_from(handing, LIMITS, modules=["trial.programs.agent_environments"])
 
 

@@ -1,7 +1,7 @@
-"""Programs that watch a trial, and advise where the project allows it: the path /gym of its server (docs/gym.md).
+"""Programs that watch a trial, and advise if the project allows it: the path /gym of a trial server (docs/gym.md).
 
-They speak in Gymie's messages, `{"method", "params"}`. They change nothing about the participant's connection, and do
-not keep the server running.
+Their messages have Gymie's form, `{"method", "params"}`. They have no effect on participants' connections, and an idle
+server ends although programs are connected.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from trial.recordings.recording import Line, text_of_line
 from trial.wire.inbound import MESSAGES_A_SECOND, RateLimit
 
 PATH = "/gym"
-MOST = 8
-"""Programs that may be connected at a time."""
-_UNREAD = 1000  # lines that wait for a program; one more ends its connection
-_UNREAD_BYTES = 16 * 1024**2  # the same of their bytes; a single line may be longer
+MAX_PROGRAMS = 8
+"""The most programs that may be connected at a time."""
+_UNREAD = 1000  # the most lines that wait for a program; one more ends its connection
+_UNREAD_BYTES = 16 * 1024**2  # the most bytes of these lines; a single line may be longer
 
 Advise = Callable[[int, str | None], None]
-"""Takes the number of an action, and the player or None (`TrialProgress.advise`). Raises CommandRefused."""
+"""Takes the number of an action, and a player or None, as `Choices.advise` does. Raises CommandRefused."""
 
 
 class Watchers:
-    """Passes on what is recorded, line by line, to programs that watch. To be used on the event loop."""
+    """Passes each line of the recording on to the programs that watch. For the event loop."""
 
     def __init__(self) -> None:
         self._waiting: dict[Lines, Callable[[], None]] = {}
 
     def tell(self, line: Line) -> None:
-        """Pass on a line. A program that does not read is cut off; the trial waits for none."""
+        """Pass on a line. The trial never waits: the connection of a program that does not read its lines is cut."""
         if not self._waiting:
             return
         text = text_of_line(line)
@@ -47,7 +47,7 @@ class Watchers:
 
     @contextlib.contextmanager
     def lines(self, cut_off: Callable[[], None]) -> Iterator[Lines]:
-        """All lines from now on; `cut_off` is called if too many wait."""
+        """Collect all lines from now on, for one program. `cut_off` is called if too many wait."""
         lines = Lines()
         self._waiting[lines] = cut_off
         try:
@@ -64,7 +64,7 @@ class Lines:
         self._bytes = 0
 
     def put(self, line: bytes) -> bool:
-        """Let a line wait; False if there is no room for it."""
+        """Add a line; return False if too many wait."""
         if len(self) >= _UNREAD or (self._bytes and self._bytes + len(line) > _UNREAD_BYTES):
             return False
         self._waiting.put_nowait(line)
@@ -72,7 +72,7 @@ class Lines:
         return True
 
     async def get(self) -> bytes:
-        """The next line, once there is one."""
+        """Wait for the next line, and return it."""
         line = await self._waiting.get()
         self._bytes -= len(line)
         return line
@@ -82,7 +82,10 @@ class Lines:
 
 
 class Watching:
-    """One program's connection. `advise` is None if the project does not allow advice."""
+    """The connection of one program that watches.
+
+    `actions` returns the names of a player's actions. `advise` is None if the project allows no advice.
+    """
 
     def __init__(
         self,
@@ -98,7 +101,7 @@ class Watching:
         self._sending: asyncio.Task[None] | None = None
 
     async def run(self) -> None:
-        """Answer requests until the program goes. Raises CloseConnection and ConnectionClosed."""
+        """Answer requests until the program closes its connection. Raises CloseConnection and ConnectionClosed."""
         rate, loop = RateLimit(MESSAGES_A_SECOND), asyncio.get_running_loop()
         try:
             async for data in self._websocket:
@@ -127,10 +130,10 @@ class Watching:
             names = self._actions(_player_in(params))
             return {"name": "Discrete", "n": len(names), "names": list(names)}
         if method == "advise":
-            return self._advised(params)
+            return self._take_advice(params)
         raise CommandRefused("there are the methods watch, action_space and advise")
 
-    def _advised(self, params: Any) -> bool:
+    def _take_advice(self, params: Any) -> bool:
         if self._advise is None:
             raise CommandRefused("the project allows no advice (gym: advise, in the section trial of config.yml)")
         action = params.get("action") if isinstance(params, dict) else None

@@ -1,1 +1,1 @@
-"""Recordings and answers: written, spooled, stored, and read again by the next server."""
+"""Recordings and answers: written to a spool, stored, and read by the server that replaces a lost one."""

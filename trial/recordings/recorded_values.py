@@ -1,4 +1,4 @@
-"""Values of the researcher's code as JSON can hold them: none of them raises, or takes for ever. Pure."""
+"""Converts values of the researcher's code for JSON, without raising an error and in bounded time. Pure."""
 
 from __future__ import annotations
 
@@ -11,43 +11,44 @@ from typing import Any
 import numpy as np
 
 LISTED = 100
-"""Numbers of an array that `extra` has as a list."""
+"""The most numbers of an array that the field `extra` has as a list. Larger arrays are packed."""
 MOST_VALUES = 2_000_000
-"""Values that are read of one value. Objects that lead to each other in many ways would have no end."""
+"""The most values in one value that are converted: containers that hold each other in many ways would have no end."""
 CUT_OFF = "<cut off>"
-_DEPTH = 20
-_TEXT = 1000  # characters of what has no other form than its text
-_INT_BITS = 10_000  # Python writes no longer ones as text (sys.set_int_max_str_digits)
-_PACKED_BYTES = 64  # an array is packed if it has not more bytes than so many times what may be kept
+"""Stands in a container for the values that were left out."""
+_DEPTH = 20  # the most levels of nesting
+_TEXT = 1000  # the most characters of an object that is converted to its text
+_INT_BITS = 10_000  # Python converts no longer integers to text (sys.set_int_max_str_digits)
+_PACKED_BYTES = 64  # arrays up to this multiple of `longest` are packed, since their bytes may be compressible
 
 
 class Values:
-    """Makes values plain. `listed`: arrays with more numbers are packed with their dtype and shape; None packs none.
+    """Converts values for JSON. Packs arrays with more than `listed` numbers, with dtype and shape; None: packs none.
 
-    At most `most` values are read. Texts and bytes longer than `longest` are left out.
+    At most `most` values are converted. Texts and bytes that are longer than `longest` are left out.
     """
 
     def __init__(self, *, listed: int | None = None, most: int = MOST_VALUES, longest: float = math.inf) -> None:
         self._listed = listed
         self._left = most
         self._longest = longest
-        self._around: set[int] = set()  # the containers that the value is in
+        self._around: set[int] = set()  # the ids of the containers around the present value
         self.left_out = 0
-        """The size in bytes of what was too long."""
+        """The bytes of the texts and arrays that were too long."""
 
     @property
     def exhausted(self) -> bool:
-        """There were more values, or longer ones, than are kept."""
+        """Whether values were left out, because there are too many or they are too long."""
         return self._left < 0 or self.left_out > 0
 
     def keep(self, value: Any, depth: int = 0) -> Any:
-        """The value as JSON can hold it; its type in `<>` where it is nested too deep, or within itself, or raises."""
+        """Convert a value; to its type in `<>` if it is nested too deep, contains itself, or raises an error."""
         try:
-            return self._kept(value, depth)
+            return self._converted(value, depth)
         except Exception:  # noqa: BLE001 - the researcher's objects may raise anything, and the game goes on
             return f"<{type(value).__name__}>"
 
-    def _kept(self, value: Any, depth: int) -> Any:
+    def _converted(self, value: Any, depth: int) -> Any:
         if value is None or isinstance(value, bool):
             return value
         if isinstance(value, str | bytes):
@@ -81,24 +82,24 @@ class Values:
             self._around.discard(id(value))
 
     def _mapping(self, value: Mapping[Any, Any], depth: int) -> dict[str, Any]:
-        kept: dict[str, Any] = {}
+        converted: dict[str, Any] = {}
         for key, item in value.items():
             self._left -= 1
             if self._left < 0:
-                kept[CUT_OFF] = True
+                converted[CUT_OFF] = True
                 break
-            kept[text_of(key)] = self.keep(item, depth + 1)
-        return kept
+            converted[text_of(key)] = self.keep(item, depth + 1)
+        return converted
 
     def _list(self, value: Iterable[Any], depth: int) -> list[Any]:
-        kept: list[Any] = []
+        converted: list[Any] = []
         for item in value:
             self._left -= 1
             if self._left < 0:
-                kept.append(CUT_OFF)
+                converted.append(CUT_OFF)
                 break
-            kept.append(self.keep(item, depth + 1))
-        return kept
+            converted.append(self.keep(item, depth + 1))
+        return converted
 
     def _array(self, value: Any) -> Any:
         if value.dtype.kind not in "biuf":
@@ -117,7 +118,7 @@ class Values:
 
 
 def text_of(value: Any) -> str:
-    """A text as it is; another value's text, cut off, or its type if it has none."""
+    """Return a text unchanged; of another value its text, `_TEXT` characters at most, or its type if it has none."""
     if isinstance(value, str):
         return value
     try:
@@ -127,7 +128,7 @@ def text_of(value: Any) -> str:
 
 
 def _numbers(value: Any) -> Any:
-    """An array as lists, or a number; null where it is not finite."""
+    """Convert an array to lists, or a NumPy number to a number, with None for NaN and infinities."""
     if value.dtype.kind != "f":
         return value.tolist()
     if value.dtype.itemsize > np.dtype(float).itemsize:
@@ -135,6 +136,6 @@ def _numbers(value: Any) -> Any:
     finite = np.isfinite(value)
     if finite.all():
         return value.tolist()
-    kept = np.array(value, dtype=object)
-    kept[~finite] = None
-    return kept.tolist()
+    numbers = np.array(value, dtype=object)
+    numbers[~finite] = None
+    return numbers.tolist()

@@ -1,4 +1,4 @@
-"""The recordings and the answer of a trial, on the event loop: written soon, stored when they are complete."""
+"""Writes and stores the recordings and answers of one trial, on the event loop."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from trial.settings import TrialSettings
 log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
-"""Play that may be lost if the process is killed outright."""
+"""Lines are written to the file within this time: play that is lost if the process is killed."""
 
 
 class Recorder:
-    """Writes what one trial leaves behind, and reads what earlier servers left of the same step."""
+    """Writes the recordings and answers of one trial, and reads those of earlier servers of the same step."""
 
     def __init__(self, settings: TrialSettings, step: str, trial_id: str, store: Store, spool: Spool) -> None:
         self._settings = settings
@@ -46,39 +46,40 @@ class Recorder:
     # ---- before
 
     async def earlier_answers(self) -> dict[str, Any] | None:
-        """What an earlier server answered for the participant's step; None if the step has not been played."""
+        """Return the participant's answer of this step, which an earlier server has stored; None if there is none."""
         return await self._earlier_answer(self._settings.user_id)
 
     async def members_answers(self) -> dict[str, Any]:
-        """In a session: the answers of this step that are there, by the members' ids.
+        """Return the stored answers of this step, by the members' ids.
 
-        If each of them has one, the step is over. A server that is lost between two answers has stored all recordings
-        before, so the next one stores those that are missing. Who was refused in an earlier game has one from there.
+        The step is over if each member has one. If a server was lost between two answers, it had stored all recordings
+        before, and the next server stores the missing answers. The answer of a member who was refused in an earlier
+        game was stored then.
         """
-        found = {user_id: await self._earlier_answer(user_id) for user_id in self._settings.seats}
-        return {user_id: answers for user_id, answers in found.items() if answers is not None}
+        answers = {user_id: await self._earlier_answer(user_id) for user_id in self._settings.seats}
+        return {user_id: answer for user_id, answer in answers.items() if answer is not None}
 
     async def _earlier_answer(self, user_id: str) -> dict[str, Any] | None:
         try:
-            found = await asyncio.to_thread(self._store.get, answer_key(self._settings.project_id, user_id, self._step))
-        except Exception as error:  # noqa: BLE001 - whatever the store raises; the answer is not overwritten anyway
+            body = await asyncio.to_thread(self._store.get, answer_key(self._settings.project_id, user_id, self._step))
+        except Exception as error:  # noqa: BLE001 - any error of the store: no write will replace an answer anyway
             log.warning("cannot look for an earlier answer (%s)", short_error(error))
             return None
-        return None if found is None else answers_in(found) or {}
+        return None if body is None else answers_in(body) or {}
 
     async def recorded(self) -> RecordedTrial | None:
-        """What earlier servers recorded of the step."""
+        """Return what earlier servers have recorded of the step; None if they have not, or it cannot be read."""
         folder, _, server = self._settings.recordings_folder.rpartition("/")
         try:
             return await asyncio.to_thread(load_recorded, self._store, folder, server, self._step)
-        except Exception as error:  # noqa: BLE001 - whatever the store or an old recording raises: it is played anew
+        except Exception as error:  # noqa: BLE001 - any error of the store or of a recording: the step is played anew
             log.warning("cannot look for earlier recordings (%s)", short_error(error))
             return None
 
     # ---- recordings
 
     def stamp(self) -> dict[str, Any]:
-        """What every line begins with. May be called on any thread."""
+        """Return the fields with which each line begins. May be called on any thread."""
         return {
             "v": recording.SCHEMA,
             "session": self._settings.server,
@@ -89,11 +90,14 @@ class Recorder:
 
     @property
     def is_open(self) -> bool:
-        """There is a recording to which lines can be written."""
+        """Whether a recording is open, to which lines can be written."""
         return self._recording is not None
 
     def open(self, opening: OpenRecording, players: Mapping[str, Any]) -> None:
-        """Open a recording and write its header, with who plays whom if there are several. Raises OSError."""
+        """Open a recording and write its header. Raises OSError.
+
+        `players` describes who plays each player, if there are several (`Places.described`); else it is empty.
+        """
         settings, config = self._settings, self._settings.trial
         name = "trial" if config.data_file == "trial" else f"episode-{opening.episode:04d}"
         self._recording = self._spool.open(f"{settings.recordings_folder}/{self._step}-{name}.jsonl.gz")
@@ -118,11 +122,11 @@ class Recorder:
         self._recording.add(header)
 
     def line(self, kind: str, fields: Mapping[str, Any]) -> bytes:
-        """A line of this kind, stamped with the time."""
+        """Build a line of this kind, with the fields of `stamp`."""
         return recording.line(kind, **self.stamp(), **fields)
 
     def write(self, line: recording.Line) -> None:
-        """Write a finished line. It is in the file within `FLUSH_SECONDS`."""
+        """Write a line. It is in the file within `FLUSH_SECONDS`. Without an open recording it is dropped."""
         if self._recording is None:
             return
         self._recording.add(line)
@@ -130,7 +134,7 @@ class Recorder:
             self._flush_later()
 
     def close(self) -> None:
-        """Close the recording and store it, in the background."""
+        """Close the recording if one is open, and store it in the background."""
         current, self._recording = self._recording, None
         if current is not None:
             self._uploads.add(asyncio.create_task(self._finish(current)))
@@ -162,11 +166,11 @@ class Recorder:
     # ---- the end
 
     async def save(self, answers: Mapping[str, Any] | None) -> None:
-        """Wait until all recordings are stored, then store the answer: a reader of the answer finds them.
+        """Wait until all recordings are stored, then store the answer: so whoever finds the answer finds them, too.
 
-        If they cannot be stored for `recordings_first_seconds`, or the server ends (`hurry`), the answer does not wait
-        any longer. An answer that is there already stays as it is. None in a session: each member's own answer follows
-        (`save_member`).
+        The answer waits for `recordings_first_seconds` at most, and not after `hurry`. An answer that exists is not
+        changed. `answers` is None in a session, where each member's own answer follows (`save_member`), or if there is
+        no answer.
         """
         await self._store_recordings_first()
         settings, now = self._settings, datetime.now(UTC)
@@ -174,12 +178,12 @@ class Recorder:
             await self._create(settings.user_id, Answer(self._step, GAME, settings.group, now, answers))
 
     def hurry(self) -> None:
-        """The server ends soon: an answer waits for recordings no longer."""
+        """The server ends soon: let no answer wait for recordings any longer."""
         self._hurried.set()
 
     @property
     def storing(self) -> bool:
-        """There is a recording that is closed and not stored."""
+        """Whether a recording is closed and not stored yet."""
         return any(not task.done() for task in self._uploads)
 
     async def stored(self) -> None:
@@ -190,10 +194,10 @@ class Recorder:
     async def _store_recordings_first(self) -> None:
         if not self.storing:
             return
-        until = [asyncio.create_task(self.stored()), asyncio.create_task(self._hurried.wait())]
+        waits = [asyncio.create_task(self.stored()), asyncio.create_task(self._hurried.wait())]
         limit = self._settings.recordings_first_seconds
-        await asyncio.wait(until, timeout=limit, return_when=asyncio.FIRST_COMPLETED)
-        for task in until:
+        await asyncio.wait(waits, timeout=limit, return_when=asyncio.FIRST_COMPLETED)
+        for task in waits:
             task.cancel()
         if self.storing:
             log.error("a recording is not stored yet; the answer does not wait for it")
@@ -201,17 +205,17 @@ class Recorder:
     async def save_member(
         self, user_id: str, answers: Mapping[str, Any], later: Mapping[str, Any] | None = None
     ) -> None:
-        """Store the answer of a member of a session. One that is there already stays as it is.
+        """Store the answer of a member of a session. An answer that exists is not changed.
 
-        `later` is the answer of each later game step, if they are out of those, too. It is stored first: a member whose
-        own step has its answer goes on, and comes to no game that does not take them.
+        `later` is the answer of each later game step, if the member does not play those either. These answers are
+        stored first: as soon as the present step has its answer, the member goes on, and must not come to a later game.
         """
         settings = self._settings
         group = next((member.group for member in settings.members if member.user_id == user_id), None)
         following = settings.game_steps[settings.game_steps.index(self._step) + 1 :] if later is not None else ()
-        for step, said in (*((step, later or {}) for step in following), (self._step, answers)):
-            found = {**said, "session": settings.session}
-            await self._create(user_id, Answer(step, GAME, group, datetime.now(UTC), found))
+        for step, values in (*((step, later or {}) for step in following), (self._step, answers)):
+            stored = {**values, "session": settings.session}
+            await self._create(user_id, Answer(step, GAME, group, datetime.now(UTC), stored))
 
     async def _create(self, user_id: str, answer: Answer) -> None:
         key, data = answer_key(self._settings.project_id, user_id, answer.step), to_json(answer)
@@ -219,14 +223,14 @@ class Recorder:
 
 
 def _whose(settings: TrialSettings) -> dict[str, Any]:
-    """Whose recording it is. No participant's id stands in that of a session."""
+    """Return the fields that say whose recording it is. The recording of a session contains no participant's id."""
     return {"sessionId": settings.session, "group": settings.group} if settings.session else {"user": settings.user_id}
 
 
 def rules(config: TrialSection, players: Sequence[Player]) -> dict[str, Any]:
-    """By which rules several players act: what is needed to take the steps of a recording again.
+    """Return the fields of the header about the rules by which several players act: a replay needs them.
 
-    `idleActions` are the numbers that the environment was given for players whose `action` is null.
+    `idleActions`: the numbers of the actions that the environment was given for players whose `action` is null.
     """
     return {
         "pace": config.pace,
@@ -237,9 +241,9 @@ def rules(config: TrialSection, players: Sequence[Player]) -> dict[str, Any]:
 
 
 def _with_actions(players: Mapping[str, Any], opening: OpenRecording) -> dict[str, Any]:
-    """What is said of each player, with its actions if they are others than those of the first human."""
+    """Add to each player's description the names of its actions, if they differ from the first human's."""
     spaces = {player.name: player.action_space for player in opening.players}
     return {
-        name: {**said, **({} if spaces[name] == opening.action_space else {"actionSpace": list(spaces[name])})}
-        for name, said in players.items()
+        name: {**described, **({} if spaces[name] == opening.action_space else {"actionSpace": list(spaces[name])})}
+        for name, described in players.items()
     }

@@ -1,13 +1,14 @@
-"""Recordings: gzip of JSON lines, one line per step, readable to the last flush whatever happens to the process.
+"""Recordings: gzip of JSON lines, one line per step. All lines up to the last flush can be read after any crash.
 
-Kinds of lines: `header` (first of each file), `reset` (an episode begins), `resume` (it goes on after a lost server's
-steps), `step`, `callback` (what a callback of the agent recorded), `error` (the researcher's code raised), `end` (an
-episode or the file ends) and `break` (the break after it ends). Nothing is pickled.
+Kinds of lines: `header` (the first of each file), `reset` (an episode begins), `resume` (it goes on after the steps of
+a lost server), `step`, `callback` (values that a callback of the agent recorded), `error` (the researcher's code
+failed), `end` (an episode ends, or the server must end), `break` (a break ends), and in a session `presence` and
+`ping`. Nothing is pickled.
 
-A `step` tells the choice of its action: `human` is the index of the action that the participant's keys asked for (null
-if no key acted); `action` and `actionName` are the one that was taken; `by` is its origin: `agent` (the agent reports
-it as its own, even if it is the human's), or one of `trial.core.actions.By`. Times are UTC:
-2026-11-21T14:46:40.123456Z. docs/data.md says what else the lines hold, also where several players play.
+A `step` says how its action was chosen. `human` is the number of the action that the participant's keys chose (null if
+no key acted). `action` and `actionName` are the action taken. `by` is who chose it: `agent` (the agent reports the
+action as its own, even if it is the human's), or one of `trial.core.actions.By`. Times are UTC:
+2026-11-21T14:46:40.123456Z. docs/data.md describes all fields, and those of several players.
 """
 
 from __future__ import annotations
@@ -35,35 +36,36 @@ from protocol.times import time_text
 from trial.recordings.recorded_values import CUT_OFF, LISTED, Values, text_of
 
 SCHEMA = 1
+"""The version of the lines' format."""
 VERSION = "1.0"
-"""Of the trial server; in the head of each recording."""
+"""The version of the trial server, in the header of each recording."""
 SYNC_SECONDS = 5.0
-"""An open recording is synced to the disk this often: a power cut takes no more of it."""
+"""The time between two syncs of an open recording to the disk: a power cut loses at most the lines of this time."""
 MAX_EXTRA_BYTES = 1_000_000
-"""Of what an agent's `step` returns beside Gymnasium's values, as JSON, in one line."""
+"""The most bytes of JSON in one line for the values that an agent's `step` returns beside Gymnasium's."""
 MOST_TOO_LARGE = 100
-"""Values of one line that are replaced by their sizes; those after them are left out."""
+"""The most values of one line that are replaced by their sizes; the values after them are left out."""
 LONGEST_NAME = 1_000
-"""Characters of the name of such a value, if it is too large itself."""
+"""The most characters of a value's name, if there is no room for the whole name."""
 
 
 def line(kind: str, /, **fields: Any) -> bytes:
-    """One line of a recording; values that are not JSON are made so. `time` may be a moment in UTC."""
+    """Build a line of a recording. `plain` converts values that JSON cannot hold. `time` may be a datetime in UTC."""
     record = {"kind": kind, **fields}
     if isinstance(fields.get("time"), datetime):
         record["time"] = time_text(fields["time"])
     try:
         text = _JSON.encode(record)
-    except Exception:  # noqa: BLE001 - NaN, keys that are no text, circles, what raises: rare, so not looked for first
+    except Exception:  # noqa: BLE001 - NaN, keys that are not text, cycles, errors: too rare to look for them first
         text = _JSON.encode(plain(record))
     return text.encode() + b"\n"
 
 
 class LaterLine:
-    """A line whose text is made when it is written. Nothing may change its values until then.
+    """A line whose text is built when it is written. Nothing may change its values until then.
 
-    Made together, the lines of half a second find everything in the processor's cache: a tick of two participants takes
-    3 % less than with each line made in its step.
+    Building the lines of half a second together uses the processor's cache better: a step of two participants takes 3 %
+    less time than if each line is built in its step.
     """
 
     __slots__ = ("_fields", "_kind")
@@ -73,20 +75,20 @@ class LaterLine:
         self._fields = fields
 
     def text(self) -> bytes:
-        """The line."""
+        """Build the line."""
         return line(self._kind, **self._fields)
 
 
 Line = bytes | LaterLine
 
 
-def text_of_line(one: Line) -> bytes:
-    """The line itself."""
-    return one if isinstance(one, bytes) else one.text()
+def text_of_line(line: Line) -> bytes:
+    """Return the bytes of a line; build them if necessary."""
+    return line if isinstance(line, bytes) else line.text()
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON can hold it: numpy as numbers and lists, NaN as null, what is left by its text."""
+    """Convert a value for JSON: NumPy's numbers and arrays to numbers and lists, NaN to null, other objects to text."""
     return Values().keep(value)
 
 
@@ -94,40 +96,40 @@ _JSON = json.JSONEncoder(default=plain, separators=(",", ":"), allow_nan=False)
 
 
 def observation(value: Any) -> Any:
-    """An observation as a recording keeps it: arrays as base64 of zlib of their bytes, with dtype and shape."""
+    """Convert an observation for a recording: arrays to base64 of zlib of their bytes, with dtype and shape."""
     return Values(listed=-1).keep(value)
 
 
 def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tuple[dict[str, Any], dict[str, int]]:
-    """What an agent's `step` returned beside Gymnasium's values, as a recording keeps it, and what is too large.
+    """Convert the values that an agent's `step` returned beside Gymnasium's for a recording, `left` bytes at most.
 
-    A value that does not fit into `left` bytes together with those before it is replaced by
-    `{"tooLarge": bytes}`. The second result says which, and how large they are at least. After `MOST_TOO_LARGE` such
-    values the rest is left out, and `"<cut off>"` is how many these are.
+    A value that does not fit together with those before it is replaced by `{"tooLarge": bytes}`. The second result has
+    the least sizes of these values, by name. After `MOST_TOO_LARGE` of them the rest is left out, and `"<cut off>"` is
+    the number of values left out.
     """
-    kept: dict[str, Any] = {}
+    recorded: dict[str, Any] = {}
     too_large: dict[str, int] = {}
     for index, (key, value) in enumerate(values.items()):
         if len(too_large) == MOST_TOO_LARGE:
-            kept[CUT_OFF] = len(values) - index
+            recorded[CUT_OFF] = len(values) - index
             break
         name = text_of(key)
         if len(name) > left:
             name = name[:LONGEST_NAME]
         reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
-        fit = reader.keep(value)
-        size = size_of(fit) + reader.left_out
+        converted = reader.keep(value)
+        size = size_of(converted) + reader.left_out
         if size > left or reader.exhausted:
             too_large[name] = size
-            fit = {"tooLarge": size}
+            converted = {"tooLarge": size}
         else:
             left -= size
-        kept[name] = fit
-    return kept, too_large
+        recorded[name] = converted
+    return recorded, too_large
 
 
 def is_settled(info: Any) -> bool:
-    """Whether an `info` holds a few small values that nothing can change."""
+    """Whether an `info` holds only a few small values, which are immutable."""
     return type(info) is dict and len(info) <= _FEW and all(map(_is_short, info)) and all(map(_is_short, info.values()))
 
 
@@ -143,71 +145,77 @@ _FIXED = frozenset({float, bool, type(None)})
 
 
 def is_too_large(info: Mapping[str, Any]) -> bool:
-    """Whether an `info` has more than `MAX_EXTRA_BYTES` as JSON. A value that is too large alone is not read."""
+    """Whether an `info` has more than `MAX_EXTRA_BYTES` as JSON. A text or array that is too large is not converted."""
     reader = Values(most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
-    kept = reader.keep(info)
-    return reader.exhausted or size_of(kept) > MAX_EXTRA_BYTES
+    converted = reader.keep(info)
+    return reader.exhausted or size_of(converted) > MAX_EXTRA_BYTES
 
 
-def size_of(kept: Any) -> int:
-    """Bytes of a value that is plain already, as JSON."""
-    return len(json.dumps(kept, separators=(",", ":")))
+def size_of(converted: Any) -> int:
+    """Return the bytes of a converted value as JSON."""
+    return len(json.dumps(converted, separators=(",", ":")))
 
 
-def read_observation(kept: Any) -> Any:
-    """Undo `observation` for one array."""
-    pixels = zlib.decompress(base64.b64decode(kept["zlib"]))
-    return np.frombuffer(pixels, dtype=np.dtype(kept["dtype"])).reshape(kept["shape"])
+def read_observation(recorded: Any) -> Any:
+    """Return the array that `observation` has converted."""
+    data = zlib.decompress(base64.b64decode(recorded["zlib"]))
+    return np.frombuffer(data, dtype=np.dtype(recorded["dtype"])).reshape(recorded["shape"])
 
 
 OF_SEVERAL = ("pettingzoo", "onnxruntime")
-"""Packages that may change how a game of several players plays."""
+"""Further packages whose versions a recording names if several players play."""
 
 
 REQUIRED = Path(__file__).resolve().parents[2] / "requirements/project.txt"
-"""In the servers' image, the lines of the project's requirements.txt."""
+"""In the servers' image: a copy of the project's requirements.txt."""
 _PACKAGE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _MOST_PACKAGES = 100
 
 
 @functools.cache
 def packages(agent_dir: Path) -> tuple[str, ...]:
-    """The packages that the project's requirements.txt names: its games are among them."""
+    """Return the packages that the project's requirements.txt names, such as those of its games."""
     names: dict[str, None] = {}
     for file in (agent_dir / "requirements.txt", REQUIRED):
         with contextlib.suppress(OSError, UnicodeDecodeError):
-            found = map(_PACKAGE.match, map(str.strip, file.read_text(encoding="utf-8-sig").splitlines()))
-            names |= dict.fromkeys(each[0] for each in found if each)
+            matches = map(_PACKAGE.match, map(str.strip, file.read_text(encoding="utf-8-sig").splitlines()))
+            names |= dict.fromkeys(match[0] for match in matches if match)
     return tuple(names)[:_MOST_PACKAGES]
 
 
 def versions(more: Iterable[str] = ()) -> dict[str, str]:
-    """Versions of what may change how a game plays; of these packages, too, as far as they are installed."""
+    """Return the versions of Python, this server, and the packages that may change how a game plays, if installed.
+
+    `more` are the names of further packages.
+    """
     return dict(_versions(tuple(more)))
 
 
 @functools.cache
 def _versions(more: tuple[str, ...]) -> Mapping[str, str]:
-    found = {"trial": VERSION, "python": platform.python_version()}
+    installed = {"trial": VERSION, "python": platform.python_version()}
     for name in dict.fromkeys(("gymnasium", "ale-py", "numpy", "websockets", *more)):
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 class Recording:
-    """One file being written. `add` only remembers; `flush` writes, and may be called from another thread."""
+    """A recording's file that is being written. `add` collects lines; `flush` and `close` write them, on any thread.
+
+    Raises OSError if the file cannot be created, FileExistsError if it exists.
+    """
 
     def __init__(self, path: Path, key: str) -> None:
+        """`path` is where it is written, `key` the document in the store that it becomes."""
         self.path = path
         self.key = key
-        """Where the finished file belongs in the store."""
         disk.make_folder(path.parent)
         self._file = path.open("xb", buffering=0)
         self._synced = time.monotonic()
-        self._named = False  # whether the file's name is on the disk
+        self._folder_synced = False  # before that, a power cut may lose the file's name
         self._gzip = zlib.compressobj(6, zlib.DEFLATED, 31)
         self._lines: list[Line] = []
         self._packed = b""
@@ -217,17 +225,17 @@ class Recording:
 
     @property
     def dirty(self) -> bool:
-        """There is something that `flush` would write."""
+        """Whether there are lines to write."""
         return bool(self._lines or self._packed)
 
-    def add(self, one: Line) -> None:
-        """Remember one line."""
-        self._lines.append(one)
+    def add(self, line: Line) -> None:
+        """Collect a line."""
+        self._lines.append(line)
 
     def flush(self) -> None:
-        """Bring all lines to the file, so that they can be read even if the process is killed. Raises OSError.
+        """Write all lines to the file, from which they can be read even if the process is killed. Raises OSError.
 
-        Every few seconds (`SYNC_SECONDS`) they are also brought to the disk, where a power cut does not harm them.
+        Every `SYNC_SECONDS` also sync the file to the disk, so that a power cut does not lose them.
         """
         with self._lock:
             self._write(zlib.Z_SYNC_FLUSH)
@@ -235,9 +243,9 @@ class Recording:
                 self._sync()
 
     def close(self) -> None:
-        """Write what is left and the end of the gzip stream, all of it to the disk.
+        """Write the last lines and the end of the gzip stream, and sync the file to the disk.
 
-        Raises OSError; may then be called again.
+        Raises OSError; then it may be called again.
         """
         with self._lock:
             if self.closed:
@@ -249,23 +257,23 @@ class Recording:
 
     def _sync(self) -> None:
         os.fsync(self._file.fileno())
-        if not self._named:
+        if not self._folder_synced:
             disk.sync_folder(self.path.parent)
-            self._named = True
+            self._folder_synced = True
         self._synced = time.monotonic()
 
-    def _write(self, how: int) -> None:
+    def _write(self, flush_mode: int) -> None:
         if self.closed:
             return
         lines, self._lines = self._lines, []
-        if not self._finished and (lines or how == zlib.Z_FINISH):
-            self._packed += self._gzip.compress(b"".join(map(text_of_line, lines))) + self._gzip.flush(how)
-            self._finished = how == zlib.Z_FINISH
-        while self._packed:  # kept until it is written, so that a full disk loses nothing
+        if not self._finished and (lines or flush_mode == zlib.Z_FINISH):
+            self._packed += self._gzip.compress(b"".join(map(text_of_line, lines))) + self._gzip.flush(flush_mode)
+            self._finished = flush_mode == zlib.Z_FINISH
+        while self._packed:  # it stays here until it is written, so that a full disk loses nothing
             self._packed = self._packed[self._file.write(self._packed) :]
 
 
 def read(data: bytes) -> list[dict[str, Any]]:
-    """The lines of a recording, also of one cut off in the middle."""
+    """Return the complete lines of a recording, also of one that is cut off anywhere."""
     text = zlib.decompressobj(31).decompress(data)
     return [json.loads(part) for part in text.split(b"\n")[: text.count(b"\n")]]

@@ -1,8 +1,8 @@
-"""What earlier servers of the participant recorded of a step, so that an interrupted game goes on where it was.
+"""Reads what earlier servers have recorded of a game step, so that an interrupted game goes on where it was.
 
-A lost server, such as one that Spot took back, is replaced by another. If the environment is deterministic (the same
-seed and the same actions give the same rewards), the interrupted episode is replayed up to its last recorded step,
-without frames and without pauses; otherwise it begins again. Episodes that were over count as before.
+Another server replaces a lost one, such as one that Spot took back. If the environment is deterministic (the same seed
+and actions give the same rewards), the interrupted episode is replayed up to its last recorded step, without frames and
+pauses; otherwise it begins again. Episodes that were over count as before.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ _ATTEMPT = re.compile(r"(.+)-([0-9]{1,3})")
 
 
 def load_recorded(store: Store, folder: str, server: str, step: str) -> RecordedTrial | None:
-    """Read the recordings of a step by the servers before this one; None if there are none.
+    """Read the recordings that the servers before this one have made of a step; None if there are none.
 
-    The participant's recordings lie in `folder`. `server` is this server's name, which ends in the number of its
-    attempt. Blocks; raises the store's errors.
+    `folder` has the recordings of the participant or session. `server` is this server's name, which ends in the number
+    of its attempt. Blocks; raises the store's errors.
     """
-    named = _ATTEMPT.fullmatch(server)
-    if named is None:
+    match = _ATTEMPT.fullmatch(server)
+    if match is None:
         return None
     recorded = RecordedTrial()
     found = False
-    for attempt in range(1, int(named[2])):
-        for lines in _recordings(store, f"{folder}/{named[1]}-{attempt}/{step}", recorded):
+    for attempt in range(1, int(match[2])):
+        for lines in _recordings(store, f"{folder}/{match[1]}-{attempt}/{step}", recorded):
             found = True
             add_lines(recorded, lines)
     return recorded if found else None
 
 
 def _recordings(store: Store, prefix: str, recorded: RecordedTrial) -> Iterable[list[dict[str, Any]]]:
-    """One server's recordings of the step, in order: one file for the trial, or one for each episode."""
+    """Yield the lines of one server's recordings of the step, in order: one file, or one for each episode."""
     whole = store.get(f"{prefix}-trial.jsonl.gz")
     if whole is not None:
         yield recording.read(whole)
@@ -57,7 +57,7 @@ def _recordings(store: Store, prefix: str, recorded: RecordedTrial) -> Iterable[
 
 
 def add_lines(recorded: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> None:
-    """Add a recording's lines. Lines of other kinds, and malformed ones, change nothing."""
+    """Add the lines of a recording to `recorded`. Lines of unknown kinds and malformed lines are ignored."""
     rate = 30.0
     for line in lines:
         with contextlib.suppress(KeyError, TypeError, ValueError):
@@ -78,7 +78,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
     elif kind == "break":
         ends = {"stop": "stopped", PARTNER_LEFT: PARTNER_LEFT}.get(line["why"])
         if ends is not None and recorded.ended and recorded.ended[-1].number == number:
-            recorded.ended[-1] = replace(recorded.ended[-1], why=ends)  # the trial ended in the break after it
+            recorded.ended[-1] = replace(recorded.ended[-1], why=ends)  # the trial ended in the episode's break
     elif current is None or number != current.number:
         return
     elif kind == "resume":
@@ -88,7 +88,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         current.steps.append(_step(line, words))
         current.unheard = []
         recorded.seconds += 1.0 / rate
-        if line.get("terminated") or line.get("truncated"):  # over, even if its `end` was not written any more
+        if line.get("terminated") or line.get("truncated"):  # over, even if the server was lost before the line `end`
             _end(recorded, current, "terminated" if line.get("terminated") else "truncated")
     elif kind == "end" and line["why"] == "shutdown":
         current.unheard = _feedback(line)
@@ -97,7 +97,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
 
 
 def _step(line: Mapping[str, Any], words: tuple[Word, ...]) -> RecordedStep:
-    # What the environment was given: the action itself, unless the agent took another one than it was asked for.
+    # The action that the agent was asked to take: that of the line, unless the agent reported another one (`agent`).
     advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
     parts = line.get("players") or {}
     players = {
@@ -113,5 +113,5 @@ def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
 
 
 def _feedback(line: Mapping[str, Any]) -> list[Word]:
-    said = (message for message in line.get("messages", ()) if is_feedback(message.get("command")))
-    return [Word(message["command"], message.get("player")) for message in said]
+    feedback = (message for message in line.get("messages", ()) if is_feedback(message.get("command")))
+    return [Word(message["command"], message.get("player")) for message in feedback]

@@ -1,4 +1,4 @@
-"""Where recordings are written, and how they get into the store: nothing is lost or overwritten."""
+"""The folder where recordings are written, and their way into the store: no recording is lost or overwritten."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from trial.settings import TrialSettings
 T = TypeVar("T")
 log = logging.getLogger("trial")
 
-_LONGEST_PAUSE = 20.0
+_LONGEST_PAUSE = 20.0  # seconds
 
 
 class Spool:
-    """The folder where recordings are written before they are stored."""
+    """The folder where recordings are written before they are stored: SPOOL, the store's folder, or a temporary one."""
 
     def __init__(self, settings: TrialSettings, store: Store) -> None:
         self.local_only = not settings.trial.s3upload
@@ -36,7 +36,7 @@ class Spool:
             self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
 
     def open(self, key: str) -> Recording:
-        """A new recording for the key, or for the key with a number if there is one already. Raises OSError."""
+        """Open a new recording for this key; if there is one, for the key with a number. Raises OSError."""
         for number in range(1, 100):
             numbered = with_number(key, number)
             path = self.folder / f"{numbered}.part"
@@ -47,13 +47,16 @@ class Spool:
         raise FileExistsError(key)
 
     def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
-        """Recordings of this server that a killed process left here, with their keys."""
+        """Return the recordings with this prefix that a killed process has left here: their keys and paths."""
         paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
         return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
 
 
 async def store_file(store: Store, key: str, path: Path) -> None:
-    """Store a closed recording under its key, or its key with a number if that is taken; then remove the file."""
+    """Store a closed recording under its key, or under the key with a number if that exists; then delete the file.
+
+    Errors are retried for ever.
+    """
     for number in count(1):
         attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
         if await retry_forever("store a recording", attempt):
@@ -61,13 +64,13 @@ async def store_file(store: Store, key: str, path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
-async def retry_forever(what: str, attempt: Callable[[], Awaitable[T]]) -> T:
-    """Try until an attempt succeeds, with growing pauses; its result."""
+async def retry_forever(action: str, attempt: Callable[[], Awaitable[T]]) -> T:
+    """Call `attempt` until it succeeds, with growing pauses, and return its result. The log says "cannot `action`"."""
     pause = 0.5
     while True:
         try:
             return await attempt()
         except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
-            log.warning("cannot %s (%s); trying again in %g s", what, short_error(error), pause)
+            log.warning("cannot %s (%s); trying again in %g s", action, short_error(error), pause)
         await asyncio.sleep(pause)
         pause = min(2 * pause, _LONGEST_PAUSE)

@@ -1,4 +1,4 @@
-"""Where documents are stored, always under the same keys: a bucket, by presigned requests, or a folder."""
+"""The store of documents: a bucket, by presigned requests, or a folder. The keys are the same in both."""
 
 from __future__ import annotations
 
@@ -10,36 +10,39 @@ from trial.recordings.presigned import PresignedStore
 
 
 class Store(Protocol):
-    """Blocking calls; use them off the event loop. They raise OSError."""
+    """Reads and creates documents. The methods block: do not call them on the event loop. They raise OSError."""
 
     def get(self, key: str) -> bytes | None:
-        """The document, or None if there is none."""
+        """Return the document; None if there is none."""
         ...
 
     def look(self, key: str) -> bytes | None:
-        """The same, of a document that is read every few seconds; tries once."""
+        """Return the document as `get` does. For documents that are read every few seconds: errors are not retried."""
         ...
 
     def create(self, key: str, data: bytes | Path) -> bool:
-        """Store bytes or a file's content; False, and nothing changed, if the key exists."""
+        """Create a document of bytes or of a file's content. If the key exists, return False and change nothing."""
         ...
 
 
 def open_store(place: str, server: str = "", credential: str = "") -> Store:
-    """The store behind the address that signs requests, or in a folder."""
+    """Return the store for STORE: the bucket behind the address that signs requests, or a folder.
+
+    `server` and `credential` are shown to that address.
+    """
     if place.startswith(("https://", "http://")):
         return PresignedStore(place, server, credential)
     return FolderStore(Path(place).resolve())
 
 
 def short_error(error: BaseException) -> str:
-    """A store's error for the log, without the names of files and keys, which hold participants' ids."""
+    """Describe a store's error for the log, without file names and keys, which contain participants' ids."""
     kind = type(error).__name__
     return f"{kind}: {error.strerror}" if isinstance(error, OSError) else kind
 
 
 class FolderStore:
-    """Files under one folder. A file appears whole or not at all; once created, it outlives a power cut."""
+    """A store of files in a folder. A file is created whole or not at all, and survives a power cut afterwards."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

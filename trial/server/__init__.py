@@ -1,1 +1,1 @@
-"""The process of a participant's server: its life, its port, who gets in."""
+"""The process of a trial server: its lifetime, its port, and the admission of clients."""

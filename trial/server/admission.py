@@ -1,7 +1,7 @@
-"""Who is let in: a client's first message is checked, and whoever may not play now is told why.
+"""Admits clients: checks their first message, and tells those who may not play now why.
 
-`handshake.py` has each check. Here are their order, the wait until it is known who plays on this server, and what a
-member of a session has to have done before.
+The checks are in `handshake.py`. This module decides their order, waits until the server knows who plays there, and
+checks that a member of a session has answered the game steps before.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ _TOO_OFTEN = "You connect too often. Please wait: it is tried again."
 
 
 class Admission:
-    """Lets in the participant of this server, or the members of its session.
+    """Admits the participant of this server, or the members of its session.
 
-    `settings` returns those of now: a server may learn only later who plays there. `finished_steps` are the game steps
-    whose answers are stored, those of all members.
+    `settings` returns the present settings: a server may learn only later who plays there. `finished_steps` are the
+    game steps whose answers are stored, in a session those of all members.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Admission:
         self._reconnects = Reconnects()
 
     async def admit(self, websocket: ServerConnection) -> Hello:
-        """The first message of a client who may play. Raises CloseConnection."""
+        """Wait for a client's first message, and return it if the client may play. Raises CloseConnection."""
         hello = await receive_hello(websocket, self._settings().hello_seconds)
         try:
             await self._check_client(websocket, hello)
@@ -72,25 +72,25 @@ class Admission:
         return hello
 
     async def _check_client(self, websocket: ServerConnection, hello: Hello) -> None:
-        """Raises CloseConnection unless this is a participant of this server, with the token where one is needed."""
+        """Raise CloseConnection unless this is the client of a participant of this server, with a token if needed."""
         before = self._settings()
         check_access(websocket, hello, tokens_for(before, hello.user_id), before.plain_origins)
         if not before.assigned:
             await self._wait_for_assignment(websocket)
         settings = self._settings()
-        if before.warm_server:  # now it is known which of the tokens counts
+        if before.warm_server:  # the server knows only now which of the tokens counts
             check_access(websocket, hello, tokens_for(settings, hello.user_id), settings.plain_origins)
         if settings.session:
             check_member(websocket, hello.user_id, settings)
         elif hello.token is None:
             check_matches(hello.user_id, settings.user_id, OTHER_ID)
-            if hello.project_id is not None:  # an id may take part in two studies, and its name leads to one server
+            if hello.project_id is not None:  # the id may take part in two studies, whose servers have the same name
                 check_matches(hello.project_id, settings.project_id, OTHER_STUDY)
         else:
             check_matches(hello.user_id, settings.user_id)
 
     async def _wait_for_assignment(self, websocket: ServerConnection) -> None:
-        """Look for the documents that say who plays here. Raises CloseConnection if they are not there in time."""
+        """Look once more for the documents that say who plays here. Raises CloseConnection if they do not exist yet."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings().hello_seconds):
                 await first_of(self._search.look(), websocket.wait_closed())
@@ -98,9 +98,10 @@ class Admission:
             raise CloseConnection(1013, NOT_ASSIGNED)
 
     async def _check_turn(self, user_id: str, step: str) -> None:
-        """Raises CloseConnection unless the member has answered every game step before this one.
+        """Raise CloseConnection unless the member has answered every game step before this one.
 
-        Else a member whose client names a later step would begin its game, and keep the others out of theirs.
+        Otherwise a client that names a later step would begin the game of that step, and the other members could not
+        enter the game of theirs.
         """
         settings = self._settings()
         steps = settings.game_steps
@@ -117,7 +118,7 @@ class Admission:
 
 
 async def first_of(*waits: Coroutine[Any, Any, Any]) -> None:
-    """Wait until the first of these is done; cancel the others."""
+    """Wait until the first of these coroutines is done, and cancel the others."""
     tasks = [asyncio.ensure_future(wait) for wait in waits]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

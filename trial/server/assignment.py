@@ -1,7 +1,8 @@
-"""Who plays on a server that was started before that was known: a warm server (`warmServers`), and that of a session.
+"""Finds out who plays on a server that was started ahead: a warm server (`warmServers`), or the server of a session.
 
-A warm server reads it in its handover (`protocol/handover.py`), which may name a session. Who the members of a session
-are stands in its document (`protocol/session.py`). Until these documents are there, the server refuses all clients.
+A warm server reads its handover (`protocol/handover.py`), which names a participant or a session. The server of a
+session reads the members in the session's document (`protocol/session.py`). Until these documents exist, the server
+refuses all clients.
 """
 
 from __future__ import annotations
@@ -22,27 +23,28 @@ from trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
 
-Found = Handover | SessionDocument
+AssignmentDocument = Handover | SessionDocument
+"""A document that says who plays on a server."""
 
 
-def assigned(settings: TrialSettings, found: Handover) -> TrialSettings:
-    """The settings of a warm server after its handover: those of an ordinary server, or of a session's."""
+def with_handover(settings: TrialSettings, found: Handover) -> TrialSettings:
+    """Return the settings of a warm server after its handover: those of a participant's or a session's server."""
     if is_session_id(found.user_id):
         return replace(settings, warm_server=False, session=found.user_id, group=found.group, server=found.server)
     return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
 
 
-def formed(settings: TrialSettings, found: SessionDocument) -> TrialSettings:
-    """The settings of a session's server once its members are known. Raises BadSession."""
+def with_members(settings: TrialSettings, found: SessionDocument) -> TrialSettings:
+    """Return the settings of a session's server with the members of the document. Raises BadSession."""
     if found.id != settings.session:
         raise BadSession("its document is that of another session")
     return replace(settings, players=found.players, members=found.members, group=found.group)
 
 
-def set_environment(environment: MutableMapping[str, str], found: Found | None) -> None:
-    """Let the researcher's code see who plays, as on an ordinary server; None: it is not known yet.
+def set_environment(environment: MutableMapping[str, str], found: AssignmentDocument | None) -> None:
+    """Set the variables that tell the researcher's code who plays. None: no one is known yet, so remove them.
 
-    In a session it sees the session's id and group, and no participant's id.
+    In a session they are the session's id and group; no variable holds a participant's id.
     """
     for name in (*variables.PARTICIPANT, variables.SESSION):
         environment.pop(name, None)
@@ -55,10 +57,7 @@ def set_environment(environment: MutableMapping[str, str], found: Found | None) 
 
 
 class Search:
-    """Looks for the documents that say who plays, until they are there: at intervals, and when `look` is called.
-
-    The interval is `warm_server_seconds` of the settings.
-    """
+    """Looks for the documents that say who plays: every `warm_server_seconds` (settings), and when `look` is called."""
 
     def __init__(self, store: Store, settings: TrialSettings) -> None:
         self._store = store
@@ -67,10 +66,13 @@ class Search:
         self._looked = asyncio.Event()
         self._logged = ""
 
-    async def run(self, assign: Callable[[TrialSettings, Found], Awaitable[None]]) -> None:
-        """Look until all is known. `assign` is told of each document; it has returned before any `look` returns."""
+    async def run(self, assign: Callable[[TrialSettings, AssignmentDocument], Awaitable[None]]) -> None:
+        """Look until the server is assigned. Call `assign` with each document and the settings that follow from it.
+
+        `assign` has returned before a `look` returns that found the document.
+        """
         while not self._settings.assigned:
-            looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next one
+            looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next pass
             self._asked.clear()
             while not self._settings.assigned and (found := await self._find()) is not None:
                 self._settings, document = found
@@ -84,13 +86,13 @@ class Search:
                     await self._asked.wait()
 
     async def look(self) -> None:
-        """Look once more, from now on, and wait for its end."""
+        """Look once more now, and wait until that is done."""
         looked = self._looked
         self._asked.set()
         await looked.wait()
 
-    async def _find(self) -> tuple[TrialSettings, Found] | None:
-        """The next document, and the settings with what it says."""
+    async def _find(self) -> tuple[TrialSettings, AssignmentDocument] | None:
+        """Return the next document that is found, and the settings that follow from it; None if there is none yet."""
         settings, found, problem = self._settings, None, ""
         try:
             body = await asyncio.to_thread(self._store.get, _key(settings))
@@ -106,16 +108,16 @@ class Search:
 
 
 def _key(settings: TrialSettings) -> str:
-    """The key of the document that says what is not known yet."""
+    """Return the key of the document that a server with these settings still needs."""
     if settings.warm_server:
         return handover_key(settings.project_id, settings.server)
     return session_key(settings.project_id, settings.session)
 
 
-def _read(settings: TrialSettings, body: bytes) -> tuple[TrialSettings, Found]:
-    """Raises BadHandover and BadSession."""
+def _read(settings: TrialSettings, body: bytes) -> tuple[TrialSettings, AssignmentDocument]:
+    """Parse the document, and return it with the settings that follow from it. Raises BadHandover and BadSession."""
     if settings.warm_server:
-        given = handover.parse(body)
-        return assigned(settings, given), given
-    members = session.parse(body)
-    return formed(settings, members), members
+        assigned = handover.parse(body)
+        return with_handover(settings, assigned), assigned
+    formed = session.parse(body)
+    return with_members(settings, formed), formed

@@ -1,6 +1,6 @@
-"""The callbacks of a trial beside its game: who comes, leaves and returns, and lines that stand in order.
+"""Calls the agent's callbacks when participants come, leave and return, and orders the lines that callbacks record.
 
-The methods of `TrialCallbacks` are called on the event loop. What they submit runs on the agent's thread.
+The methods of `TrialCallbacks` are called on the event loop. The work that they submit runs on the agent's thread.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from trial.agent.worker import Worker
 from trial.core.effects import TellMoved
 from trial.recordings.recording import Line
 
-_MOVES = 4  # moves that wait until callbacks are told; of more, a leave and the return after it cancel out
+_MOVES = 4  # if so many moves wait for a callback, a return cancels the leave before it
 
 
 class TrialCallbacks:
-    """Tells the agent's callbacks who has come, left or returned, and writes the lines that callbacks recorded."""
+    """Tells the agent's callbacks who has come, left or returned (a *move*), and writes the lines that they record."""
 
     def __init__(
         self,
@@ -31,7 +31,10 @@ class TrialCallbacks:
         is_open: Callable[[], bool],
         is_over: Callable[[], bool],
     ) -> None:
-        """`limit`: seconds for one move. `write` writes a line while a recording `is_open`. `is_over`: the trial."""
+        """`limit`: seconds for the callback of one move. `write` writes a line to the recording, if one `is_open`.
+
+        `is_over` returns whether the trial is over.
+        """
         self._worker = worker
         self._limit = limit
         self._is_over = is_over
@@ -39,28 +42,30 @@ class TrialCallbacks:
         self._is_open = is_open
         self._loop = asyncio.get_running_loop()
         self._callbacks: Callbacks | None = None
-        self._recorded = 0  # lines of callbacks by the end of the last piece of work
-        self._moves: deque[TellMoved] = deque()  # the first is being told
+        self._recorded = 0  # the number of lines that callbacks had recorded at the end of the last work that is done
+        self._moves: deque[TellMoved] = deque()  # a callback is being told of the first
 
     @property
     def busy(self) -> bool:
-        """A callback has not returned, and may never."""
+        """Whether a callback has not returned, and may never."""
         return self._callbacks is not None and self._callbacks.busy
 
     def begin(self, callbacks: Callbacks) -> None:
-        """The agent has started: these are its callbacks."""
+        """The agent has started. `callbacks` are those that it has."""
         self._callbacks = callbacks
 
     def close(self) -> None:
-        """The trial is over: the callbacks' thread ends."""
+        """End the callbacks' thread, because the trial is over."""
         if self._callbacks:
             self._callbacks.close()
 
     def on_agent(self, work: Callable[[], Any], limit: float, done: Callable[[Any, Exception | None], None]) -> None:
-        """Do `work` on the agent's thread; `done` gets its result, or None and its error.
+        """Do `work` on the agent's thread, and call `done` with its result, or with None and its error.
 
-        The thread may be at the next piece of work when `done` is called. Lines that callbacks recorded during that one
-        are not written yet.
+        The error is AgentTimeout if the work has not returned after `limit` seconds.
+
+        The thread may do the next work already when `done` is called. So the lines that callbacks have recorded by the
+        end of this work are counted, and `write_lines` writes only these.
         """
 
         def finished(found: tuple[Any, int] | None, error: Exception | None) -> None:
@@ -70,20 +75,24 @@ class TrialCallbacks:
         self._worker.submit(lambda: (work(), self._recorded_now()), limit, finished)
 
     def write_lines(self) -> None:
-        """Write what callbacks recorded by the end of the last piece of work, if a recording is open."""
+        """If a recording is open, write the lines that callbacks had recorded by the end of the last finished work."""
         if self._callbacks and self._is_open():
             for line in self._callbacks.take(self._recorded):
                 self._write(line)
 
     def late(self, recorded: int) -> None:
-        """A callback for which the game did not wait has returned: write its lines. Called on the callbacks' thread."""
+        """A callback for which the game did not wait has returned: write its lines. Called on the callbacks' thread.
+
+        `recorded`: the number of lines that callbacks have recorded by then.
+        """
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._write_late, recorded)
 
     def tell_moved(self, effect: TellMoved) -> None:
-        """Tell a callback on the agent's thread, between two calls, so that it sees the environment at rest.
+        """Tell a callback of a move, on the agent's thread between two calls: no step is being taken meanwhile.
 
-        One move after the other, with calls in between. If many wait, a participant who left and returned did not move.
+        The moves are told one by one, and calls of the agent come in between. If `_MOVES` wait, a participant who has
+        left and returned counts as not having moved.
         """
         moves = self._moves
         if not self._callbacks:

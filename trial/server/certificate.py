@@ -1,4 +1,4 @@
-"""The certificate of an encrypted connection: fetched when the server starts, and again while it runs."""
+"""The certificate of the server's TLS: fetched when the server starts, and again while it runs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from trial.settings import SettingsError, TrialSettings
 RELOAD_SECONDS = 3600.0
 
 
-class Pair(NamedTuple):
-    """A chain and its key (PEM) that fit, and the two files they come from."""
+class CertificatePair(NamedTuple):
+    """A certificate chain and a key (PEM) that fit each other, and the two files from which they were taken."""
 
     chain: bytes
     key: bytes
@@ -24,10 +24,10 @@ class Pair(NamedTuple):
 
 
 class Certificate:
-    """A server's SSL context, and where its files are. `context` stays the same object.
+    """A server's certificate, and the SSL context with it. `context` stays the same object.
 
-    The key's file may hold its chain as well; those that Hippodrome orders do. That chain is used if the other file
-    does not fit or is missing, because the two were read while a new certificate replaced them.
+    The key's file may hold the chain, too, as in the certificates that Hippodrome orders. This chain is used if the
+    chain's own file is missing or does not fit, because the files were read while a new certificate replaced them.
     """
 
     def __init__(self, settings: TrialSettings, store: Store) -> None:
@@ -39,47 +39,50 @@ class Certificate:
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
 
     def load(self) -> bool:
-        """`fetch` and `use`, before there are connections; False if they are the ones in use. Blocks."""
-        found = self.fetch()
-        if found is not None:
-            self.use(found)
-        return found is not None
+        """Fetch the certificate and use it, before there are connections. Return False if it is in use already. Blocks.
 
-    def fetch(self) -> Pair | None:
-        """The pair to use from now on; None if it is in use already. Blocks: not on the event loop.
-
-        Raises SettingsError if a file is missing, ssl.SSLError if they do not fit, and the store's own errors.
+        Raises as `fetch`.
         """
-        with ThreadPoolExecutor(2) as both:  # each takes two round trips, and participants wait for the server
-            chain, key = both.map(self._store.get, (self._chain_key, self._private_key))
-        alone = key is not None and b"-----BEGIN CERTIFICATE" in key
-        if key is None or (chain is None and not alone):
+        fetched = self.fetch()
+        if fetched is not None:
+            self.use(fetched)
+        return fetched is not None
+
+    def fetch(self) -> CertificatePair | None:
+        """Fetch the files, and return the chain and key to use; None if they are in use already. Blocks.
+
+        Raises SettingsError if a file is missing, ssl.SSLError if the files do not fit, and the store's errors.
+        """
+        with ThreadPoolExecutor(2) as pool:  # both at once: each takes two round trips, and participants wait
+            chain, key = pool.map(self._store.get, (self._chain_key, self._private_key))
+        key_has_chain = key is not None and b"-----BEGIN CERTIFICATE" in key
+        if key is None or (chain is None and not key_has_chain):
             raise SettingsError("the certificate's files are not where SSL_FULLCHAIN and SSL_PRIVKEY say")
         if (chain, key) == self._files:
             return None
-        # Tried on a context of its own: OpenSSL forgets its key when it is given a chain that does not fit, and the
+        # Tried on another context: if OpenSSL is given a chain that does not fit, the context loses its key, and the
         # server would refuse every connection.
-        trial = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        probe = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         try:
-            _load(trial, chain or key, key)
+            _load(probe, chain or key, key)
         except ssl.SSLError:
-            if not alone:
+            if not key_has_chain:
                 raise
-            _load(trial, key, key)
-            return Pair(key, key, (chain, key))
-        return Pair(chain or key, key, (chain, key))
+            _load(probe, key, key)
+            return CertificatePair(key, key, (chain, key))
+        return CertificatePair(chain or key, key, (chain, key))
 
-    def use(self, found: Pair) -> None:
-        """Use it for connections from now on. On the event loop, once there are connections.
+    def use(self, pair: CertificatePair) -> None:
+        """Use the pair for connections from now on. Once the server listens, call it on the event loop only.
 
-        Takes about a millisecond. In between the context has a chain and no key, and no client may connect.
+        It takes about a millisecond, in which the context has a chain without its key: no client may connect then.
         """
-        _load(self.context, found.chain, found.key)
-        self._files = found.files
+        _load(self.context, pair.chain, pair.key)
+        self._files = pair.files
 
 
 def _load(context: ssl.SSLContext, chain: bytes, key: bytes) -> None:
-    # load_cert_chain reads files only; these are the owner's alone (0700, 0600) and gone at once.
+    # load_cert_chain reads files only. These can be read by this user alone (0700, 0600), and are deleted at once.
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder, name) for name in ("chain.pem", "key.pem")]
         for path, data in zip(paths, (chain, key), strict=True):

@@ -1,4 +1,4 @@
-"""What a server needs for a game that is drawn by objects: its images, and how its scenes become pictures."""
+"""The images of a game that is drawn by objects, and its scenes as pixels for clients that do not draw scenes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ log = logging.getLogger("trial")
 
 
 class Drawing:
-    """Of a project without a `section` (`trial.scene`) there are no images, and its `render()` returns pixels.
+    """The images of a project, and what reads and draws its pictures.
 
-    What is wrong with images and objects goes into the log, each sentence once.
+    Problems with images and objects are logged, each sentence once.
     """
 
     def __init__(self, section: SceneSection | None, project: Path) -> None:
-        """Read the project's images."""
+        """Read the project's images. `section` is `trial.scene`; None: no images, since `render()` returns pixels."""
         self._section = section
         self.assets = Assets() if section is None else assets.load(project, section.assets)
         self.reader = PictureReader(section, self.assets, log.warning)
@@ -35,7 +35,7 @@ class Drawing:
             log.warning(problem)
 
     def draw(self, scene: Scene) -> Frame:
-        """The scene as pixels, for a client that does not draw scenes. Any thread may call it."""
+        """Draw the scene as pixels. May be called on any thread."""
         if self._raster is None:
             from trial.pictures.raster import Raster  # noqa: PLC0415 - most servers never need it
 

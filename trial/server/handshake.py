@@ -1,4 +1,4 @@
-"""How a connection begins: plain HTTP is answered, a subprotocol chosen, and the first message must authenticate."""
+"""The checks at the beginning of a connection: its HTTP request, its subprotocol, its first message and its token."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ OTHER_ORIGIN = (
 OTHER_ID = "This page cannot open the game: the game is that of another participant. Please open your own link."
 OTHER_STUDY = "This page cannot open the game: the game is that of another study. Please open your own link."
 REFUSED_MESSAGES_A_SECOND = 20
-"""What a client may send that has been refused and stays."""
+"""The most messages in a second of a client that is refused and whose connection stays open."""
 
 
 def process_request(
     websocket: ServerConnection, request: Request, *, gym: str = "none", token: str = ""
 ) -> Response | None:
-    """The answer to a request that is no WebSocket's; None lets the handshake go on.
+    """Answer an HTTP request that opens no WebSocket; None: go on with the WebSocket's handshake.
 
-    The path of programs is there only if the section `trial` has another `gym` than none. A program that would make
-    environments is refused here, since its protocol has no words for it, unless it has the token.
+    The path of programs, /gym, exists only if `gym` (in the section `trial`) is not `none`. A program that asks for
+    environments must show the token here: later its protocol has no message for a refusal.
     """
     path = urlsplit(request.path).path
     if path == "/healthz":
@@ -69,14 +69,14 @@ def process_request(
 def select_subprotocol(
     websocket: ServerConnection, offered: Sequence[Subprotocol], *, gym: str = "none"
 ) -> Subprotocol | None:
-    """The best of those offered; None for a client of HIPPO's, and of Gymie's."""
+    """Return the preferred one of the subprotocols that the client offers; None for clients of HIPPO and Gymie."""
     if gym == "environments" and is_program(websocket):
         return environments.SUBPROTOCOL if environments.SUBPROTOCOL in offered else None
     return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
 
 
 async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
-    """The first message, with the token of the address if it names none. Raises CloseConnection."""
+    """Wait for the first message, and return it, with the address's token if it has none. Raises CloseConnection."""
     try:
         async with asyncio.timeout(seconds):
             data = await websocket.recv()
@@ -90,11 +90,11 @@ async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
 
 
 def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
-    """The tokens with which a client that says this id may play.
+    """Return the tokens with which a client that sends this id may play.
 
-    In a session it is the member's own (`protocol.session.member_token`). The server's token opens no session: who has
-    one member's token, or knows another member's id, cannot play in another's place. A warm server does not know yet
-    whether it will be a session's, so with either token it looks for its handover.
+    In a session each member has a token of their own (`protocol.session.member_token`), and the server's token does not
+    count. So no one can play in another member's place with their own token and the other's id. A warm server may still
+    become a session's: with either token, it looks for its handover.
     """
     named = user_id is not None and NAME.fullmatch(user_id) is not None
     own = (member_token(settings.token, user_id),) if user_id is not None and named else ()
@@ -104,9 +104,9 @@ def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
 
 
 def check_member(websocket: ServerConnection, user_id: str | None, settings: TrialSettings) -> None:
-    """Check that the participant is a member of the session, and that their client speaks ours. Raises CloseConnection.
+    """Check that the participant is a member of the session, and that their client has a subprotocol of ours.
 
-    What a client without a subprotocol sends along is recorded, and could hold another member's id.
+    Unknown fields of a client without a subprotocol are recorded, and could hold a member's id. Raises CloseConnection.
     """
     if user_id not in settings.seats:
         raise CloseConnection(4401, _REFUSED)
@@ -117,8 +117,8 @@ def check_member(websocket: ServerConnection, user_id: str | None, settings: Tri
 def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str], origins: Collection[str]) -> None:
     """Check that a client has one of the tokens, or needs none. Raises CloseConnection.
 
-    It needs none if it offers no subprotocol and its page is of one of `origins`: those of the project's front end, if
-    the installation allows such clients. Its id is compared afterwards.
+    It needs none if it has no subprotocol and its page is of one of `origins`: those of the project's front end, if
+    `plainClients` is on. The caller compares its id.
     """
     if hello.token is not None or websocket.subprotocol is not None:
         if not any(_matches(hello.token, token) for token in tokens):
@@ -130,7 +130,7 @@ def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str
 
 
 def check_matches(shown: str | None, expected: str, words: str = _REFUSED) -> None:
-    """Compare a token or an id in constant time. Raises CloseConnection."""
+    """Raise CloseConnection with `words` unless the token or id is the expected one. Compares in constant time."""
     if not _matches(shown, expected):
         raise CloseConnection(4401, words)
 
@@ -141,13 +141,13 @@ def _matches(shown: str | None, expected: str) -> bool:
 
 
 async def show_refusal(websocket: ServerConnection, words: str) -> None:
-    """Show the words on HIPPO's page, and keep the connection until the page closes it.
+    """Show the words on the page of HIPPO's front end, and keep the connection until the page closes it.
 
-    If the server closed it, that page would say that the game has ended, ask for the next step and connect again.
-    Raises CloseConnection for a flood, and ConnectionClosed.
+    If the server closed the connection, that page would say that the game has ended, ask for the next step and connect
+    again. Raises CloseConnection if the client sends too many messages, and ConnectionClosed.
     """
     await websocket.send(plain.sentence(words))
-    await websocket.send(notice.frame_message(words))  # in place of "please wait"
+    await websocket.send(notice.frame_message(words))  # instead of "please wait"
     rate, loop = RateLimit(REFUSED_MESSAGES_A_SECOND), asyncio.get_running_loop()
     async for _ in websocket:
         if rate.exceeded(loop.time()):
@@ -155,9 +155,9 @@ async def show_refusal(websocket: ServerConnection, words: str) -> None:
 
 
 def _origin(websocket: ServerConnection) -> str | None:
-    """Where the client's page comes from, as its browser says; None if it says nothing, or several things."""
-    sent = websocket.request.headers.get_all("Origin") if websocket.request is not None else []
-    return sent[0] if len(sent) == 1 else None
+    """Return the origin of the client's page, from the header that its browser sends; None unless there is just one."""
+    origins = websocket.request.headers.get_all("Origin") if websocket.request is not None else []
+    return origins[0] if len(origins) == 1 else None
 
 
 def is_program(websocket: ServerConnection) -> bool:
@@ -166,7 +166,7 @@ def is_program(websocket: ServerConnection) -> bool:
 
 
 def token_in_address(websocket: ServerConnection) -> str | None:
-    """What the address says as `token`."""
+    """Return the parameter `token` of the address that the client has opened; None if there is none."""
     request = websocket.request
     tokens = parse_qs(urlsplit(request.path).query).get("token") if request is not None else None
     return tokens[0] if tokens else None

@@ -1,4 +1,4 @@
-"""When the server ends: when it is asked to, when no participant is connected for long, and at its deadline."""
+"""Ends the server: when it is asked to, when no participant has been connected for long, and at its deadline."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from collections.abc import Callable
 from trial.server.watchdog import Watchdog
 from trial.settings import TrialSettings
 
-_LOOK_AGAIN_SECONDS = 5.0
-_LONGEST_TIMER = 86400.0  # the event loop refuses an infinite time
+_LOOK_AGAIN_SECONDS = 5.0  # until an idle server that still stores something is looked at again
 
 
 class Lifetime:
-    """Ends the server once, with a reason. `saving` tells whether an idle server has still something to store."""
+    """Ends the server once, with a reason. `saving` returns whether the server still has something to store."""
 
     def __init__(self, settings: TrialSettings, saving: Callable[[], bool]) -> None:
         self._loop = asyncio.get_running_loop()
         self._saving = saving
         self._ended: asyncio.Future[str] = self._loop.create_future()
         self._timer: asyncio.TimerHandle | None = None
-        # The clock of the deadline is the wall's; everything else counts seconds of the loop's clock.
+        # The deadline is a time of the system's clock. The watchdog gets all times by the loop's monotonic clock.
         deadline = None if settings.deadline is None else self._loop.time() + settings.deadline - time.time()
         self._watchdog = Watchdog(
             now=self._loop.time() if settings.assigned else None,
@@ -34,7 +33,7 @@ class Lifetime:
         )
 
     def end(self, reason: str) -> None:
-        """End the server. The first reason counts."""
+        """End the server. If it is called several times, the first reason counts."""
         if not self._ended.done():
             self._ended.set_result(reason)
 
@@ -43,7 +42,7 @@ class Lifetime:
         self._loop.call_later(seconds, self.end, reason)
 
     async def over(self) -> str:
-        """Wait for the end; the reason."""
+        """Wait until the server is to end, and return the reason."""
         reason = await self._ended
         if self._timer is not None:
             self._timer.cancel()
@@ -65,7 +64,7 @@ class Lifetime:
         self.watch()
 
     def watch(self) -> None:
-        """Look at the watchdog, now and whenever it can have something to say."""
+        """End the server if the watchdog says so; else look again at the next time at which it could."""
         now = self._loop.time()
         if self._timer is not None:
             self._timer.cancel()
@@ -75,11 +74,11 @@ class Lifetime:
             return
         expires = self._watchdog.expires() if verdict is None else now + _LOOK_AGAIN_SECONDS
         if expires < float("inf"):
-            self._timer = self._loop.call_at(min(expires + 0.01, now + _LONGEST_TIMER), self.watch)
+            self._timer = self._loop.call_at(expires + 0.01, self.watch)
 
 
 def exit_hard_after(seconds: float) -> None:
-    """End the process after `seconds`, whatever still runs then."""
+    """End the process after `seconds`, even if threads still run."""
 
     def end() -> None:
         print("trial: had to be ended", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""The listening WebSocket server: its port, its certificate, and how many connections may be unauthenticated."""
+"""The WebSocket server: its port, its certificate, and its limits for connections that are not authenticated yet."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ from trial.wire.player_socket import PlayerSocket
 log = logging.getLogger("trial")
 
 LARGEST_MESSAGE = 4096
+"""The most bytes in a client's message."""
 MAX_UNAUTHENTICATED_WEBSOCKETS = 64
-"""WebSockets that have not authenticated yet; one more closes the oldest. Of sockets see preauth_limit.py."""
+"""The most WebSockets that have not authenticated. One more closes the oldest. preauth_limit.py limits sockets."""
 CLOSE_SECONDS = 2.0
+"""The time that a client has to answer a close."""
 
 
 class Listener:
-    """Accepts connections. `handle` is called for each one that speaks WebSocket."""
+    """Accepts connections. `handle` is called for each one whose WebSocket handshake is done."""
 
     def __init__(
         self, settings: TrialSettings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]
@@ -42,7 +44,10 @@ class Listener:
         self._unauthenticated: dict[ServerConnection, None] = {}
 
     async def open(self) -> int:
-        """Listen; the port. Raises PortNotPermitted, and SettingsError or the store's errors for the certificate."""
+        """Begin to listen, and return the port.
+
+        Raises PortNotPermitted, OSError, and for the certificate SettingsError, ssl.SSLError and the store's errors.
+        """
         settings, certificate = self._settings, self._certificate
         if certificate is not None:
             await asyncio.to_thread(certificate.load)
@@ -59,7 +64,7 @@ class Listener:
             server_header=None,
             compression=None,
             max_size=LARGEST_MESSAGE,
-            write_limit=(1, 0),  # so that sending returns only when nothing is left in the buffer
+            write_limit=(1, 0),  # so that `send` returns only when the write buffer is empty
             ping_interval=15,
             ping_timeout=15,
             close_timeout=CLOSE_SECONDS,
@@ -70,12 +75,12 @@ class Listener:
         return port
 
     def authenticated(self, websocket: ServerConnection) -> None:
-        """This connection no longer counts as unauthenticated."""
+        """This connection has authenticated, and no longer counts for the limits."""
         self._unauthenticated.pop(websocket, None)
         self._socket.authenticated(websocket.remote_address)
 
     async def renew_certificate(self) -> None:
-        """Load renewed certificates until it is cancelled. Returns at once without TLS."""
+        """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled. Without TLS, return at once."""
         certificate = self._certificate
         while certificate is not None:
             await asyncio.sleep(RELOAD_SECONDS)
@@ -88,10 +93,11 @@ class Listener:
                 log.exception("the certificate cannot be renewed; the present one stays")
 
     def close(self, reason: str) -> None:
-        """Accept no more connections, and close all of them (1001)."""
+        """Accept no more connections, and close the open ones with code 1001."""
         self._server.close(code=1001, reason=reason)
 
     async def wait_closed(self) -> None:
+        """Wait until all connections are closed."""
         await self._server.wait_closed()
 
     async def _connected(self, websocket: ServerConnection) -> None:
@@ -107,7 +113,7 @@ class Listener:
 
 
 def _silent() -> logging.Logger:
-    """A logger that logs nothing: what unauthenticated clients send does not belong in the log."""
+    """Return a logger that logs nothing: unauthenticated clients could write to the log by what they send."""
     logger = logging.getLogger("trial.websockets")
     logger.setLevel(logging.CRITICAL + 1)
     return logger

@@ -1,4 +1,4 @@
-"""The asyncio shell of a trial: brings events to its core (`trial/core/trial.py`) and carries out the effects."""
+"""The asyncio shell of a trial: passes events to its core (`trial/core/trial.py`), and carries out the effects."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from trial.recordings.recording import Line
 from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
 from trial.server.callbacks import TrialCallbacks
-from trial.server.started import Started, Table
+from trial.server.started import StartedAgent, TrialPlayers
 from trial.settings import TrialSettings
 from trial.wire.connection import Connection
 
@@ -60,7 +60,7 @@ log = logging.getLogger("trial")
 
 
 class TrialLoop:
-    """Runs one trial on the event loop, from which all methods are to be called."""
+    """Runs one trial. All methods are for the event loop."""
 
     def __init__(
         self,
@@ -73,15 +73,15 @@ class TrialLoop:
         watchers: Watchers,
         assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        """`assets` are the images of a game that is drawn by objects (`Assets.table`)."""
+        """`assets` describe the images of a game that is drawn by objects (`Assets.table`)."""
         self.core = Trial(
             settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31), assets=assets
         )
         self.ready = asyncio.Event()
-        """The first frame is there, or the trial is over."""
+        """Set once the first frame is there, or the trial is over."""
         self._settings = settings
         self._hide = partial(without, settings.private) if settings.session else str
-        """Takes the ids of members out of what is recorded for all of them."""
+        """Removes members' ids from a text, since the recording of a session is that of all members."""
         self._worker = worker
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
@@ -101,7 +101,7 @@ class TrialLoop:
         self._saving_members: set[asyncio.Task[None]] = set()
         self._done: asyncio.Future[None] = self._loop.create_future()
         self._logged: set[str] = set()
-        self._pictured: list[Connection] = []  # connections that have a new picture
+        self._pictured: list[Connection] = []  # connections whose new picture is not sent yet
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
             **dict.fromkeys((StepCall, FeedbackCall, ResetCall, ReplayCall), self._call),
             SendMessage: lambda effect: effect.connection.send(effect.text),
@@ -124,31 +124,33 @@ class TrialLoop:
 
     @property
     def stuck(self) -> bool:
-        """A callback of the agent or a policy has not returned, and may never."""
+        """Whether a callback of the agent or a policy has not returned, and may never."""
         return self._places.busy or self._callbacks.busy
 
-    def begin(self, agent_ready: Awaitable[Started | None]) -> asyncio.Future[None]:
-        """Play, once the agent is ready. The future is done when the trial is, and has the exception that broke it."""
+    def begin(self, agent_ready: Awaitable[StartedAgent | None]) -> asyncio.Future[None]:
+        """Begin the trial once the agent is ready. The future is done when the trial is; it fails if an error ends it.
+
+        If `agent_ready` returns None, the agent cannot be started.
+        """
         self._starting = asyncio.create_task(self._start(agent_ready))
         self._starting.add_done_callback(self._started)
         return self._done
 
     @property
     def storing(self) -> bool:
-        """A recording is not stored yet."""
+        """Whether a closed recording is not stored yet."""
         return self._recorder.storing
 
     async def stored(self) -> None:
-        """Wait until the answers, if there are some, and all closed recordings are stored."""
+        """Wait until all closed recordings are stored, and the answers if the trial is over."""
         if self._saving is not None:
             await asyncio.wait({self._saving})
         await self._recorder.stored()
 
     async def close(self, seconds: float) -> None:
-        """End playing where the game stands and store what was recorded.
+        """End the game where it is, and store its recordings and answers. Give up after `seconds`.
 
-        Answers wait for recordings for half the time. Gives up after `seconds`, even if the researcher's code or the
-        store never answers.
+        An answer waits for the recordings for half of this time.
         """
         if self._starting is not None:
             self._starting.cancel()
@@ -163,85 +165,90 @@ class TrialLoop:
     # ---- clients
 
     def connect(self, human: str, connection: Connection) -> None:
-        """Show the trial to this client and do what it asks for."""
+        """The human's client has connected: show the trial to it from now on."""
         connection.rate = self.core.progress.frame_rate
         self._apply(self.core.connect(human, connection, connection.window, self._loop.time()))
 
     def disconnect(self, connection: Connection) -> None:
+        """The connection is closed, or was never connected."""
         self._apply(self.core.disconnect(connection, self._loop.time()))
 
     def round_trip(self, human: str, seconds: float) -> None:
-        """The human's browser has answered a ping after so many seconds."""
+        """The human's browser has answered a ping after `seconds`."""
         self._do(self.core.round_trip, human, seconds)
 
     def receive(self, connection: Connection, message: Message) -> None:
+        """The client has sent a message."""
         self._apply(self.core.receive(connection, message, self._loop.time()))
 
-    def woke(self, connection: Connection, frame_id: int) -> None:
-        """The page acknowledges this frame, and had stopped acknowledging."""
+    def acknowledges_again(self, connection: Connection, frame_id: int) -> None:
+        """The client, which had stopped acknowledging frames, has acknowledged this one."""
         self._do(self.core.receive, connection, Message(ack=frame_id))
 
     # ---- programs
 
     def advise(self, action: int, player: str | None) -> None:
-        """A program advises an action, or chooses it. Raises CommandRefused."""
+        """A program advises or chooses an action: see `Choices.advise`. Raises CommandRefused."""
         self._apply(self.core.advise(action, player, self._loop.time()))
 
     # ---- events
 
-    async def _start(self, agent_ready: Awaitable[Started | None]) -> None:
+    async def _start(self, agent_ready: Awaitable[StartedAgent | None]) -> None:
         answers, answered = await self._earlier()
         if answers is not None:
             self._apply(self.core.already_played(answers))
             return
         started = await agent_ready
-        table = None if started is None else await self._table(started)
-        if started is None or table is None:
+        playing = None if started is None else await self._players_of(started)
+        if started is None or playing is None:
             self._apply(self.core.agent_failed(self._loop.time()))
             return
         recorded = await self._recorder.recorded()
-        self._calls = self._calls_of(started, table)
-        self._places.fill(table.players, table.policies, table.stand_ins, table.seats)
-        self._find_callbacks(started, table.players)
+        self._calls = self._calls_of(started, playing)
+        self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
+        self._use_callbacks(started, playing.players)
         now = self._loop.time()
-        places, vacant, gone = table.places, table.vacant, table.gone
+        places, vacant, gone = playing.places, playing.vacant, playing.gone
         start = partial(self.core.start, places=places, vacant=vacant, gone=gone, answered=answered)
-        self._apply(start(table.players, recorded, now))
+        self._apply(start(playing.players, recorded, now))
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
-        """The answers of a step that is over; and, in a session whose step is not, those of some members."""
+        """Return the stored answers: first, if the step is over; second, those of some members, if it is not.
+
+        The first is the participant's answer, or in a session all members' by their ids.
+        """
         if not self._settings.session:
             return await self._recorder.earlier_answers(), {}
-        found = await self._recorder.members_answers()
-        over = bool(found) and len(found) == len(self._settings.seats)
-        return (found, {}) if over else (None, found)
+        answers = await self._recorder.members_answers()
+        over = bool(answers) and len(answers) == len(self._settings.seats)
+        return (answers, {}) if over else (None, answers)
 
-    async def _table(self, started: Started) -> Table | None:
-        """Who plays whom; None if the policies cannot be loaded, which the log says."""
+    async def _players_of(self, started: StartedAgent) -> TrialPlayers | None:
+        """Return who plays in this trial; None if the policies cannot be loaded, which is logged."""
         settings = self._settings
         try:
-            return await self._worker.call(lambda: started.take(settings), limit=settings.start_seconds)
+            return await self._worker.call(lambda: started.players_of(settings), limit=settings.start_seconds)
         except (PlayersError, PolicyError) as error:
             log.error("%s", error)
         except Exception as error:  # noqa: BLE001 - a policy may be the researcher's code
             log.error("a policy cannot be loaded\n%s", report(error, settings.agent_dir, settings.private))
         return None
 
-    def _calls_of(self, started: Started, table: Table) -> Calls:
+    def _calls_of(self, started: StartedAgent, playing: TrialPlayers) -> Calls:
         stamp, config = self._recorder.stamp, self._settings.trial
         if isinstance(started.agent, JointAdapter):
             return JointCalls(
                 started.agent,
-                table.players,
+                playing.players,
                 stamp,
                 record_observations=config.record_observations,
-                stand_ins=table.stand_ins,
+                stand_ins=playing.stand_ins,
             )
         views = config.pace == "turns"
         return AgentCalls(started.agent, stamp, record_observations=config.record_observations, views=views)
 
     def _acted(self, player: str, ask_id: int, action: int | None, error: Exception | None) -> None:
-        """A policy has answered."""
+        """A policy has answered with an action or an error."""
         if error is not None:
             self._do(self.core.policy_failed, player, ask_id, error)
         else:
@@ -252,7 +259,7 @@ class TrialLoop:
             self._fail(task.exception())
 
     def _do(self, event: Callable[..., list[Effect]], *args: Any) -> None:
-        """Bring an event to the core. No caller waits for it, so an error here ends the trial."""
+        """Pass an event to the core. No caller could handle an error, so an error ends the trial."""
         try:
             self._apply(event(*args, self._loop.time()))
         except Exception as error:  # noqa: BLE001 - the future of `begin` gets it
@@ -262,9 +269,9 @@ class TrialLoop:
         if not self._done.done() and error is not None:
             self._done.set_exception(error)
 
-    def _called(self, call: Call, result: Any, error: Exception | None) -> None:
+    def _call_ended(self, call: Call, result: Any, error: Exception | None) -> None:
         if not isinstance(call, StepCall) or error is not None:
-            self._callbacks.write_lines()  # before the episode's end, with which its recording may be closed
+            self._callbacks.write_lines()  # now, because the end of an episode may close its recording
         if error is not None:
             self._do(self.core.call_failed, call, error)
         else:
@@ -273,10 +280,10 @@ class TrialLoop:
     # ---- effects
 
     def _apply(self, effects: list[Effect]) -> None:
-        """Carry out effects; then see when to go on."""
+        """Carry out the effects, then set the timer for the core's `wake_at`."""
         for effect in effects:
             self._carry_out[type(effect)](effect)
-        while self._pictured:  # after the messages of the same event
+        while self._pictured:  # pictures follow the messages of the same event
             self._pictured.pop().send_now()
         core = self.core
         if core.ready:
@@ -294,10 +301,10 @@ class TrialLoop:
         self._do(self.core.advance)
 
     def _call(self, call: Call) -> None:
-        self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._called, call))
+        self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._call_ended, call))
 
-    def _find_callbacks(self, started: Started, players: Sequence[Player]) -> None:
-        """The agent has started: from now on its callbacks are called, if it has some."""
+    def _use_callbacks(self, started: StartedAgent, players: Sequence[Player]) -> None:
+        """If the agent has callbacks, call them from now on."""
         settings, agent = self._settings, started.agent
         if not started.callbacks:
             return
@@ -329,7 +336,7 @@ class TrialLoop:
         self._write(self._recorder.line(effect.kind, fields))
 
     def _write_line(self, effect: WriteLine) -> None:
-        """Write the line of a step or a reset, and then what callbacks recorded during it."""
+        """Write the line of a step or a reset, then the lines that callbacks recorded during it."""
         self._write(effect.line)
         self._callbacks.write_lines()
 
@@ -361,7 +368,7 @@ class TrialLoop:
         self._saving.add_done_callback(self._saved)
 
     async def _save_all(self, effect: SaveAnswer) -> None:
-        """Each member goes on when their own answer is stored; all are when those of earlier `SaveMember` are, too."""
+        """Store the answers after the recordings. Return when those of earlier `SaveMember` are stored, too."""
         await self._recorder.save(effect.answers)
         for human, answers in effect.by_human.items():
             self._save_member(SaveMember(human, answers))

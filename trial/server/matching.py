@@ -1,8 +1,8 @@
-"""Answers who plays with whom, by the function `match` of agent.py (`matching: match`), until there are members.
+"""Answers the lobby's question who plays with whom, by the function `match` of agent.py (`matching: match`).
 
-The lobby writes who waits into a document, with an id. Servers without members look at it, call `match`, and create the
-answer's document; the first one's counts. `match` runs on a thread of its own: if it never returns, the server can
-still play.
+The lobby writes the participants who wait into a document, the question, which has an id. Servers without members read
+it, call `match`, and create a document with the answer; the first answer counts. `match` runs on a thread of its own:
+if it never returns, the server can still play.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from trial.settings import TrialSettings
 log = logging.getLogger("trial")
 
 LOOK_SECONDS = 2.0
-"""From one look for a question to the next."""
+"""The time between two looks for a question."""
 
 
 class Matching:
     """Answers questions until the server has members."""
 
     def __init__(self, store: Store, settings: Callable[[], TrialSettings], function: Callable[..., Any]) -> None:
-        """`settings` returns those of now."""
+        """`settings` returns the present settings. `function` is `match` of agent.py."""
         self._store = store
         self._settings = settings
         self._function = function
         self._worker = Worker("match")
-        self._answered = ""
-        self._said: set[str] = set()
+        self._answered = ""  # the id of the last question that was answered
+        self._logged: set[str] = set()
 
     async def run(self) -> None:
-        """Look, and answer, until the members are known, or `match` does not return."""
+        """Answer questions until the members are known, or `match` does not return."""
         while not self._settings().assigned:
             if self._settings().session:
                 try:
                     await self._look()
                 except Exception as error:  # noqa: BLE001 - whatever the store raises, the next look may succeed
-                    self._say(logging.WARNING, f"cannot see who waits ({short_error(error)}); trying again")
+                    self._log_once(logging.WARNING, f"cannot see who waits ({short_error(error)}); trying again")
             if self._worker.busy:
                 return
             await asyncio.sleep(LOOK_SECONDS)
@@ -68,45 +68,44 @@ class Matching:
         self._answered = question["id"]
 
     async def _groups(self, question: Mapping[str, Any]) -> list[list[str]]:
-        """What `match` chooses; none if it fails, which the log says once."""
+        """Call `match`, and return the groups that it chooses; none if it fails, which is logged once."""
         folder = self._settings().agent_dir
         try:
-            found, problem = await self._worker.call(
+            groups, problem = await self._worker.call(
                 lambda: match.groups(self._function, question), limit=match.SECONDS
             )
         except BadGroups as error:
-            self._say(logging.ERROR, f"{error}; nobody is matched")
+            self._log_once(logging.ERROR, f"{error}; nobody is matched")
             return []
         except AgentTimeout:
             text = f"match() has not returned within {match.SECONDS:g} s; this server calls it no more"
-            self._say(logging.ERROR, text)
+            self._log_once(logging.ERROR, text)
             return []
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
-            self._say(logging.ERROR, f"match() failed, and nobody is matched\n{report(error, folder)}")
+            self._log_once(logging.ERROR, f"match() failed, and nobody is matched\n{report(error, folder)}")
             return []
         if problem:
-            self._say(logging.ERROR, f"{problem}; that group is left out")
-        return found
+            self._log_once(logging.ERROR, f"{problem}; that group is left out")
+        return groups
 
-    def _say(self, level: int, text: str) -> None:
-        """Once each."""
-        if text not in self._said and len(self._said) < 100:
-            self._said.add(text)
+    def _log_once(self, level: int, text: str) -> None:
+        if text not in self._logged and len(self._logged) < 100:
+            self._logged.add(text)
             log.log(level, "%s", text)
 
 
 def read(body: bytes) -> dict[str, Any] | None:
-    """The question in a document; None if there is none."""
+    """Parse a question: its `id`, the `players` of a session, and who is `waiting`. None if it cannot be read."""
     try:
-        found = json.loads(body)
+        document = json.loads(body)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         return None
-    name, players, waiting = found.get("id"), found.get("players"), found.get("waiting")
-    if not (isinstance(name, str) and QUESTION_ID.fullmatch(name)) or not isinstance(waiting, list):
+    question_id, players, waiting = document.get("id"), document.get("players"), document.get("waiting")
+    if not (isinstance(question_id, str) and QUESTION_ID.fullmatch(question_id)) or not isinstance(waiting, list):
         return None
     if not isinstance(players, int) or not 2 <= players <= MAX_PLAYERS:
         return None
-    good = all(isinstance(each, dict) and isinstance(each.get("id"), str) for each in waiting)
-    return {"id": name, "players": players, "waiting": waiting} if good else None
+    valid = all(isinstance(each, dict) and isinstance(each.get("id"), str) for each in waiting)
+    return {"id": question_id, "players": players, "waiting": waiting} if valid else None

@@ -1,4 +1,4 @@
-"""Keeps participants' ids out of the log, also if the researcher's code knows them and says them."""
+"""Keeps participants' ids out of the log, even if the researcher's code logs them or names them in an error."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from trial.agent.tracebacks import without
 
 
-class WithoutIds(logging.Filter):
-    """A filter for the logger `trial`. `ids` returns those of all participants who play; none while none is known."""
+class IdFilter(logging.Filter):
+    """Removes ids from what the logger `trial` writes. `ids` returns those of the participants who play now."""
 
     def __init__(self, ids: Callable[[], Iterable[str]]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Runs a process in a process group of its own, for a researcher's code that is only tried."""
+"""Runs a process in a process group of its own, for commands that try a researcher's code."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import Any
 
 
 def run(command: Sequence[str], seconds: float, **options: Any) -> int | None:
-    """The process's exit status, None if it had to be killed after `seconds`. Whatever it has started ends with it.
+    """Run the command, and return its exit status; None if it had to be killed after `seconds`.
 
-    `options` are those of `subprocess.Popen`. Raises OSError if it cannot be started.
+    All processes of its group end with it. `options` are those of `subprocess.Popen`. Raises OSError if it cannot be
+    started.
     """
     process = Popen(  # noqa: S603 - our own commands
         command, stdin=DEVNULL, start_new_session=True, **options

@@ -1,7 +1,7 @@
-"""The server: admits one participant, or the members of one session, connects them to their trial, and ends.
+"""The trial server: admits one participant, or the members of one session, and connects them to their trials.
 
-It ends when the trial is over, or when they do not come. A warm server, and one whose session is not formed yet, do not
-know who plays. They refuse clients until they have read it (`trial/server/assignment.py`).
+It ends when the last trial is over, or when no participant comes. A warm server does not know at first who plays, nor
+does the server of a session that is not formed yet. They refuse clients until they know (`trial/server/assignment.py`).
 """
 
 from __future__ import annotations
@@ -30,23 +30,19 @@ from trial.core.messages import BadMessage, CloseConnection, CommandRefused, Not
 from trial.core.players import PlayersError
 from trial.policies.policy import PolicyError
 from trial.programs import watch
-from trial.programs.environments import MOST, Environments
+from trial.programs.environments import MAX_PROGRAMS, Environments
 from trial.recordings.spool import Spool, store_file
 from trial.recordings.store import Store, open_store
 from trial.server.admission import NOT_ASSIGNED, Admission, first_of
-from trial.server.assignment import Found, Search, set_environment
+from trial.server.assignment import AssignmentDocument, Search, set_environment
 from trial.server.drawing import Drawing
-from trial.server.handshake import (
-    check_matches,
-    is_program,
-    token_in_address,
-)
+from trial.server.handshake import check_matches, is_program, token_in_address
 from trial.server.lifetime import Lifetime, exit_hard_after
 from trial.server.listener import CLOSE_SECONDS, Listener
 from trial.server.loop import TrialLoop
 from trial.server.matching import Matching
-from trial.server.private_log import WithoutIds
-from trial.server.started import Started
+from trial.server.private_log import IdFilter
+from trial.server.started import StartedAgent
 from trial.settings import TrialSettings
 from trial.wire import round_trips
 from trial.wire.connection import Connection
@@ -55,13 +51,13 @@ from trial.wire.inbound import Inbound
 log = logging.getLogger("trial")
 
 STORE_MARGIN = 10.0
-"""Storing recordings gives up this many seconds before the process is killed."""
+"""The server stops trying to store recordings this many seconds before its process is killed."""
 EXIT_MARGIN = 4.0
-"""The process ends in any case this many seconds before it would be killed."""
+"""The process ends, whatever still runs, this many seconds before it would be killed."""
 TELL_SECONDS = 5.0
-"""If a trial cannot begin, the process tells it to clients that connect within so many seconds. Then it ends, and
-another server replaces it."""
-_TOLD_SECONDS = 0.3  # the same, once a client has been told
+"""If a trial cannot begin, the server ends after so many seconds, and another one replaces it. Until then it tells the
+clients that connect."""
+_TOLD_SECONDS = 0.3  # the same, after one client has been told
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 
@@ -79,23 +75,23 @@ class TrialServer:
         self._agent = AgentAdapter(
             settings.agent_dir, settings.trial.game, settings.trial.action_space, self._drawing.reader
         )
-        self._agent_ready: asyncio.Task[Started | None]
-        self._failure = 1  # the exit status if the server ends by an error
-        self._trial: TrialLoop | None = None
-        self._trials: list[TrialLoop] = []  # also those that are over: a policy or a callback may still run
+        self._agent_ready: asyncio.Task[StartedAgent | None]
+        self._failure = 1  # the exit status if an error ends the server
+        self._trial: TrialLoop | None = None  # the last one that has begun
+        self._trials: list[TrialLoop] = []  # all; after the end of a trial, its policies or callbacks may still run
         self._finished_steps: set[str] = set()
         self._search: Search
         self._admission: Admission
         self._connections: dict[Connection, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._watchers = watch.Watchers()
-        self._watching = 0  # programs that are connected
+        self._watching = 0  # the number of programs that watch
         self._environments = Environments(settings.agent_dir)
 
     async def run(self) -> int:
-        """Serve until the trial is over, all participants stay away, the deadline comes, or `end` is called."""
+        """Serve until the last trial is over, no participant comes, the deadline passes, or `end` is called."""
         settings = self.settings
-        log.addFilter(WithoutIds(lambda: self.settings.private))
+        log.addFilter(IdFilter(lambda: self.settings.private))
         self._lifetime = Lifetime(settings, saving=self._is_saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
@@ -107,12 +103,12 @@ class TrialServer:
         log.info("listening on port %d", port)
         self._agent_ready = asyncio.create_task(self._start_agent())
         if not settings.warm_server:
-            self._keep(self._store_files(await self._leftovers(settings)))
+            self._in_background(self._store_files(await self._leftovers(settings)))
         if not settings.assigned:
-            self._keep(self._search.run(self._assign))
+            self._in_background(self._search.run(self._assign))
             if settings.match:
-                self._keep(self._match())
-        self._keep(self._listener.renew_certificate())
+                self._in_background(self._match())
+        self._in_background(self._listener.renew_certificate())
         self._lifetime.watch()
         reason = await self._lifetime.over()
         log.info("ending: %s", reason)
@@ -121,12 +117,12 @@ class TrialServer:
         return self._failure if reason == "error" else 0
 
     def end(self, reason: str) -> None:
-        """End the server. Call it on the event loop."""
+        """End the server. `reason` is for the log; `error` makes the exit status a failure. For the event loop."""
         self._lifetime.end(reason)
 
     @property
     def stuck(self) -> bool:
-        """The researcher's code is still running and may never return."""
+        """Whether the researcher's code is still running, and may never return."""
         return self._worker.busy or any(trial.stuck for trial in self._trials)
 
     def _is_saving(self) -> bool:
@@ -140,7 +136,7 @@ class TrialServer:
         if not self._agent_ready.done():
             self._agent_ready.cancel()
         if not self._worker.busy:
-            with contextlib.suppress(Exception):  # the game is over; nothing depends on how the agent ends
+            with contextlib.suppress(Exception):  # the game is over: an error of the agent changes nothing any more
                 await self._worker.call(self._agent.close, limit=CLOSE_SECONDS)
         self._worker.close()
         for connection in self._connections:
@@ -149,17 +145,17 @@ class TrialServer:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._listener.wait_closed(), CLOSE_SECONDS)
 
-    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     # ---- before the participant comes
 
-    async def _start_agent(self) -> Started | None:
+    async def _start_agent(self) -> StartedAgent | None:
         try:
             settings = self.settings
-            start = partial(Started.start, self._agent, settings)
+            start = partial(StartedAgent.start, self._agent, settings)
             started = await self._worker.call(start, limit=settings.start_seconds)
         except (PlayersError, PolicyError) as error:
             self._failure = exits.NO_AGENT
@@ -167,7 +163,7 @@ class TrialServer:
             self._lifetime.end_in(TELL_SECONDS, "error")
             return None
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
-            settings = self.settings  # as they are now: a warm server may have been assigned meanwhile
+            settings = self.settings  # the present ones: a warm server may have been assigned meanwhile
             self._failure = exits.LATE_AGENT if isinstance(error, AgentTimeout) else exits.NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.private))
             self._lifetime.end_in(TELL_SECONDS, "error")
@@ -176,7 +172,7 @@ class TrialServer:
         return started
 
     async def _match(self) -> None:
-        """Say who plays with whom, until it is known who plays here. Only a server that is ready answers."""
+        """Answer the lobby's questions by the function `match`, from the agent's start until the server is assigned."""
         if await asyncio.shield(self._agent_ready) is None:
             return
         function = match.function_of(self._agent.agent_module)
@@ -185,10 +181,10 @@ class TrialServer:
             return
         await Matching(self._store, lambda: self.settings, function).run()
 
-    async def _assign(self, settings: TrialSettings, found: Found) -> None:
-        """Make this server the one of the participant or the session that was found."""
+    async def _assign(self, settings: TrialSettings, found: AssignmentDocument) -> None:
+        """Take over new settings, which follow from the document `found`: now it is known who plays here."""
         if self.settings.warm_server:
-            self._keep(self._store_files(await self._leftovers(settings)))
+            self._in_background(self._store_files(await self._leftovers(settings)))
             log.info("this server is assigned to a %s now", "session" if settings.session else "participant")
         set_environment(os.environ, found)
         self.settings = settings
@@ -198,14 +194,17 @@ class TrialServer:
             self._lifetime.expect_participant()
 
     async def _leftovers(self, settings: TrialSettings) -> list[tuple[str, Path]]:
-        """Recordings that an earlier process of this server left. Call it before this process records anything."""
+        """Return the recordings, with their keys, that an earlier process of this server has not stored.
+
+        Call it before this process records anything.
+        """
         if not self._spool.local_only:
             with contextlib.suppress(OSError):
                 return await asyncio.to_thread(self._spool.leftovers, settings.recordings_folder)
         return []
 
-    async def _store_files(self, left: list[tuple[str, Path]]) -> None:
-        for key, path in left:
+    async def _store_files(self, leftovers: list[tuple[str, Path]]) -> None:
+        for key, path in leftovers:
             log.warning("storing a recording that an earlier process left")
             await store_file(self._store, key, path)
 
@@ -255,7 +254,7 @@ class TrialServer:
                 sender.add_done_callback(lambda _: self._lifetime.end_in(_TOLD_SECONDS, "error"))
         finally:
             trial.disconnect(connection)
-            if websocket.close_code is None:  # ended by us: what was to be sent goes first
+            if websocket.close_code is None:  # the server ends the connection: messages that wait are sent first
                 await asyncio.wait({sender}, timeout=2 * CLOSE_SECONDS)
                 if not sender.done():
                     connection.abort()
@@ -265,12 +264,12 @@ class TrialServer:
                 self._lifetime.disconnected()
 
     async def _serve_watching(self, websocket: ServerConnection) -> None:
-        """Serve a program that watches, with the token in its address. Raises CloseConnection and ConnectionClosed."""
+        """Serve a program that watches, if its address has the token. Raises CloseConnection and ConnectionClosed."""
         check_matches(token_in_address(websocket), self.settings.token)
         if not self.settings.assigned:
             raise CloseConnection(1013, NOT_ASSIGNED)
-        if self._watching >= watch.MOST:
-            raise CloseConnection(1013, f"{watch.MOST} programs watch already")
+        if self._watching >= watch.MAX_PROGRAMS:
+            raise CloseConnection(1013, f"{watch.MAX_PROGRAMS} programs watch already")
         self._listener.authenticated(websocket)
         self._watching += 1
         try:
@@ -280,15 +279,15 @@ class TrialServer:
             self._watching -= 1
 
     async def _serve_environments(self, websocket: ServerConnection) -> None:
-        """Serve environments to a program, whose token the handshake has checked.
+        """Serve environments to a program. The handshake has checked its token.
 
-        A close says what is wrong: a message would be taken for an answer.
+        An error is the reason of a close, since Gymie's clients take every message for an answer.
         """
         self._listener.authenticated(websocket)
         if not self.settings.assigned:
             await websocket.close(1013, NOT_ASSIGNED)
-        elif self._environments.connections >= MOST:
-            await websocket.close(1013, f"{MOST} programs are connected already; try later.")
+        elif self._environments.connections >= MAX_PROGRAMS:
+            await websocket.close(1013, f"{MAX_PROGRAMS} programs are connected already; try later.")
         else:
             await self._environments.serve(websocket)
 
@@ -304,17 +303,17 @@ class TrialServer:
         return self._trial
 
     async def _connect(self, trial: TrialLoop, human: str, connection: Connection) -> None:
-        """Connect a client to the trial once it has begun. Raises CloseConnection if it cannot begin."""
+        """Connect a client to the trial once that is ready. Raises CloseConnection if the game cannot begin."""
         await first_of(trial.ready.wait(), connection.websocket.wait_closed())
         if connection.websocket.close_code is not None:
-            return  # gone before the game was ready; a client that plays now is not disturbed
+            return  # closed before the game was ready: it must not replace a client that plays now
         if trial.core.broken:
             raise CloseConnection(1011, _CANNOT_START)
         trial.connect(human, connection)
 
     @contextlib.asynccontextmanager
     async def _measured(self, trial: TrialLoop, human: str, connection: Connection) -> AsyncIterator[None]:
-        """In a session, tell the trial of the connection's round trips meanwhile."""
+        """In a session, measure the connection's round trips meanwhile, and report them to the trial."""
         if not self.settings.session:
             yield
             return
@@ -326,12 +325,12 @@ class TrialServer:
             measuring.cancel()
 
     async def _receive(self, trial: TrialLoop, connection: Connection) -> None:
-        """Take a client's messages until it goes. Raises CloseConnection and ConnectionClosed."""
+        """Receive a client's messages until its connection is closed. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
         inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
         connection.hear_acknowledgements(inbound)
-        if self.settings.session:  # an acknowledgement says nothing to the trial unless the others wait for it
-            connection.woke = partial(trial.woke, connection)
+        if self.settings.session:  # only in a session does an acknowledgement concern the trial: the member is back
+            connection.acknowledges_again = partial(trial.acknowledges_again, connection)
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())
@@ -347,9 +346,10 @@ class TrialServer:
     # ---- trials
 
     def _trial_of(self, step: str | None) -> TrialLoop:
-        """The trial of this step; begins it if necessary. Raises CloseConnection.
+        """Return the trial of this step, which is begun if necessary. Raises CloseConnection.
 
-        A session may play on while the answer of one member to an earlier step is not stored: that member waits there.
+        In a session, a member whose answer of an earlier step is not stored waits there, while the others play the next
+        step: so there may be several trials that are not done.
         """
         trial = self._trial
         if trial is not None and trial.core.broken:
@@ -389,15 +389,15 @@ class TrialServer:
         elif trial.core.finished:
             self._finished_steps.add(trial.core.step)
             if trial.core.step == self.settings.game_steps[-1]:
-                self._keep(self._end_when_stored())
+                self._in_background(self._end_when_stored())
 
     async def _end_when_stored(self) -> None:
-        """The last game step has its answers: end the server once those of all steps, and recordings, are stored."""
+        """The answers of the last game step are stored: end the server once all answers and recordings are."""
         for trial in self._trials:
             await trial.stored()
         self._lifetime.end_in(self.settings.linger_seconds, "done")
 
 
 def _reason(words: str) -> str:
-    """The words as the reason of a close, which has at most 123 bytes (RFC 6455, 5.5)."""
+    """Shorten the words to the reason of a close, which has at most 123 bytes (RFC 6455, 5.5)."""
     return words.encode("utf-8", "replace")[:120].decode("utf-8", "ignore")

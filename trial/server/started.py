@@ -1,4 +1,4 @@
-"""The researcher's agent once it has started, who plays in its environment, and the policies."""
+"""The researcher's agent after its start, the players of its environment, and their policies."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from trial.settings import TrialSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """Who plays whom: the players in the environment's order, and the policies of those that have one."""
+class TrialPlayers:
+    """Who plays in one trial: the players in the environment's order, and the policies by player."""
 
     players: tuple[Player, ...]
     policies: Mapping[str, Policy]
     places: Mapping[str, str] = field(default_factory=dict)
-    """In a session: the place of each member, by their id: the player whom they play."""
+    """In a session: the player that each member plays, by the member's id."""
     seats: tuple[str, ...] = ()
-    """In a session: the players of its seats, in their order."""
+    """In a session: the player of each seat, in the order of the seats."""
     vacant: tuple[str, ...] = ()
-    """In a session: the places of humans that no member has. A policy plays there."""
+    """In a session: the players of the seats that no member has. Policies play them."""
     stand_ins: Mapping[str, Policy] = field(default_factory=dict)
     """In a session: the policies that may play for members who are away, by player."""
     gone: tuple[str, ...] = ()
-    """In a session: the places of members whose data were erased, if no policy plays there. They do not come back."""
+    """In a session without `substitute`: the players of members whose data were erased, and who never come."""
 
 
 @dataclass(slots=True)
-class Started:
-    """What a trial is played with. Its methods block; they are for the agent's thread."""
+class StartedAgent:
+    """The agent after its start, and the loaded policies. The methods block: call them on the agent's thread."""
 
     settings: TrialSettings
     agent: AgentAdapter | JointAdapter
     callbacks: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
-    """Those that the agent has."""
-    _loaded: dict[int | None, Table] = field(default_factory=dict)
+    """The callbacks that the agent has, by name."""
+    _loaded: dict[int | None, TrialPlayers] = field(default_factory=dict)
 
     @classmethod
-    def start(cls, adapter: AgentAdapter, settings: TrialSettings) -> Started:
-        """Start the agent, and load the policies of every group that the server may get.
+    def start(cls, adapter: AgentAdapter, settings: TrialSettings) -> StartedAgent:
+        """Start the agent, and load the policies of every group that the server may be assigned to.
 
-        Raises PlayersError and PolicyError with a sentence, AgentError, and whatever the researcher's code raises.
+        Raises PlayersError and PolicyError, whose messages are for the researcher, AgentError, and any error of the
+        researcher's code.
         """
         config = settings.trial
         agent = starting.start(adapter, config.named_players())
@@ -58,51 +59,51 @@ class Started:
         return started
 
     def _key(self, group: int | None) -> int | None:
-        """The group, if who plays whom differs between groups."""
+        """Return the group, or None if the same policies play in all groups."""
         return group if self.settings.trial.groups() else None
 
-    def take(self, settings: TrialSettings) -> Table:
-        """Who plays whom, for one trial: the next one gets policies of its own. Raises as `start`.
+    def players_of(self, settings: TrialSettings) -> TrialPlayers:
+        """Return who plays in one trial. The next trial gets other policy objects. Raises as `start`.
 
-        `settings` are those of now: a server may have learnt its group and its session since it has started.
+        `settings` are the present ones: since its start, a server may have been assigned to a group and a session.
         """
-        table = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
-        return self._with_members(table, settings) if settings.session else table
+        playing = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
+        return self._with_members(playing, settings) if settings.session else playing
 
-    def _with_members(self, table: Table, settings: TrialSettings) -> Table:
-        """The table of a session: each member has a place, and `substitute` plays in the places that are left."""
-        config, seats = settings.trial, [player.name for player in table.players if player.human]
+    def _with_members(self, playing: TrialPlayers, settings: TrialSettings) -> TrialPlayers:
+        """Give each member of the session the player of their seat. The policy `substitute` plays the other seats."""
+        config, seats = settings.trial, [player.name for player in playing.players if player.human]
         if len(seats) != settings.players:
             raise PlayersError(
                 f"project.players is {settings.players}, and trial.players has {len(seats)} humans; they must agree"
             )
         places = {user_id: seats[seat] for user_id, seat in settings.seats.items()}
         vacant = tuple(name for name in seats if name not in places.values())
-        plays = config.substitute
-        if plays is None:
+        substitute = config.substitute
+        if substitute is None:
             erased = {seats[member.seat] for member in settings.members if not member.user_id}
             if missing := [name for name in vacant if name not in erased]:
                 raise PlayersError(
                     f"trial.substitute must say what plays in the place of {missing[0]}, who has not come"
                 )
-            return replace(table, places=places, seats=tuple(seats), gone=vacant)
+            return replace(playing, places=places, seats=tuple(seats), gone=vacant)
         away = seats if config.after_absent == "policy" else vacant
-        stand_ins = self._policies([replace(each, plays=plays) for each in table.players if each.name in away])
-        return Table(
-            tuple(replace(each, plays=plays) if each.name in vacant else each for each in table.players),
-            {**table.policies, **{name: stand_ins[name] for name in vacant}},
+        stand_ins = self._policies([replace(each, plays=substitute) for each in playing.players if each.name in away])
+        return TrialPlayers(
+            tuple(replace(each, plays=substitute) if each.name in vacant else each for each in playing.players),
+            {**playing.policies, **{name: stand_ins[name] for name in vacant}},
             places,
             tuple(seats),
             vacant,
             {name: policy for name, policy in stand_ins.items() if name not in vacant},
         )
 
-    def _load(self, group: int | None) -> Table:
+    def _load(self, group: int | None) -> TrialPlayers:
         config, agent = self.settings.trial, self.agent
         if not isinstance(agent, JointAdapter):
-            return Table(who_plays(config, {PLAYER: agent.action_space}, group), {})
+            return TrialPlayers(who_plays(config, {PLAYER: agent.action_space}, group), {})
         players = who_plays(config, {name: agent.action_spaces[name] for name in agent.players}, group)
-        return Table(players, self._policies(players))
+        return TrialPlayers(players, self._policies(players))
 
     def _policies(self, players: Iterable[Player]) -> dict[str, Policy]:
         agent = self.agent

@@ -1,4 +1,4 @@
-"""When a server must end because it is unused, or because of its deadline. Pure; clocks are passed in."""
+"""Decides when a server must end because no participant is there, or at its deadline. Pure; the clock is passed in."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import math
 class Watchdog:
     """Counts the time without a participant. All times are seconds of one clock.
 
-    `idle` is how long the server waits for a participant, `grace` how long at least it waits for one that was
-    connected before, `deadline` the time at which it ends in any case. Without `now` the wait begins at `expected`.
+    `idle` is how long the server waits for a participant; `grace` is the least time for which it waits for one who was
+    connected before; `deadline` is the time at which it ends in any case. The wait begins at `now`; if that is None, at
+    the call of `expected`.
     """
 
     def __init__(self, *, now: float | None, idle: float, grace: float, deadline: float | None) -> None:
@@ -33,13 +34,13 @@ class Watchdog:
         self._alone_since = now
 
     def expires(self) -> float:
-        """The moment at which the server ends if nothing else happens; infinity if there is none."""
+        """Return the time at which the server must end if nothing else happens; infinity if there is none."""
         if self._alone_since is None:
             return self._deadline
         return min(self._alone_since + max(self._idle, self._grace if self._visited else 0.0), self._deadline)
 
     def verdict(self, now: float) -> str | None:
-        """`deadline`, `idle` or None."""
+        """Return why the server must end now, `deadline` or `idle`; None if it need not."""
         if now >= self._deadline:
             return "deadline"
         return "idle" if now >= self.expires() else None

@@ -1,1 +1,1 @@
-"""WebSocket connections to participants: what is sent, and how messages are read."""
+"""WebSocket connections to participants: sends pictures and messages, and reads clients' messages."""

@@ -1,4 +1,4 @@
-"""One client's connection: what is sent to it, in which order, and how much of it at a time."""
+"""The sending half of a client's connection: decides in which order, when and in which form things are sent."""
 
 from __future__ import annotations
 
@@ -28,28 +28,27 @@ from trial.wire.player_socket import PlayerSocket
 log = logging.getLogger("trial")
 
 SUBPROTOCOLS = ("hippodrome.3", "hippodrome.2", "hippodrome.1")
-"""What a client may offer, the preferred one first. Clients of the first draw scenes; of the last, they know lossless
-frames only."""
+"""The subprotocols, the preferred one first. Clients with the first draw scenes; those with the last take only lossless
+frames."""
 REST_SECONDS = 0.25
-"""A lossy frame is made exact if no other follows within this time or that of 2.5 frames, whichever is longer."""
+"""A lossy frame is made exact if no other picture follows within this time or 2.5 frames, whichever is longer."""
 
-_ROWS_RATE = 20  # at least so many ROWS frames a second
-_INLINE_BYTES = 400_000  # larger pictures are packed off the event loop
-_UNSENT_BYTES = 16_384  # the most that the kernel keeps unsent: some clients do not acknowledge frames
+_ROWS_RATE = 20  # the least rate of ROWS frames, per second
+_INLINE_BYTES = 400_000  # larger pictures are packed on a thread, not on the event loop
+_UNSENT_BYTES = 16_384  # the most that the kernel may keep unsent, since some clients do not acknowledge frames
 _DONE = 1000  # the close code of a trial that is over
-_TEXTS = 64  # if so many messages wait, new ones are dropped
-_ASSET_PART = 65_536  # bytes of an image that are sent at a time
-_ASSET_TIMES = 3  # that a connection may ask for an image
+_TEXTS = 64  # the most messages that may wait; more are dropped
+_ASSET_PART = 65_536  # the bytes of an image in one message
+_ASSET_TIMES = 3  # how often a connection may ask for the same image
 
 
 class Connection:
-    """The sending half of a connection. `run` sends what the other methods leave it to send.
+    """The sending half of a connection. Other methods collect pictures and messages, and `run` sends them.
 
-    Only a picture for which nothing else has to wait is sent at once, by `send_now`.
-
-    Of pictures and of the trial's state only the newest is kept, so nothing builds up for a slow client.
-    Pictures may lose something on the way (trial/pictures/encoder.py) if the client knows such frames and `lossless`
-    is False. A client that does not draw scenes gets them as frames, which `draw` makes; it runs on a thread.
+    Only `send_now` sends a picture itself, if nothing else is to be sent before it. Of pictures and states only the
+    newest one waits, so nothing builds up for a slow client.
+    Pictures may be lossy (trial/pictures/encoder.py) if the client takes such frames and `lossless` is False. A client
+    that does not draw scenes gets them as frames, which `draw` makes on a thread.
     """
 
     def __init__(
@@ -65,52 +64,52 @@ class Connection:
         self._loop = asyncio.get_running_loop()
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
-        self.woke: Callable[[int], None] | None = None
-        """Called with the frame's id when a client acknowledges again that had stopped."""
+        self.acknowledges_again: Callable[[int], None] | None = None
+        """Called with the id of a frame that the client has acknowledged, if it had stopped acknowledging before."""
         self.rate = 30
-        """Frames per second of the game now."""
+        """The game's present frame rate, per second."""
         self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
         self._encoder = Encoder(lossy=websocket.subprotocol in SUBPROTOCOLS[:2] and not lossless)
         self._scenes = SceneEncoder()
         self._draw = draw
         self._assets = () if assets is None else tuple(assets.by_name.values())
-        self._asked: Counter[int] = Counter()  # how often for each asset
-        self._wanted: deque[tuple[int, int]] = deque()  # assets that are asked for, by number, each with an offset
-        self._sharpen_at = math.inf
+        self._asked: Counter[int] = Counter()  # how often the client has asked for each asset
+        self._wanted: deque[tuple[int, int]] = deque()  # assets to send: the number, and the offset of the next part
+        self._sharpen_at = math.inf  # when rows that make the last picture exact may be sent
         self._texts: deque[str] = deque()
         self._state: str | None = None
         self._picture: tuple[int, Picture] | None = None
-        self._sent = 0, False  # id of the last picture, and whether it is large
-        self._closing: tuple[int, str] | None = None  # code, last words
+        self._sent = 0, False  # the id of the last picture, and whether it is large
+        self._closing: tuple[int, str] | None = None  # the code, and the last message
         self._wake = asyncio.Event()
-        self._resting = False  # `run` has nothing to do
-        _keep_little_unsent(websocket)
+        self._resting = False  # whether `run` waits for `_wake`
+        _limit_unsent(websocket)
 
     def send(self, text: str) -> None:
-        """Send a message. It is dropped if the client reads so slowly that `_TEXTS` others wait."""
+        """Send a message. It is dropped if `_TEXTS` others wait, because the client reads slowly."""
         if len(self._texts) < _TEXTS:
             self._texts.append(text)
             self._wake.set()
 
     def send_state(self, text: str) -> None:
-        """Send the trial's state. It replaces a state that still waits."""
+        """Send the trial's state, instead of one that still waits."""
         self._state = text
         self._wake.set()
 
     def put_picture(self, picture: Picture, picture_id: int) -> None:
-        """A picture to be sent, by `send_now` or with the next message. It replaces one that still waits.
+        """Let a picture wait for `send_now` or the next message, instead of one that still waits.
 
         `picture` must not change afterwards.
         """
         self._picture = (picture_id, picture)
 
     def send_now(self) -> None:
-        """Send the picture that waits, at once if nothing else has to be sent or written."""
+        """Send the picture that waits: at once if nothing else is to be sent or written before it, else by `run`."""
         if not self._send_at_once():
             self._wake.set()
 
     def _send_at_once(self) -> bool:
-        """Send the picture that waits; False if `run` has to send it."""
+        """Send the picture that waits. Return False if `run` has to send it, or rows that make it exact."""
         direct, now = self._direct, self._loop.time()
         if direct is None or self._picture is None or not self._resting or self._wake.is_set() or not direct.free:
             return False
@@ -131,10 +130,10 @@ class Connection:
             log.exception("a picture cannot be sent")
             self.abort()
             return True
-        return self._encoder.exact  # else `run` makes it so
+        return self._encoder.exact
 
     def send_asset(self, name: str) -> bool:
-        """Send an image; False if there is none of this name. A client that asks for it too often gets it no more."""
+        """Send an image, at most `_ASSET_TIMES` times to one client. Return False if there is none of this name."""
         number = next((number for number, each in enumerate(self._assets) if each.name == name), None)
         if number is None:
             return False
@@ -146,15 +145,15 @@ class Connection:
 
     def acknowledged(self, frame_id: int, now: float) -> None:
         """The client has shown this frame."""
-        slept = self.woke is not None and self.window.stalled(now)
+        had_stopped = self.acknowledges_again is not None and self.window.stalled(now)
         self.window.acknowledged(frame_id, now)
-        if slept and self.woke is not None:
-            self.woke(frame_id)
+        if had_stopped and self.acknowledges_again is not None:
+            self.acknowledges_again(frame_id)
         if self._picture is not None or not self._encoder.exact:
             self._wake.set()
 
     def hear_acknowledgements(self, inbound: Inbound) -> None:
-        """From now on `inbound` reads acknowledgements as they come. Messages that say more are left to `recv`."""
+        """From now on, `inbound` reads each acknowledgement at its arrival. `recv` returns all other messages."""
 
         def hear(data: bytes | bytearray | memoryview) -> bool:
             now = self._loop.time()
@@ -167,13 +166,13 @@ class Connection:
             self._direct.hear = hear
 
     def close(self, code: int, last_words: str) -> None:
-        """Close, after the messages that wait and this one, which is never lost. The first call counts."""
+        """Close with this code, after the messages that wait and `last_words`, a message. The first call counts."""
         if self._closing is None:
             self._closing = (code, last_words)
             self._wake.set()
 
     def close_done(self, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Say that the trial is over, then close. HIPPO's clients expect the plain word `done`, not JSON."""
+        """Say that the trial is over, then close. HIPPO's clients get the plain word `done` instead of JSON."""
         self.close(_DONE, messages.done(episodes, score, outcome) if self.binary else "done")
 
     async def run(self) -> None:
@@ -207,7 +206,7 @@ class Connection:
             pass
         except Exception:
             log.exception("a picture cannot be sent")
-            self.abort()  # without this the page would wait for a frame that never comes; now it connects again
+            self.abort()  # so that the page connects again, and does not wait for a frame that never comes
         finally:
             self._resting = False
             if timer is not None:
@@ -219,10 +218,10 @@ class Connection:
         self._resting = False
         self._wake.clear()
         if self._direct is not None:
-            await self._direct.drain()  # `send_now` does not wait for it
+            await self._direct.drain()  # because `PlayerSocket.send_now` does not wait until the data are written
 
     def _wait(self, now: float) -> float:
-        """Seconds until the next frame may be sent; infinite if there is none."""
+        """Return the seconds until the next picture or rows may be sent; infinity if there are none."""
         if self._picture is not None:
             return self.window.wait(now, self.rate)
         if not self.binary or self._encoder.exact:
@@ -230,7 +229,7 @@ class Connection:
         return max(self._sharpen_at - now, self.window.wait(now, self.rate))
 
     async def _send_part(self) -> None:
-        """Send the next bytes of an image that was asked for."""
+        """Send the next part of an image that the client has asked for."""
         number, offset = self._wanted[0]
         packed = self._assets[number].packed
         part = packed[offset : offset + _ASSET_PART]
@@ -241,7 +240,7 @@ class Connection:
         await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
 
     async def _end(self, loop: asyncio.AbstractEventLoop, code: int, last_words: str) -> None:
-        """Send the last words and close; if the trial is over, after the picture that still waits: it shows how."""
+        """Send the last message and close. If the trial is over, send a picture that waits before: it shows the end."""
         if code == _DONE and self._picture is not None:
             try:
                 await self._send_picture(loop)
@@ -253,7 +252,7 @@ class Connection:
         await self.websocket.close(code)
 
     async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Send the picture that waits; if there is none, the next rows that make the last picture exact."""
+        """Send the picture that waits; if none does, the next rows that make the last picture exact."""
         pack: Callable[[], bytes | str]
         if self._picture is not None:
             (frame_id, picture), self._picture = self._picture, None
@@ -267,7 +266,7 @@ class Connection:
         await self.websocket.send(data)  # returns when the write buffer is empty
 
     def _rest(self) -> float:
-        """Seconds after a picture until rows of it follow, if no other picture does."""
+        """Return the seconds after a picture until its rows follow, if no other picture does."""
         return max(REST_SECONDS, 2.5 / self.rate)
 
     def _note_sent(self, frame_id: int, now: float, rest: float) -> None:
@@ -275,7 +274,7 @@ class Connection:
         self._sharpen_at = now + rest
 
     def _packing(self, picture: Picture, frame_id: int) -> tuple[Callable[[], bytes | str], bool]:
-        """What packs a picture for this client, and whether that takes so long that a thread has to do it."""
+        """Return a function that packs a picture for this client, and whether it must run on a thread."""
         if isinstance(picture, Scene):
             if self._draws_scenes:
                 self._encoder.forget()
@@ -292,12 +291,12 @@ class Connection:
         return self._encoder.encode(frame, frame_id) if self.binary else frames.jpeg_message(frame, frame_id)
 
     def abort(self) -> None:
-        """Cut the connection."""
+        """Cut the connection without a close frame."""
         with contextlib.suppress(Exception):
             self.websocket.transport.abort()
 
 
-def _keep_little_unsent(websocket: ServerConnection) -> None:
+def _limit_unsent(websocket: ServerConnection) -> None:
     sock = websocket.transport.get_extra_info("socket")
     option = getattr(socket, "TCP_NOTSENT_LOWAT", None)
     if sock is not None and option is not None:

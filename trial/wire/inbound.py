@@ -1,4 +1,4 @@
-"""What a client sends after its first message: read, counted, and refused if it is too much or makes no sense. Pure."""
+"""Reads a client's messages after the first. Refuses messages that are too many or make no sense. Pure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from trial.core.messages import BadMessage, CloseConnection, Message, NotAMessag
 from trial.wire import plain
 
 MESSAGES_A_SECOND = 200
-_NONSENSE_ALLOWED = 2  # messages that are no JSON objects
+"""The most messages that a client may send in a second."""
+_NONSENSE_ALLOWED = 2  # messages that are not JSON objects; one more closes the connection
 _ACK = re.compile(rb'\{"ack": ?(0|[1-9][0-9]{0,9})\}')
 
 
 class RateLimit:
-    """Counts messages by the second."""
+    """Counts messages, and limits them to `limit` in a second."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -24,7 +25,7 @@ class RateLimit:
         self._count = 0
 
     def exceeded(self, now: float) -> bool:
-        """Count one message; whether it is one too many."""
+        """Count one message, and return whether it is one too many."""
         if now - self._since >= 1.0:
             self._since, self._count = now, 0
         self._count += 1
@@ -34,7 +35,7 @@ class RateLimit:
 class Inbound:
     """Reads the messages of one connection. `window` is None for clients without a subprotocol (`trial/wire/plain.py`).
 
-    `words` are what the project's own controls say.
+    `words` are the feedback words of the project's own controls.
     """
 
     def __init__(self, window: Window | None, words: Collection[str] = ()) -> None:
@@ -44,9 +45,9 @@ class Inbound:
         self._nonsense = 0
 
     def acknowledged(self, data: bytes | bytearray | memoryview, now: float) -> int | None:
-        """The frame that a message acknowledges, which says nothing else; None if `read` has to read the message.
+        """Read a message that only acknowledges a frame, and return the frame's id; None if `read` must read it.
 
-        Most messages are of this kind, and one follows each frame.
+        Such a message follows each frame, so most messages are of this kind.
         """
         found = _ACK.fullmatch(data)
         if found is None or self._window is None:
@@ -55,7 +56,7 @@ class Inbound:
         return None if frame_id > self._window.newest or self._rate.exceeded(now) else frame_id
 
     def read(self, data: str | bytes, now: float) -> Message:
-        """The message. Raises BadMessage or NotAMessage with words for the client, and CloseConnection."""
+        """Read a message. Raises BadMessage and NotAMessage, whose words are for the client, and CloseConnection."""
         if self._rate.exceeded(now):
             raise CloseConnection(4429, "too many messages")
         try:

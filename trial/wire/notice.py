@@ -1,4 +1,4 @@
-"""A sentence as a picture, for pages that show nothing but frames while they wait. Pure."""
+"""Draws a sentence as a picture, for pages that show only frames while they wait. Pure."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from trial.pictures import frames
 
 _SIZE = 600, 400  # pixels; HIPPO's page shows frames in about this shape
-_LETTER = 26
-_COLUMNS = 38
+_LETTER = 26  # pixels
+_COLUMNS = 38  # letters in a line
 
 
 @lru_cache(maxsize=8)
 def frame_message(words: str) -> str:
-    """A frame, as clients without a subprotocol get them, that shows the words."""
+    """Return a message with a frame that shows the words, in the form for clients without a subprotocol."""
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 - only for such clients
 
     picture = Image.new("RGB", _SIZE, "white")

@@ -1,7 +1,7 @@
-"""Clients without a subprotocol, such as HIPPO's front end: what they say, turned into our messages. Pure.
+"""Turns the messages of clients without a subprotocol, such as HIPPO's front end, into ours. Pure.
 
-HIPPO (App/trial.py since 1.0.0) keeps an action until the next message with one, takes numbers as text, ignores
-what it does not know, and records every message whole. All of this is here, and nothing of it further in.
+HIPPO's server (App/trial.py since 1.0.0) repeats an action until a message names another one, takes numbers as text,
+ignores unknown fields, and records every message whole. Only this module deals with these differences.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from trial.core import messages
 from trial.core.messages import BadMessage, Message
 
 FIELDS_LENGTH = 3500
-"""The unknown fields of one message are recorded if they have at most so many characters of JSON."""
+"""The most characters of JSON that the unknown fields of one message may have. Otherwise they are not recorded."""
 
 FIELDS_DEPTH = 20
-"""And if they are nested no deeper: not every reader of JSON takes all that another does."""
+"""The most levels of nesting that recorded fields may have, since some readers of JSON take no more."""
 
 _COMMANDS = {name.lower(): name for name in messages.PLAIN_COMMANDS | messages.FEEDBACK}
 _KNOWN = ("command", "action", "held", "changeFrameRate")
@@ -28,44 +28,43 @@ _NEVER_RECORDED = ("userId", "token")
 def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
     """Read a message after the first. Raises NotAMessage, and BadMessage for a wrong value of a known field.
 
-    `words` are what the project's own controls say.
-
-    Fields that are empty count as left out. Unknown commands and fields become `fields`, which are recorded.
+    `words` are the feedback words of the project's own controls. Empty fields count as left out. Unknown commands and
+    fields become `Message.fields`, which are recorded.
     """
     value = messages.object_of(data)
-    said = {key: value[key] for key in _KNOWN if value.get(key) not in (None, "")}
-    rest = {key: each for key, each in value.items() if key not in _KNOWN and key not in _NEVER_RECORDED}
-    command = said.pop("command", None)
-    known = _command(command.strip(), words) if isinstance(command, str) else None
-    if known is not None:
-        said["command"] = known
-    elif command is not None:
-        rest["command"] = command
-    if isinstance(said.get("changeFrameRate"), str):
-        said["changeFrameRate"] = _frame_rate(said["changeFrameRate"])
-    message = messages.message_of(said, words) if said else Message()
-    kept = _short_enough(rest)
+    known = {key: value[key] for key in _KNOWN if value.get(key) not in (None, "")}
+    unknown = {key: each for key, each in value.items() if key not in _KNOWN and key not in _NEVER_RECORDED}
+    sent_command = known.pop("command", None)
+    command = _command(sent_command.strip(), words) if isinstance(sent_command, str) else None
+    if command is not None:
+        known["command"] = command
+    elif sent_command is not None:
+        unknown["command"] = sent_command
+    if isinstance(known.get("changeFrameRate"), str):
+        known["changeFrameRate"] = _frame_rate(known["changeFrameRate"])
+    message = messages.message_of(known, words) if known else Message()
+    fields = _short_enough(unknown)
     return replace(
         message,
         lasts=message.action is not None and message.held is None,
-        fields=kept,
-        fields_dropped=0 if kept or not rest else len(rest),
+        fields=fields,
+        fields_dropped=0 if fields or not unknown else len(unknown),
     )
 
 
-def _command(said: str, words: Collection[str]) -> str | None:
-    """The command or word that was meant, in small letters or large ones; None if there is none."""
+def _command(name: str, words: Collection[str]) -> str | None:
+    """Return the command or word of this name, whether its letters are upper or lower case; None if there is none."""
     own = {word.lower(): word for word in words}
-    return said if said in words else _COMMANDS.get(said.lower(), own.get(said.lower()))
+    return name if name in words else _COMMANDS.get(name.lower(), own.get(name.lower()))
 
 
 def sentence(words: str) -> str:
-    """A message that HIPPO's front end shows to the participant; it shows no `error`."""
+    """Build a message whose words HIPPO's front end shows to the participant. It does not show `error`."""
     return json.dumps({"error": words, "UI": [], "Instructions": [words]})
 
 
 def _frame_rate(text: str) -> str | float:
-    """`faster`, `slower` or the number in the text."""
+    """Return `faster`, `slower` or the number in the text. Raises BadMessage."""
     word = text.strip().lower()
     if word in messages.FRAME_RATE_CONTROLS:
         return word
@@ -76,14 +75,14 @@ def _frame_rate(text: str) -> str | float:
 
 
 def _short_enough(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The fields, if they are few enough to be recorded."""
+    """Return the fields, or None if they are empty, too long or too deep to be recorded."""
     if not fields or _too_deep(fields):
         return None
     return fields if len(json.dumps(fields)) <= FIELDS_LENGTH else None
 
 
 def _too_deep(value: Any) -> bool:
-    """Whether there are values below FIELDS_DEPTH levels."""
+    """Whether the value has more than FIELDS_DEPTH levels of nesting."""
     level = [value]
     for _ in range(FIELDS_DEPTH + 1):
         nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]

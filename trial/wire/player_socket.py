@@ -1,4 +1,4 @@
-"""The WebSocket of a participant, with a shorter way for what comes and goes with each frame."""
+"""The WebSocket of a participant, with a faster path for pictures and their acknowledgements."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _FOR_A_FRAME = StreamReader.at_eof.__code__
 
 
 class PlayerSocket(ServerConnection):
-    """Sends a picture, and hears of its acknowledgement, without waking a task.
+    """Sends a picture, and receives its acknowledgement, without waking a task.
 
-    At 30 pictures a second a task that wakes up costs about as much as packing the picture, and so does the package's
-    way of writing and reading a frame. Everything else goes by `send` and `recv`.
+    At 30 pictures a second, waking a task takes about as much processor time as packing the picture, and so does
+    writing or reading a frame with the package `websockets`. All other messages go through `send` and `recv`.
     """
 
     hear: Callable[[bytes | bytearray | memoryview], bool] | None = None
-    """Is shown each text message as it comes. If it returns True, `recv` never returns that message."""
+    """Called with each text message at its arrival. If it returns True, `recv` does not return the message."""
 
     @property
     def free(self) -> bool:
-        """The connection is open, and nothing waits to be written."""
+        """Whether the connection is open and nothing waits to be written."""
         return (
             not self.paused
             and self.send_in_progress is None
@@ -40,7 +40,7 @@ class PlayerSocket(ServerConnection):
         self.transport.write(framed(BINARY, data))
 
     def data_received(self, data: bytes) -> None:
-        """Called by asyncio. Most of what comes is one acknowledgement."""
+        """Called by asyncio with received bytes. Mostly they are one acknowledgement."""
         if self.hear is not None and self._between_messages:
             text = short_text(data)
             if text is not None and self.hear(text):
@@ -49,18 +49,18 @@ class PlayerSocket(ServerConnection):
 
     @property
     def _between_messages(self) -> bool:
-        """What comes next is the beginning of a message: the package's parser waits for one, or for the end.
+        """Whether the next bytes begin a message: the package's parser waits for a frame, and for no continuation.
 
-        It may also wait within a frame with nothing in its buffer, so the buffer does not tell.
+        An empty buffer would not tell: the parser may also wait within a frame with an empty buffer.
         """
         protocol = self.protocol
-        waits: Any = protocol.parser
-        while waits.gi_yieldfrom is not None:
-            waits = waits.gi_yieldfrom
-        return waits.gi_code is _FOR_A_FRAME and protocol.current_size is None and protocol.state is State.OPEN
+        generator: Any = protocol.parser
+        while generator.gi_yieldfrom is not None:
+            generator = generator.gi_yieldfrom
+        return generator.gi_code is _FOR_A_FRAME and protocol.current_size is None and protocol.state is State.OPEN
 
     def process_event(self, event: Event) -> None:
-        """Called by websockets for each message that `data_received` left to it."""
+        """Called by `websockets` with each frame that `data_received` has left to it."""
         if not (isinstance(event, Frame) and self._heard(event)):
             super().process_event(event)
 

@@ -1,16 +1,15 @@
-"""How often a member of a session may connect. Pure.
+"""Limits how often a member of a session may connect. Pure; the clock is passed in.
 
-Every connection of a member is written down, tells all others, and may let a policy take or give back a place. So who
-connects without end is told to wait. An honest page does not meet the limit: it waits half a second at least after each
-loss, and longer while it is not let in.
+Each connection of a member is recorded and reported to all members, and may make a policy give the player back. Our
+page does not reach the limit: it waits for at least half a second after each loss, and longer while it is refused.
 """
 
 from __future__ import annotations
 
 AT_ONCE = 30
-"""So many connections of one member are let in at once,"""
+"""The number of connections that a member may make at once."""
 SECONDS_EACH = 2.0
-"""and then one more for each of so many seconds."""
+"""After these, the seconds until the member may connect once more."""
 
 
 class Reconnects:
@@ -18,10 +17,10 @@ class Reconnects:
 
     def __init__(self) -> None:
         self._free_at: dict[str, float] = {}
-        """By member, when all AT_ONCE are theirs again."""
+        """By member, when they may connect AT_ONCE times again."""
 
     def allowed(self, human: str, now: float) -> bool:
-        """Whether the member may connect now. Only then it counts."""
+        """Return whether the member may connect now. A connection that is refused does not count."""
         free_at = max(self._free_at.get(human, now), now)
         if free_at - now > (AT_ONCE - 1) * SECONDS_EACH:
             return False

@@ -1,8 +1,8 @@
-"""How long a message to a browser and back takes, measured with the WebSocket's own pings.
+"""Measures round trips to a browser with the pings of WebSocket.
 
 A browser answers a ping by itself, without the page, "as soon as is practical" (RFC 6455, 5.5.2 and 5.5.3). A ping
-waits behind what was written before it, as the game's pictures do. So what is measured is what the participant has, the
-server's own delays included. It costs 6 bytes to the browser and 10 back, beside TCP's and TLS's own.
+waits until earlier data are sent, as the game's pictures do. So the round trip is the one that the participant
+experiences, with the server's own delays. It takes 6 bytes to the browser and 10 back, without those of TCP and TLS.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 LONGEST_SECONDS = 10.0
-"""A ping that is not answered within so many seconds counts as one that took so long."""
+"""The longest round trip that is reported: a ping without an answer counts as one of this length."""
 EVERY_SECONDS = 5.0
-"""From the answer to one ping to the next ping, while the game goes on."""
+"""The time from the answer to one ping to the next ping, after the first samples."""
 _BETWEEN_SAMPLES = 0.1
 
 
 async def measure(websocket: ServerConnection, samples: int, report: Callable[[float], None]) -> None:
-    """Report round trips in seconds until the connection is closed: so many `samples` one after the other, then others.
+    """Report round trips, in seconds, until the connection is closed.
 
-    There is one ping under way at a time. While one is not answered, because a phone sleeps for instance,
-    `LONGEST_SECONDS` are reported each time that so many seconds have passed.
+    The first `samples` are measured at once, the others every `EVERY_SECONDS`. One ping is under way at a time. While
+    it has no answer, for instance because a phone sleeps, `LONGEST_SECONDS` is reported every `LONGEST_SECONDS`.
     """
     count = 0
     try:
         while True:
-            await _one(websocket, report)
+            await _measure_one(websocket, report)
             count += 1
             await asyncio.sleep(_BETWEEN_SAMPLES if count < samples else EVERY_SECONDS)
     except ConnectionClosed:
         pass
 
 
-async def _one(websocket: ServerConnection, report: Callable[[float], None]) -> None:
-    """Report one round trip. Raises ConnectionClosed."""
+async def _measure_one(websocket: ServerConnection, report: Callable[[float], None]) -> None:
+    """Measure and report one round trip. Raises ConnectionClosed."""
     ping, late = asyncio.ensure_future(_round_trip(websocket)), False
     try:
         while True:

@@ -1,8 +1,8 @@
-"""Frames of a WebSocket (RFC 6455, 5.2), as far as the usual messages need them. Pure.
+"""Reads and writes the usual frames of a WebSocket (RFC 6455, 5.2): messages of one frame. Pure.
 
-The package `websockets` reads and writes every other frame. For a message of a hundred bytes that costs it as much as
-a step of a small environment. So the one case that nearly all messages are is taken here: pictures and their
-acknowledgements (`player_socket.py`), and requests at `/gym` with their answers (`trial/gym/worker.py`).
+The package `websockets` handles all other frames. For a message of a hundred bytes it takes as long as a step of a
+small environment. So this module handles the most frequent messages: pictures and their acknowledgements
+(`player_socket.py`), and requests at `/gym` with their answers (`trial/gym/worker.py`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ except ImportError:  # a platform for which `websockets` has no wheel
 __all__ = ["BINARY", "TEXT", "UNMASKED", "WHOLE", "extent", "framed", "short_text", "unmasked"]
 
 TEXT, BINARY = 0x81, 0x82
-"""First bytes of a message in one frame."""
+"""The first byte of a message in one frame."""
 WHOLE = (TEXT, BINARY)
 
 UNMASKED = [2] * 126 + [4, 10]
-"""Where what a frame holds begins, by the seven bits of its length, if it is not masked."""
+"""The offset of the payload in a frame without a mask, by the seven bits of the frame's length field."""
 
 _MASKED_HEADER = 6  # bytes before a short text of a client: two, and the mask
 _MIDDLE = struct.Struct("!BBH")
@@ -29,7 +29,7 @@ _LONG = struct.Struct("!BBQ")
 
 
 def extent(data: bytes) -> tuple[int, int]:
-    """Where what the first frame holds begins, and its length; (0, 0) if too little of it is there to tell."""
+    """Return the offset and length of the first frame's payload; (0, 0) if its header is not complete."""
     if len(data) < 2:
         return 0, 0
     length = data[1] & 0x7F
@@ -42,7 +42,7 @@ def extent(data: bytes) -> tuple[int, int]:
 
 
 def short_text(data: bytes) -> bytes | bytearray | None:
-    """What a client says, if the data are just one whole text message of up to 125 bytes."""
+    """Return the payload if the data are exactly one text message of a client with at most 125 bytes; else None."""
     length = len(data) - _MASKED_HEADER
     if not 0 <= length <= 125 or data[0] != TEXT or data[1] != 0x80 | length:
         return None
@@ -50,7 +50,7 @@ def short_text(data: bytes) -> bytes | bytearray | None:
 
 
 def framed(first: int, payload: bytes) -> bytes:
-    """A frame of a server, which is not masked."""
+    """Build a frame of a server, which has no mask. `first` is its first byte: TEXT or BINARY."""
     length = len(payload)
     if length < 126:
         return bytes((first, length)) + payload
