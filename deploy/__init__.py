@@ -1,1 +1,1 @@
-"""The command line for AWS: stack, certificate, projects, what runs, what it costs, the data, and away again."""
+"""The command line for AWS: installs Hippodrome, registers studies, shows servers and costs, fetches data, removes."""

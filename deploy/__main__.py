@@ -1,4 +1,4 @@
-"""`python -m deploy COMMAND`: the commands, and what becomes of their errors."""
+"""`python -m deploy COMMAND`: runs a command, and turns its errors into sentences and exit codes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ try:
 except ModuleNotFoundError:
     venv.go_on()
 
-COMMANDS = {  # each is the function `command` of its module, and its docstring is the help
+COMMANDS = {  # name → module, whose function `command` runs; the docstring of that function is the help text
     "up": "lifecycle.up",
     "plan": "lifecycle.plan",
     "apply": "lifecycle.apply",
@@ -39,14 +39,17 @@ COMMANDS = {  # each is the function `command` of its module, and its docstring 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return its exit code (`console.problem.Exit`). No traceback, unless HIPPODROME_DEBUG is set."""
+    """Run one command and return its exit code (`console.problem.Exit`).
+
+    An error is printed as a sentence with advice. With HIPPODROME_DEBUG set, an error of the program is raised.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
         wanted = [arguments[0]] if arguments[0] in COMMANDS else list(COMMANDS)
-        ended = int(_app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False) or Exit.DONE)
-        if ended == Exit.INTERRUPTED:  # typer's own way with Ctrl-C
+        code = int(_app(wanted)(args=arguments, prog_name="python -m deploy", standalone_mode=False) or Exit.DONE)
+        if code == Exit.INTERRUPTED:  # typer returns it after Ctrl-C
             raise KeyboardInterrupt
-        return ended
+        return code
     except (KeyboardInterrupt, typer.Abort):
         screen.warning("Interrupted. The same command goes on from here.")
         return Exit.INTERRUPTED
@@ -65,13 +68,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _app(names: Sequence[str]) -> typer.Typer:
-    """The commands of these names. Only the one that is run is imported, because each import takes its time."""
+    """Return the typer application with these commands. It imports their modules, which takes time."""
     app = typer.Typer(
         help="Hippodrome on AWS: one installation for everybody's studies, and a server for each participant.",
         add_completion=False,
         rich_markup_mode=None,
     )
-    app.callback()(lambda: None)  # without it, an app of one command would not take the command's name
+    app.callback()(lambda: None)  # without a callback, an app with one command does not take that command's name
     for name in names:
         command = importlib.import_module(f"deploy.{COMMANDS[name]}").command
         app.command(name, short_help=re.split(r"[.,:]", command.__doc__, maxsplit=1)[0])(command)

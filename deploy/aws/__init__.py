@@ -1,1 +1,1 @@
-"""What an AWS account has and allows: identity, regions, zones, quotas, hosted zones, log groups."""
+"""What an AWS account has and allows: identity, regions, zones, quotas, hosted zones, versioned buckets, names."""

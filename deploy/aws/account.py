@@ -25,9 +25,9 @@ from hippodrome.ports import Settings
 
 STACK = "hippodrome"
 STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
-"""30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
+"""At most 30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
 RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
-"""Every account has a schedule group `default`, and may have such a cluster; S3 takes no buckets with those prefixes.
+"""Every account has a schedule group `default`, and may have a cluster `default`; S3 refuses the other prefixes.
 
 (EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
 """
@@ -48,7 +48,7 @@ _FAIL_FAST = _CONFIG.merge(Config(connect_timeout=2, read_timeout=5, retries={"t
 
 
 class Account:
-    """An account in a region, with the credentials that boto3 finds (environment, profile, SSO)."""
+    """An AWS account in one region, with the credentials that boto3 finds (environment, profile, SSO)."""
 
     def __init__(self, core: botocore.session.Session, region: str) -> None:
         """`core` is the botocore session, which has the credentials."""
@@ -59,7 +59,7 @@ class Account:
         self._making = threading.Lock()  # making a client is not thread-safe, using one is
 
     def client(self, service: str, region: str | None = None) -> Any:
-        """The boto3 client of a service (made once); `region` for the few services that live elsewhere."""
+        """The boto3 client of a service, made once. `region`: another region, for the few services that need one."""
         key = (service, region or self.region)
         with self._making:
             if key not in self._clients:
@@ -67,7 +67,7 @@ class Account:
             return self._clients[key]
 
     def fail_fast_client(self, service: str) -> Any:
-        """A client that tries once and gives up after seconds, for calls that only give a hint."""
+        """A new client that tries once and gives up after seconds. For calls whose answer is only a hint."""
         with self._making:
             return self._session.client(service, region_name=self.region, config=_FAIL_FAST)
 
@@ -77,7 +77,7 @@ class Account:
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
-        """Whose credentials these are: `Account`, `Arn`. Raises what `deploy.core.explain` makes sentences of."""
+        """To whom the credentials belong: `Account`, `Arn`. Raises botocore's errors (`deploy.core.explain`)."""
         return dict(self.client("sts").get_caller_identity())
 
     @property
@@ -109,10 +109,10 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
 
 
 def _of_aws_login(profile: str) -> Problem:
-    """Why the credentials of `aws login` are not usable as they are, and how they become so.
+    """The problem of a profile of `aws login`: its credentials cannot be read here, and how AWS's CLI provides them.
 
-    botocore reads them only with a package in C. AWS's command line hands them on, and renews them: those that it has
-    fetched are valid for 15 minutes, a login for 12 hours (AWS SDKs and Tools Reference Guide, "Login credentials
+    botocore reads them only with a package in C (awscrt). AWS's command line prints them, and renews them: credentials
+    are valid for 15 minutes, a login for 12 hours (AWS SDKs and Tools Reference Guide, "Login credentials
     provider" and "Process credentials").
     """
     hand_on = f"aws configure export-credentials --profile {shlex.quote(profile)} --format process"
@@ -129,7 +129,7 @@ def _of_aws_login(profile: str) -> Problem:
 
 @dataclass(frozen=True)
 class Installation:
-    """A stack of ours that exists: its name, and its outputs under their names in `infra/template.yml`."""
+    """An existing stack of Hippodrome: its name, and its outputs under their names in `infra/template.yml`."""
 
     stack: str
     region: str
@@ -139,7 +139,7 @@ class Installation:
 
     @classmethod
     def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
-        """The installation of a described stack, whatever state the stack is in."""
+        """The installation of a stack from DescribeStacks, in whatever state the stack is."""
         outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
         return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
@@ -166,7 +166,7 @@ class Installation:
 
     @property
     def env(self) -> dict[str, str]:
-        """The functions' environment variables, for `Account.platform`: the commands use the same ports."""
+        """The functions' environment variables, from which `Account.platform` makes the same ports as functions use."""
         return {
             "AWS_REGION": self.region,
             "BUCKET": self["Bucket"],
@@ -185,9 +185,9 @@ class Installation:
 
 
 def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
-    """What CloudFormation says of the stack of that name or id; None if there is none (a deleted one counts as none).
+    """The stack of that name or id, as DescribeStacks returns it; None if there is none, or if it is deleted.
 
-    Raises `Problem` if it is no installation of Hippodrome: nothing here may touch what belongs to others.
+    Raises `Problem` if it is no installation of Hippodrome: no command may touch a stack of others.
     """
     try:
         found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
@@ -225,9 +225,9 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def elsewhere(account: Account, stack: str) -> str:
-    """The other regions that have the code of an installation of that name; "" if none has, or S3 cannot be asked.
+    """A sentence on other regions that have a code bucket of that stack's name; "" if none has, or S3 does not answer.
 
-    S3 lists the account's buckets of all regions.
+    S3 lists an account's buckets in all regions.
     """
     try:
         buckets = [str(bucket["Name"]) for bucket in account.fail_fast_client("s3").list_buckets()["Buckets"]]
@@ -240,7 +240,7 @@ def elsewhere(account: Account, stack: str) -> str:
 
 
 def find_installation(account: Account, stack: str = STACK) -> Installation:
-    """The installation, ready to be used. Raises `Problem` if there is none, or if it is broken or being made."""
+    """The installation, if its stack can be used. Raises `Problem` if there is none, or if its state forbids that."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(

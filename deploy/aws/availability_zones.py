@@ -1,7 +1,7 @@
-"""The two zones of an installation's own network: chosen once, and kept by every later apply.
+"""The two availability zones of an installation's own VPC: chosen once, and kept by every later apply.
 
-A subnet cannot move: CloudFormation would make the new one before it removes the old one, and both would have the same
-range. So the zones are parameters, and not what `Fn::GetAZs` lists first on the day of an update.
+A subnet cannot move to another zone: CloudFormation would make the new subnet before it removes the old one, and both
+would have the same range. So the zones are parameters of the template; `Fn::GetAZs` may list others at each update.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ PARAMETERS = ("ZoneA", "ZoneB")
 
 
 def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str] = ()) -> dict[str, str]:
-    """The template's parameters for zones: those of the stack, else of its subnets, else two that run Fargate.
+    """The template's parameters for zones: the stack's, else the zones of its subnets, else two that run Fargate.
 
-    `previous` are the stack's parameters, `subnets` those of the installation's own network, if it has one. Raises
-    `Problem` if a region has no two zones.
+    `previous` are the stack's parameters, `subnets` the ids of the subnets in its own VPC, if it has one. Raises
+    `Problem` if the region has no two such zones.
     """
     if all(previous.get(name) for name in PARAMETERS):
         return {name: previous[name] for name in PARAMETERS}
-    zones = _of(account, subnets) or _fit(account)
+    zones = _zones_of(account, subnets) or _fargate_zones(account)
     if len(zones) < 2:
         raise Problem(
             f"{account.region} has no two availability zones that run Fargate in this account.",
@@ -35,8 +35,8 @@ def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str]
     return dict(zip(PARAMETERS, zones, strict=False))
 
 
-def _of(account: Account, subnets: Sequence[str]) -> list[str]:
-    """The zones of subnets, in their order; none if they are gone."""
+def _zones_of(account: Account, subnets: Sequence[str]) -> list[str]:
+    """The zones of these subnets, in the subnets' order; empty if one of the subnets is gone."""
     if not subnets:
         return []
     try:
@@ -49,8 +49,8 @@ def _of(account: Account, subnets: Sequence[str]) -> list[str]:
     return [zones[name] for name in subnets if name in zones]
 
 
-def _fit(account: Account) -> list[str]:
-    """The region's zones that this account can use and that run Fargate, by name. No local zones."""
+def _fargate_zones(account: Account) -> list[str]:
+    """The zones of the region that this account can use and that run Fargate, sorted by name. No local zones."""
     found = account.client("ec2").describe_availability_zones()["AvailabilityZones"]
     return sorted(
         str(zone["ZoneName"])

@@ -1,4 +1,4 @@
-"""CAA records: which certificate authorities the owner of a domain lets issue certificates (RFC 8659)."""
+"""CAA records: which certificate authorities may issue certificates for a domain (RFC 8659)."""
 
 # ruff: noqa: PLC0415 - dnspython is imported where DNS is asked: few commands ask it
 
@@ -19,16 +19,17 @@ Record = tuple[str, str]  # tag and value
 
 @dataclass(frozen=True)
 class Caa:
-    """The records that apply to a name: those of `where`, the nearest domain upwards that has any; "" if none has."""
+    """The CAA records that apply to a name. They stand at `where`: the name or the nearest domain above; "" if none."""
 
     where: str = ""
     records: tuple[Record, ...] = ()
     certain: bool = True  # False: DNS could not be asked
 
     def forbidding(self, authorities: Sequence[str], *, wildcard: bool, acme: bool = False) -> list[Record]:
-        """The records that keep all these authorities from issuing; none if one of them may issue.
+        """The records that keep all these authorities from issuing; empty if one of them may issue.
 
-        For a wildcard `issuewild` counts instead of `issue`, where there is any (section 4.3). `acme`: by DNS-01.
+        For a wildcard, `issuewild` counts instead of `issue` if there is any (section 4.3). With `acme`, an authority
+        may issue only if it may validate by DNS-01 (RFC 8657).
         """
         wild = [record for record in self.records if record[0] == "issuewild"] if wildcard else []
         counting = wild or [record for record in self.records if record[0] == "issue"]
@@ -39,14 +40,13 @@ class Caa:
 def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
     """The records that apply to a name (section 3: up the tree, to the first name that has some).
 
-    `known`: whether a name exists; those that do not have no records, and DNS is not asked for them
-    (`deploy.aws.hosted_zone.exists` says why). Raises nothing that `known` does not raise.
+    `known` says whether a name exists. DNS is not asked for a name that does not (`deploy.aws.hosted_zone.exists` says
+    why). Raises only what `known` raises.
     """
     import dns.exception
     import dns.resolver
 
-    resolver = dns.resolver.Resolver(configure=True)
-    resolver.lifetime = hosted_zone.DNS_TIMEOUT
+    resolver = hosted_zone.resolver()
     labels = name.split(".")
     for start in range(len(labels)):
         above = ".".join(labels[start:])
@@ -63,9 +63,9 @@ def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
 
 
 def _allows(value: str, authority: str, acme: bool) -> bool:
-    """Whether the value of an issue or issuewild record names the authority; with `acme`, for DNS-01 (RFC 8657)."""
-    who, *parameters = (part.strip() for part in value.split(";"))
-    if who.lower() != authority:
+    """Whether the value of an issue or issuewild record names the authority; with `acme`, also allows DNS-01."""
+    issuer, *parameters = (part.strip() for part in value.split(";"))
+    if issuer.lower() != authority:
         return False
     for parameter in parameters if acme else ():
         key, _, content = parameter.partition("=")

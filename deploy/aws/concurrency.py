@@ -15,14 +15,14 @@ from botocore.exceptions import ClientError
 
 from deploy.aws.account import Account
 
-LEAST = 2  # that MaximumConcurrency takes
-USUAL = 20  # servers that start at once: RunTask takes 20 a second, and each of them takes about one
+LEAST = 2  # the least that MaximumConcurrency takes
+USUAL = 20  # servers that start at once: ECS allows 20 RunTask a second, and a start takes about a second
 OTHERS = 2 * LEAST  # of task_changed and stop_server: Route 53 takes a zone's changes one after the other anyway
 PARAMETER = "StartConcurrency"
 
 
 def starts(limit: int) -> int:
-    """MaximumConcurrency of start_server in an account with so many executions. At least half of them stay for pages.
+    """MaximumConcurrency of start_server in an account with `limit` executions. At least half of them stay for pages.
 
     In a small account fewer stay, because each of the three mappings must have at least 2: of 10 executions, 4 stay.
     """
@@ -30,19 +30,27 @@ def starts(limit: int) -> int:
 
 
 def workers(limit: int) -> int:
-    """Executions that the functions behind queues can take in an account that has so many."""
+    """The executions that the functions behind queues take at most, in an account with `limit` executions."""
     return starts(limit) + OTHERS
 
 
 def parameters(limit: int) -> dict[str, str]:
-    """The template's parameters for an account that has so many executions (`unreserved`)."""
+    """The template's parameters for an account with `limit` executions (`unreserved`)."""
     return {PARAMETER: str(starts(limit))}
 
 
-def unreserved(account: Account) -> int | None:
-    """Executions that the account has in this Region and no function has reserved; None if Lambda does not say."""
+def unreserved(account: Account) -> int:
+    """The concurrent executions that the account has in this Region and no function has reserved.
+
+    Raises ClientError if Lambda refuses, KeyError if its answer has no limit.
+    """
+    limit = account.client("lambda").get_account_settings()["AccountLimit"]
+    return int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+
+
+def unreserved_or_none(account: Account) -> int | None:
+    """As `unreserved`, but None if Lambda does not say."""
     try:
-        limit = account.client("lambda").get_account_settings()["AccountLimit"]
-        return int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+        return unreserved(account)
     except (ClientError, KeyError):
         return None

@@ -1,4 +1,4 @@
-"""The hosted zone of a domain: found, looked into, and compared with what the Internet's DNS says."""
+"""Finds the hosted zone of a domain, reads its records, and compares it with what the Internet's DNS says."""
 
 # ruff: noqa: PLC0415 - dnspython is imported where DNS is asked: few commands ask it
 
@@ -29,7 +29,7 @@ class Zone:
     name_servers: tuple[str, ...]
 
     def holds(self, domain: str) -> bool:
-        """Whether records of that domain belong into this zone."""
+        """Whether records of this domain belong into the zone."""
         return domain == self.domain or domain.endswith(f".{self.domain}")
 
 
@@ -42,7 +42,7 @@ def clean_domain(domain: str) -> str:
 
 
 def find_zone(account: Account, domain: str) -> Zone:
-    """The public zone for the domain or, if it has none of its own, for the nearest domain above it.
+    """The public zone of the domain or, if it has none of its own, of the nearest domain above it.
 
     Raises `Problem` if there is none, or if several zones have that name.
     """
@@ -101,21 +101,21 @@ def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
 
 
 def exists(account: Account, zone: Zone, name: str) -> bool:
-    """Whether a name of the zone exists: it has records, a name below it has, or a wildcard stands for it.
+    """Whether a name in the zone exists: it has records, a name below it has some, or a wildcard stands for it.
 
-    Route 53 is asked, not DNS: whose resolver is asked for a name that is still to be made is told for 15 minutes
+    This asks Route 53, not DNS: a resolver that is asked for a name before the name is made answers for 15 minutes
     that there is none (RFC 2308, section 5; Route 53 Developer Guide, "The start of authority (SOA) record": the TTL
-    of 900 seconds counts). Names outside of the zone are said to exist.
+    of 900 seconds counts). A name outside of the zone counts as existing.
     """
     if not zone.holds(name) or name == zone.domain:
         return True
     labels = name.removesuffix(f".{zone.domain}").split(".")
     wildcards = [f"*.{'.'.join([*labels[n:], zone.domain])}" for n in range(1, len(labels) + 1)]
-    return any(_stands(account, zone, one) for one in (name, *wildcards))
+    return any(_has_records(account, zone, one) for one in (name, *wildcards))
 
 
-def _stands(account: Account, zone: Zone, name: str) -> bool:
-    """Whether the zone has a record of that name, or of one below it: those come next in its order."""
+def _has_records(account: Account, zone: Zone, name: str) -> bool:
+    """Whether the zone has a record of this name or of a name below it, which comes next in Route 53's order."""
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="1"
     )
@@ -125,7 +125,7 @@ def _stands(account: Account, zone: Zone, name: str) -> bool:
 
 @dataclass(frozen=True)
 class Delegation:
-    """What the Internet's DNS says of a zone: its name servers there ("" of `problem` if they are the right ones)."""
+    """The name servers that the Internet's DNS has for a zone. `problem` is "" if they are Route 53's."""
 
     found: tuple[str, ...]
     problem: str = ""
@@ -133,18 +133,17 @@ class Delegation:
 
 
 def delegation(zone: Zone) -> Delegation:
-    """Whether the Internet finds the zone at Route 53's name servers. Never raises; takes some seconds at most."""
+    """Ask the Internet's DNS for the zone's name servers. Never raises; takes some seconds at most."""
     import dns.exception
     import dns.resolver
 
-    resolver = dns.resolver.Resolver(configure=True)
-    resolver.lifetime = DNS_TIMEOUT
+    asked = resolver()
     try:
-        answer = resolver.resolve(zone.domain, "NS")
+        answer = asked.resolve(zone.domain, "NS")
     except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
         return Delegation((), f"The Internet knows no name servers for {zone.domain}.")
     except dns.resolver.NoNameservers:
-        certain = _can_be_asked(resolver, zone.domain.partition(".")[2])
+        certain = _answers(asked, zone.domain.partition(".")[2])
         return Delegation((), f"The name servers that {zone.domain} is delegated to do not answer for it.", certain)
     except (dns.exception.DNSException, OSError, ValueError) as error:
         return Delegation((), f"Whether {zone.domain} is delegated could not be asked: {type(error).__name__}.", False)
@@ -154,13 +153,22 @@ def delegation(zone: Zone) -> Delegation:
     return Delegation(found)
 
 
-def _can_be_asked(resolver: dns.resolver.Resolver, domain: str) -> bool:
-    """Whether DNS answers for another domain, so that a refusal is not its own trouble."""
+def resolver() -> dns.resolver.Resolver:
+    """A resolver with this machine's configuration, which gives up after `DNS_TIMEOUT`."""
+    import dns.resolver
+
+    made = dns.resolver.Resolver(configure=True)
+    made.lifetime = DNS_TIMEOUT
+    return made
+
+
+def _answers(asked: dns.resolver.Resolver, domain: str) -> bool:
+    """Whether the resolver answers for `domain`. If not, its failure with a domain below says nothing of that one."""
     import dns.exception
     import dns.resolver
 
     try:
-        resolver.resolve(f"{domain}.", "NS")
+        asked.resolve(f"{domain}.", "NS")
     except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
         return True
     except (dns.exception.DNSException, OSError, ValueError):

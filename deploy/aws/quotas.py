@@ -1,8 +1,8 @@
-"""What AWS allows the account: quotas that decide whether a study can be held, and how to ask for more.
+"""The quotas of an account that decide whether a study can be held, and how to ask AWS for more.
 
-Codes are those of Service Quotas: Fargate's from its user guide's page on quotas; Lambda's L-B99A9384 "Concurrent
+The codes are those of Service Quotas: Fargate's from its user guide's page on quotas; Lambda's L-B99A9384 "Concurrent
 executions"; CodeBuild's L-9D07B6EF "Concurrently running builds for Linux/Small environment" (`BUILD_GENERAL1_SMALL`,
-which the stack's image builder is); the VPCs' L-F678F1CE "VPCs per Region". New accounts have as little as 6 vCPUs of
+which the stack's image builder is); the VPCs' L-F678F1CE "VPCs per Region". New accounts may have only 6 vCPUs of
 Fargate, 10 executions of Lambda, and no build at all: "Cannot have more than 0 builds in queue for the account".
 """
 
@@ -17,7 +17,7 @@ from hippodrome.aws import errors
 
 
 class Quota(NamedTuple):
-    """A quota by the codes of its service and of itself."""
+    """A quota: the code of its service, and its own."""
 
     service: str
     code: str
@@ -45,7 +45,7 @@ def applied(account: Account, quota: Quota) -> float | None:
 
 
 def request(account: Account, quota: Quota, wanted: float) -> str:
-    """The command that asks AWS for a higher value (the Service Quotas console does, too). AWS takes hours to days."""
+    """The AWS CLI command that asks for a higher value, as the Service Quotas console does. AWS takes hours to days."""
     return (
         f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
         f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"

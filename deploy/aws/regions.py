@@ -28,17 +28,17 @@ SUPPORTED: Mapping[str, str] = {
     "us-west-1": "N. California",
     "us-west-2": "Oregon",
 }
-"""Region → where it is. Each has every resource type of the template and every service that the commands use."""
+"""Region → its place. Each has every resource type of the template and every service that the commands use."""
 
 FARGATE_ZONES: Mapping[str, frozenset[str]] = {
     "ap-northeast-1": frozenset({"apne1-az1", "apne1-az2", "apne1-az4"}),
     "ca-central-1": frozenset({"cac1-az1", "cac1-az2"}),
     "us-west-1": frozenset({"usw1-az1", "usw1-az3"}),
 }
-"""Region → ids of its zones that run Fargate, where some do not.
+"""Region → the ids of its zones that run Fargate. Regions in which all zones do are left out.
 
-From "Supported Regions for Amazon ECS on AWS Fargate", ECS's developer guide. Its editions of 2026 restrict
-ca-central-1 no more, earlier ones did: these two zones are right either way.
+Source: "Supported Regions for Amazon ECS on AWS Fargate", ECS's developer guide. Earlier editions restricted
+ca-central-1 to these two zones, those of 2026 do not: the two zones are right either way.
 """
 
 
@@ -54,5 +54,5 @@ def check(region: str) -> None:
 
 
 def runs_fargate(region: str, zone_id: str) -> bool:
-    """Whether tasks can run in the zone of that id (such as usw1-az1: names of zones differ between accounts)."""
+    """Whether Fargate runs tasks in this zone. `zone_id`: such as usw1-az1, since names of zones differ by account."""
     return zone_id in FARGATE_ZONES.get(region, {zone_id})

@@ -1,7 +1,6 @@
-"""The names of an installation's resources on AWS: everything that is named after the stack is named here.
+"""The names of an installation's resources on AWS, as far as they contain the stack's name.
 
-What CloudFormation names, `infra/template.yml` names alike; the names of servers' resources are in
-`hippodrome.model.ids`.
+`infra/template.yml` builds the same names. The names of servers' resources are in `hippodrome.model.ids`.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ API = "api"  # the source of the site's access log
 
 _OURS = "/hippodrome/{}/"
 _VENDED = "/aws/vendedlogs/hippodrome/{}/"
-"""Where a service of AWS writes, by a policy that names no group of this prefix."""
+"""The prefix of log groups that a service of AWS writes to. It needs no entry for them in a resource policy."""
 
 
 def prefix(stack: str) -> str:
-    """How the names of the stack's task definitions, functions and queues begin. Other stacks' may begin so, too."""
+    """The prefix of the stack's task definitions, functions and queues. Another stack's name may begin with it, too."""
     return f"{stack}-"
 
 
@@ -32,7 +31,7 @@ def family(stack: str, project_id: str) -> str:
 
 
 def bucket_prefix(stack: str) -> str:
-    """How the names of the stack's buckets begin."""
+    """The prefix of the names of the stack's buckets."""
     return prefix(stack).lower()
 
 
@@ -48,7 +47,7 @@ def code_bucket_region(stack: str, bucket: str) -> str | None:
 
 
 def log_prefixes(stack: str) -> tuple[str, ...]:
-    """How the names of all the stack's log groups begin."""
+    """The prefixes of the names of the stack's log groups."""
     return _OURS.format(stack), _VENDED.format(stack)
 
 

@@ -1,8 +1,8 @@
-"""What a versioned bucket holds: versions, delete markers and unfinished uploads; listed, and deleted for good.
+"""Lists the versions, delete markers and unfinished uploads of a versioned bucket, and deletes them for good.
 
-Facts (S3 API Reference, read November 2026): a versioned bucket keeps what is deleted until each version is deleted by
-its id; in a bucket without versions the id is "null". DeleteObjects takes 1,000, answers 200, and says in `Errors` what
-it has not deleted.
+Facts (S3 API Reference, read November 2026): a versioned bucket keeps a deleted object until each of its versions is
+deleted by its id; in a bucket without versioning the id is "null". DeleteObjects takes 1,000 keys. It answers 200 and
+lists in `Errors` what it has not deleted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PIECE = 256 * 1024  # bytes
 class Version(NamedTuple):
     """One version or delete marker of an object, or an unfinished upload (`upload` is its id).
 
-    `latest`: it is what a reader of the key gets.
+    `latest`: it is the version that GetObject returns.
     """
 
     key: str
@@ -46,7 +46,7 @@ class VersionedBucket:
         self._bucket = {"Bucket": name, "ExpectedBucketOwner": account.id}
 
     def versions(self, prefix: str = "") -> Iterator[Version]:
-        """Every version and delete marker below the prefix, 1,000 a request."""
+        """Every version and delete marker whose key has this prefix, 1,000 a request."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Prefix=prefix, **self._bucket):
             for line in page.get("Versions", ()):
                 yield Version(line["Key"], line["VersionId"], line["Size"], latest=line["IsLatest"])
@@ -58,18 +58,18 @@ class VersionedBucket:
         return (version for version in self.versions(key) if version.key == key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """Every unfinished upload below the prefix."""
+        """Every unfinished upload whose key has this prefix."""
         for page in self._s3.get_paginator("list_multipart_uploads").paginate(Prefix=prefix, **self._bucket):
             for line in page.get("Uploads", ()):
                 yield Version(line["Key"], "", upload=line["UploadId"])
 
     def folders(self) -> Iterator[str]:
-        """The first parts of all keys that have a version, without the slash."""
+        """The top-level folders of all keys that have a version, without the slash."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Delimiter="/", **self._bucket):
             yield from (line["Prefix"].removesuffix("/") for line in page.get("CommonPrefixes", ()))
 
     def read(self, version: Version) -> bytes:
-        """The content of a version; empty if it is gone or is a delete marker."""
+        """The content of a version; empty if the version is gone or is a delete marker."""
         try:
             return bytes(self._get(version)["Body"].read())
         except ClientError as error:
@@ -89,7 +89,7 @@ class VersionedBucket:
             self._s3.put_object(Key=key, Body=body, **self._bucket)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Store a new version of a small object if its newest one still is `before`; return whether it was."""
+        """Store a new version of a small object if its newest version is still `before`; return whether it was so."""
         try:
             found = self._s3.get_object(Key=key, **self._bucket)
             if found["Body"].read() != before:
@@ -105,7 +105,7 @@ class VersionedBucket:
         return self._s3.get_object(Key=version.key, VersionId=version.id, **self._bucket)
 
     def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None] = lambda _: None) -> int:
-        """Delete these versions for good; return how many. `note` gets the versions of each call.
+        """Delete these versions for good; return how many. `note` gets the deleted versions after each request.
 
         Raises `Problem` if S3 refuses some of them.
         """

@@ -1,8 +1,8 @@
 """The functions' zips: the same input gives the same bytes, and each carries only what it imports.
 
-A function's name in `lambdas/` leads by its imports (all of them, also those inside functions, but not those for type
-checkers) through this project's modules to the distributions it needs; `deploy.code.packages` has those. A zip is
-named by the hash of its files and not of its bytes, so that another zlib on another machine makes no new version of it.
+Imports are followed from the function's module in `lambdas/` through this project's modules to the distributions that
+it needs, which `deploy.code.packages` provides. All imports count, also those inside functions; only those for type
+checkers do not. A zip is named by the hash of its files, not of its bytes: another machine's zlib makes no new version.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from deploy.code import bytecode
 from deploy.code.packages import ROOT, Target, Wheel, WheelCache, ZipMember
 
 OURS = ("lambdas", "hippodrome", "protocol")
-DATA = {
+DATA = {  # module → folders that it reads at run time, as paths below the project's root
     "hippodrome.config.step_files": ("hippodrome/config/pages",),
     "hippodrome.participants.frame": ("web",),
-}  # folders that a module reads at run time, seen from the project's root
+}
 
-# Distributions of which only the modules go in that imports reach, and where following them ends. Safe where nothing
-# that we use is imported by a computed name (tests/deploy/code/test_build.py runs the result). Powertools' Logger leads
-# to its HTTP resolvers in one place, for values that are pydantic models: we log none.
+# Distribution → modules at which following imports ends. Of these distributions a zip holds only the modules that
+# imports reach. That is safe if no module that we use is imported by a computed name (tests/deploy/code/test_build.py
+# runs the zips). Powertools' Logger imports its HTTP resolvers in one place, for pydantic models, which we do not log.
 PRUNED = {"aws-lambda-powertools": ("aws_lambda_powertools.event_handler",)}
 
+# IN_RUNTIME of deploy.code.packages, by the names of modules.
 _RUNTIME = {"boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3"}
 _DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold
 
@@ -43,11 +44,11 @@ class Function:
     name: str
     members: tuple[ZipMember, ...]
     distributions: tuple[str, ...]
-    python: str | None = None  # the version that runs it ("3.13"), to have bytecode for it
+    python: str | None = None  # the version that runs it ("3.13"); None: no bytecode
 
     @cached_property
     def digest(self) -> str:
-        """sha256 over the names and contents of its files, in hexadecimal."""
+        """The sha256 of the names and contents of its files, in hexadecimal."""
         lines = "".join(f"{member.name}\0{member.sha256}\n" for member in self.members)
         return hashlib.sha256(lines.encode()).hexdigest()
 
@@ -77,7 +78,10 @@ class Function:
 
 
 def functions(target: Target, root: Path = ROOT, wheels: WheelCache | None = None) -> list[Function]:
-    """Every function in `lambdas/` (each module with a `handler`), for that target. Raises `Problem`."""
+    """Every function in `lambdas/` (each module with a `handler`), for this target.
+
+    Raises `Problem` if an imported package is not pinned or cannot be downloaded.
+    """
     tree = _Tree(root)
     wheels = wheels or WheelCache(target)
     return [_function(name, tree, wheels, target.python) for name in tree.handlers()]
@@ -85,8 +89,8 @@ def functions(target: Target, root: Path = ROOT, wheels: WheelCache | None = Non
 
 def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Function:
     modules = _closure([f"lambdas.{name}"], tree.sources, OURS)
-    elsewhere = {name for name in modules.outside if name.partition(".")[0] not in _RUNTIME | sys.stdlib_module_names}
-    tops = {name.partition(".")[0] for name in elsewhere}
+    third_party = {name for name in modules.outside if name.partition(".")[0] not in _RUNTIME | sys.stdlib_module_names}
+    tops = {name.partition(".")[0] for name in third_party}
     if unknown := tops - set(wheels.owners):
         raise Problem(
             f"lambdas/{name}.py needs {', '.join(sorted(unknown))}, which is in no package that is pinned.",
@@ -95,7 +99,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
     distributions = wheels.closure({wheels.owners[top] for top in tops})
     members = {member.name: member for module in modules.inside for member in tree.files(module)}
     for owner, wheel in wheels.wheels(distributions).items():
-        pruned = _pruned(wheel, elsewhere, PRUNED[owner]) if owner in PRUNED else wheel.members
+        pruned = _pruned(wheel, third_party, PRUNED[owner]) if owner in PRUNED else wheel.members
         if twice := set(pruned) & set(members):
             raise Problem(f"{owner} brings {min(twice)}, which is there already.")
         members |= pruned
@@ -103,7 +107,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
 
 
 def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
-    """The wheel's Python files that these imports reach without passing through `ends`."""
+    """The wheel's Python files that the imports `wanted` reach without passing through the modules `ends`."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
     def source(module: str) -> SourceModule | None:
@@ -180,7 +184,7 @@ class _Tree:
 
 @dataclass(frozen=True)
 class Closure:
-    """All modules that some modules import, directly or through others: ours, and the names of others."""
+    """All modules that some modules import, directly or not: `inside` those that are followed, `outside` the others."""
 
     inside: frozenset[str]
     outside: frozenset[str]
@@ -231,7 +235,7 @@ def _base(node: ast.ImportFrom, module: str, package: bool) -> str:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """The tree, without the bodies of `if TYPE_CHECKING:` and without expressions, in which there is no statement."""
+    """All statements of the tree but the bodies of `if TYPE_CHECKING:`. Expressions, which hold none, are skipped."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.expr):
             continue

@@ -1,7 +1,7 @@
-"""Bytecode for the zips: on Lambda /var/task cannot be written, so a cold start would compile every module again.
+"""Bytecode for the zips: on Lambda /var/task is read-only, so without it each cold start compiles every module again.
 
-Compiled by the very Python version that the function will run on, if this machine has it, with unchecked hashes, so
-that the files' times do not matter and nothing is looked at again (PEP 552). Without that Python zips go without.
+The function's own version of Python compiles it, if this machine has that version; else the zips hold none. The
+bytecode has unchecked hashes (PEP 552), so that Python does not compare it with the source or the source's time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-WHERE = "/var/task"  # where Lambda unpacks a zip: what tracebacks say
+WHERE = "/var/task"  # where Lambda unpacks a zip; tracebacks name this path
 _COMPILE = """
 import compileall, py_compile, sys
 folder, where = sys.argv[1:]
@@ -31,23 +31,24 @@ def compiler(version: str) -> str | None:
         return sys.executable
     managed = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
     places = [shutil.which(f"python{version}"), *map(str, managed.glob(f"{version}.*/bin/python{version}"))]
-    return next((place for place in places if place and _is(place, version)), None)
+    return next((place for place in places if place and _is_cpython(place, version)), None)
 
 
-def _is(place: str, version: str) -> bool:
+def _is_cpython(place: str, version: str) -> bool:
     """Whether the program is CPython of that version, and not the placeholder of a version manager."""
     asked = [place, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
     answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - found above
     return answer.stdout.strip() == f"{version} cpython"
 
 
-_made: dict[tuple[str, str, bytes], dict[str, bytes]] = {}  # by Python, name and content: functions share most files
+_made: dict[tuple[str, str, bytes], dict[str, bytes]] = {}  # by compiler, name and content: functions share most files
 
 
 def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
-    """The bytecode files for these modules, by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
+    """Compile these modules; return the bytecode files by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
 
-    Modules that do not compile are left out: some packages carry other versions' syntax, which is not imported.
+    `python` is the path of the compiler. Modules that do not compile are left out: some packages hold modules in the
+    syntax of other versions, which they do not import.
     """
     if new := {name: body for name, body in sources.items() if (python, name, body) not in _made}:
         found = _compile(new, python)

@@ -1,11 +1,11 @@
-"""Third-party packages for the functions: pinned, downloaded as wheels for Lambda's platform, checked, and kept.
+"""Third-party packages for the functions: pinned, downloaded as wheels for Lambda's platform, checked, and cached.
 
-`requirements/packages.txt` pins everything that goes into a zip, with the hash of its wheel for Lambda; made anew from
-`lambdas.txt` and `deploy.txt` by `python -m deploy.code.packages`. pip downloads; it judges environment markers by the
-machine it runs on and not by `--platform` (pypa/pip, issue 11664), so dependencies are followed here.
+`requirements/packages.txt` pins everything that goes into a zip, with the hash of its wheel for Lambda. `python -m
+deploy.code.packages` makes it from `lambdas.txt` and `deploy.txt`. pip downloads the wheels. It evaluates environment
+markers for the machine it runs on and not for `--platform` (pypa/pip, issue 11664), so dependencies are followed here.
 """
 
-# ruff: noqa: PLC0415 - packaging is imported where something is resolved: commands that only look start faster
+# ruff: noqa: PLC0415 - packaging is imported where it is needed, so that other commands start faster
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 PINS = ROOT / "requirements" / "packages.txt"
 
-# What Lambda's Python runtimes bring (boto3 and what it needs; AWS Lambda Developer Guide, "Runtime dependencies in
-# Python", read November 2026).
+# The distributions that Lambda's Python runtimes have: boto3 and its dependencies (AWS Lambda Developer Guide, "Runtime
+# dependencies in Python", read November 2026).
 IN_RUNTIME = {"boto3", "botocore", "jmespath", "python-dateutil", "s3transfer", "six", "urllib3"}
 
 _GLIBC = range(34, 16, -1)  # Lambda's python3.13 runs on Amazon Linux 2023, which has glibc 2.34
@@ -58,12 +58,12 @@ class Target:
 
     @classmethod
     def here(cls) -> Target:
-        """The target that is the running interpreter."""
+        """The running interpreter as the target."""
         return cls(f"{sys.version_info.major}.{sys.version_info.minor}", platform.machine().lower(), local=True)
 
     @classmethod
     def from_env(cls) -> Target:
-        """Lambda's platform; this machine if HIPPODROME_TARGET is `here`."""
+        """Lambda's platform; this machine if HIPPODROME_TARGET is `here`. Raises `Problem` for an unknown value."""
         wanted = os.environ.get("HIPPODROME_TARGET", "")
         if wanted not in {"", "here", "lambda"}:
             raise Problem(f"HIPPODROME_TARGET is {wanted!r}.", "It may be `here`, `lambda` or unset.")
@@ -133,7 +133,7 @@ class ZipMember:
 
 
 class Wheel:
-    """A wheel in the cache. Its files were compared with RECORD when it was downloaded."""
+    """A wheel in the cache. Its files were compared with its RECORD when it was downloaded."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -155,7 +155,7 @@ class Wheel:
         return {top.split(".")[0] for top in tops if "." not in top or top.endswith((".py", ".so", ".pyd"))}
 
     def needs(self, target: Target) -> set[str]:
-        """The distributions that it needs on that target, by normalized name. Extras are not followed."""
+        """The normalized names of the distributions that it needs on this target. Extras are not followed."""
         from packaging.utils import canonicalize_name
 
         wanted = self._requirements
@@ -169,7 +169,7 @@ class Wheel:
         return [Requirement(line) for line in lines]
 
     def check(self) -> None:
-        """Compare every file with RECORD. Raises `Problem`."""
+        """Compare every file with RECORD. Raises `Problem` if one differs, or the wheel cannot be read."""
         try:
             listed = self._record
             for name in self._zip.namelist():
@@ -198,7 +198,7 @@ class Wheel:
 
     @cached_property
     def _record(self) -> dict[str, str]:
-        """RECORD: file → sha256 in hexadecimal, "" for itself."""
+        """RECORD: file → sha256 in hexadecimal; "" for RECORD itself."""
         found = {}
         for row in csv.reader(io.StringIO(self._text("RECORD"))):
             if row:
@@ -208,7 +208,7 @@ class Wheel:
 
 
 def _place(name: str) -> str:
-    """Where a wheel's file is installed, seen from site-packages; "" for scripts, headers and data (PEP 427)."""
+    """Where a wheel's file is installed, as a path below site-packages; "" for scripts, headers and data (PEP 427)."""
     folder, _, rest = name.partition("/")
     if folder.endswith(".data"):
         kind, _, rest = rest.partition("/")
@@ -245,7 +245,7 @@ class WheelCache:
         return {pin.name: self._wheels[pin.name] for pin in pins}
 
     def closure(self, names: Iterable[str]) -> set[str]:
-        """These distributions and all that they need, except for those that Lambda's runtime has."""
+        """These distributions and all that they need, without those that Lambda's runtime has."""
         found: set[str] = set()
         wanted = set(names) - IN_RUNTIME
         while new := wanted - found:
@@ -255,7 +255,7 @@ class WheelCache:
 
     @cached_property
     def owners(self) -> dict[str, str]:
-        """To which distribution each top-level module belongs, for all pinned distributions."""
+        """Top-level module → its distribution, for all pinned distributions."""
         return {module: name for name, wheel in self.wheels(self.pins).items() for module in wheel.modules}
 
     def _pin(self, name: str) -> Pin:
@@ -279,11 +279,11 @@ class WheelCache:
         return f"{pin}-{pin.sha256[:16]}" if self._hashed(pin) else str(pin)
 
     def _hashed(self, pin: Pin) -> bool:
-        """Whether the pin's hash is that of this target's wheel: they are pinned for Lambda only."""
+        """Whether the pin has the hash of this target's wheel. Only the wheels for Lambda are pinned with hashes."""
         return bool(pin.sha256) and self.target == Target()
 
     def _download(self, pins: list[Pin]) -> None:
-        """One pip for all of them, into a folder beside; each comes into its place whole and checked, or not at all."""
+        """Download wheels with one pip into a temporary folder, check each, and move it into the cache whole."""
         self._folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self._folder, prefix="coming-") as coming:
             self._pip(pins, Path(coming))
@@ -343,7 +343,7 @@ class WheelCache:
 
 
 def cache_folder() -> Path:
-    """The folder for this user's caches on this platform. It may be deleted at any time."""
+    """Hippodrome's folder below the user's caches on this platform. It may be deleted at any time."""
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
@@ -360,11 +360,11 @@ def _distribution(path: Path) -> str:
     return str(parse_wheel_filename(path.name)[0])
 
 
-ALSO = ("acme", "cryptography", "josepy")  # of deploy.txt, what functions import as well (renew_certificate)
+ALSO = ("acme", "cryptography", "josepy")  # distributions of deploy.txt that functions import too (renew_certificate)
 
 
 def lock() -> str:
-    """The text of `packages.txt`: direct requirements as they are pinned, the others in the versions installed here."""
+    """The text of `packages.txt`: direct requirements as they are pinned, all others in the versions installed here."""
     direct = read_pins(ROOT / "requirements" / "lambdas.txt")
     deploy = read_pins(ROOT / "requirements" / "deploy.txt")
     pins = direct | {name: deploy[name] for name in ALSO if name in deploy}

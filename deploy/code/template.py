@@ -1,4 +1,4 @@
-"""`infra/template.yml`: read, tied to the built functions, and looked into."""
+"""Reads `infra/template.yml`, puts the keys of the built functions' zips into it, and evaluates its conditions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _KEY = re.compile(r"(\bS3Key:\s*)([\"']?)([A-Za-z0-9_]+)\.zip\2(?=[\s,}]|$)")
 
 
 class Template:
-    """A CloudFormation template's text, and what it says."""
+    """A CloudFormation template: its text and its content."""
 
     def __init__(self, text: str) -> None:
         self.text = text
 
     @classmethod
     def read(cls, path: Path = PATH) -> Template:
-        """The template as it stands in the project. Raises `Problem`."""
+        """The template in the project. Raises `Problem` if it cannot be read."""
         try:
             return cls(path.read_text(encoding="utf-8"))
         except OSError as error:
@@ -55,7 +55,7 @@ class Template:
 
     @cached_property
     def body(self) -> Mapping[str, Any]:
-        """The content; `!Ref x` reads as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}."""
+        """The content: `!Ref x` as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}. Raises `Problem`."""
         try:
             found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:
@@ -73,7 +73,7 @@ class Template:
         }
 
     def refused(self, parameters: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-        """The parameters whose values CloudFormation would refuse, each with what it must be. Unknown ones pass."""
+        """The parameters whose values CloudFormation would refuse, each with what it must be. Ignores unknown names."""
         for name, spec in self.body.get("Parameters", {}).items():
             value = parameters.get(name, "")
             allowed = [str(one) for one in spec.get("AllowedValues", ())]
@@ -104,17 +104,17 @@ class Template:
         return found
 
 
-def _evaluate(what: Any, conditions: Mapping[str, Any], parameters: Mapping[str, str]) -> Any:
-    """The intrinsic functions that conditions are made of."""
-    if not isinstance(what, dict) or len(what) != 1:
-        return what
-    (name, value), *_ = what.items()
+def _evaluate(expression: Any, conditions: Mapping[str, Any], parameters: Mapping[str, str]) -> Any:
+    """The value of an expression of the section Conditions."""
+    if not isinstance(expression, dict) or len(expression) != 1:
+        return expression
+    ((name, value),) = expression.items()
     if name == "Ref":
         return parameters.get(value, "")
     if name == "Condition":
         return _evaluate(conditions.get(value), conditions, parameters)
     if name not in _FUNCTIONS:
-        return what
+        return expression
     return _FUNCTIONS[name](*(_evaluate(one, conditions, parameters) for one in value))
 
 
@@ -147,5 +147,5 @@ def _short_tag(loader: _Loader, suffix: str, node: yaml.Node) -> dict[str, Any]:
 
 
 _Loader.add_multi_constructor("!", _short_tag)
-# CloudFormation's versions look like dates: they stay text.
+# AWSTemplateFormatVersion and the Version of a policy look like dates: they stay text.
 _Loader.add_constructor("tag:yaml.org,2002:timestamp", lambda loader, node: str(node.value))

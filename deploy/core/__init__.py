@@ -1,1 +1,1 @@
-"""What the commands share: options, findings, explained errors, the project folder, registered projects and servers."""
+"""What the commands share: options, findings, explained errors, stages, project folders, projects and servers."""

@@ -1,4 +1,4 @@
-"""The control plane's log while a command runs it here: kept from the screen, and its errors put aside."""
+"""Collects the errors that `hippodrome` logs while a command runs its services, and keeps its log off the screen."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from contextlib import contextmanager
 
 
 class Failures(logging.Handler):
-    """What went wrong: sentences such as "a server is not stopped yet (ClientError, AccessDenied)", each once."""
+    """A log handler that keeps errors as sentences: "a server is not stopped yet (ClientError, AccessDenied)"."""
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)
-        self.lines: dict[str, None] = {}
+        self.lines: dict[str, None] = {}  # the sentences, each once
 
     def emit(self, record: logging.LogRecord) -> None:
         kinds = [str(kind) for kind in (getattr(record, "error", None) or [])[:1]]
         code = getattr(record, "code", None)
-        what = ", ".join([*kinds, *([str(code)] if code else [])])
-        self.lines[f"{record.getMessage()} ({what})" if what else record.getMessage()] = None
+        details = ", ".join([*kinds, *([str(code)] if code else [])])
+        self.lines[f"{record.getMessage()} ({details})" if details else record.getMessage()] = None
 
 
 @contextmanager
 def functions_log() -> Iterator[Failures]:
-    """Within the block, errors that `hippodrome` logs go to the `Failures`; stdout is for answers alone."""
+    """Within the block, collect the errors that `hippodrome` logs in `Failures`, and print none of its log lines."""
     from hippodrome.log import logger  # noqa: PLC0415 - Powertools, which most commands do without
 
     handler = logger.registered_handler
     failures = Failures()
     level = handler.level
     handler.setLevel(logging.CRITICAL + 1)
-    underneath = logging.getLogger(logger.service)
-    underneath.addHandler(failures)
+    standard_logger = logging.getLogger(logger.service)
+    standard_logger.addHandler(failures)
     try:
         yield failures
     finally:
-        underneath.removeHandler(failures)
+        standard_logger.removeHandler(failures)
         handler.setLevel(level)

@@ -1,4 +1,4 @@
-"""From the library's errors to sentences."""
+"""Turns errors of AWS, of the network and of missing packages into sentences with advice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DENIED = {
     "403",
 }
 _NOT_ACTIVE = {"OptInRequired", "SubscriptionRequiredException", "NotSignedUp"}
-"""Of an account whose sign-up is not complete, or not yet known everywhere (AWS re:Post, "error-access-service")."""
+"""Error codes of an account whose sign-up is not complete or not known everywhere (re:Post, "error-access-service")."""
 NOT_ACTIVE = (
     "AWS has not activated this account yet.",
     "Finish the sign-up in AWS's console (credit card, telephone), and wait for AWS's mail, which takes minutes, or "
@@ -63,7 +63,7 @@ def problem_from(error: BaseException) -> Problem | None:
 def _refusal(error: boto.ClientError) -> Problem:
     code = errors.code(error)
     message = errors.message(error).strip()
-    what = _words(error.operation_name)
+    action = _words(error.operation_name)
     if code in _EXPIRED:
         return Problem("The AWS credentials have expired.", "Get new ones (`aws sso login`) and try again.")
     if code in _WRONG_KEYS:
@@ -75,15 +75,15 @@ def _refusal(error: boto.ClientError) -> Problem:
         return Problem(*NOT_ACTIVE, [message] if message else [])
     if code in DENIED:
         return Problem(
-            f"These credentials may not {what}.",
+            f"These credentials may not {action}.",
             "Ask the administrator for that permission; researchers need the stack's ResearcherPolicy.",
             [message] if message else [],
         )
     if code in _SLOW_DOWN:
-        return Problem(f"AWS is busy and would not {what} now.", "Wait a minute and try again.")
-    return Problem(f"AWS would not {what}: {(message or code).rstrip('.')}.")
+        return Problem(f"AWS is busy and would not {action} now.", "Wait a minute and try again.")
+    return Problem(f"AWS would not {action}: {(message or code).rstrip('.')}.")
 
 
 def _words(operation: str) -> str:
-    """`PutObject` → `put object`."""
+    """The name of an API operation in words: `PutObject` → `put object`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", operation).lower()

@@ -1,4 +1,4 @@
-"""The results of checks: lines that are good, to be looked at, or bad, each with what to do about it."""
+"""The results of checks: each is good, worth a look, or bad, and says what to do about it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from rich.text import Text
 
 from deploy.core import explain
 
-AT_ONCE = 8  # checks under way
+AT_ONCE = 8  # checks that run at the same time
 
 
 class Mark(StrEnum):
-    """Whether a line is good, to be looked at, or bad."""
+    """Whether a result is good, worth a look, or bad."""
 
     GOOD = "good"
-    LOOK = "look"  # works, but should be looked at; or could not be checked
-    BAD = "bad"  # participants would meet it
+    LOOK = "look"  # it works, but is worth a look; or it could not be checked
+    BAD = "bad"  # participants would be affected
 
     @property
     def sign(self) -> str:
@@ -34,7 +34,7 @@ STYLES = {Mark.GOOD: "green", Mark.LOOK: "yellow", Mark.BAD: "bold red"}
 
 @dataclass(frozen=True)
 class Finding:
-    """One line: what was checked, how it stands, and what to do about it."""
+    """The result of one check, shown as a line: what was checked, the result, and what to do about it."""
 
     check: str
     mark: Mark
@@ -67,9 +67,12 @@ Subject = TypeVar("Subject")
 
 
 def examine(subject: Subject, checks: Mapping[str, Callable[[Subject], Iterable[Finding]]]) -> list[Finding]:
-    """All checks, at the same time and each by itself: one that cannot be made says why. In the order given."""
+    """Run all checks at the same time; return their findings in the order of `checks`.
 
-    def one(item: tuple[str, Callable[[Subject], Iterable[Finding]]]) -> list[Finding]:
+    A check that raises becomes a finding that says why. With HIPPODROME_DEBUG set, an unexpected error is raised.
+    """
+
+    def run(item: tuple[str, Callable[[Subject], Iterable[Finding]]]) -> list[Finding]:
         name, check = item
         try:
             return list(check(subject))
@@ -81,4 +84,4 @@ def examine(subject: Subject, checks: Mapping[str, Callable[[Subject], Iterable[
             return [look(name, f"could not be checked: {why}", problem.advice if problem else "")]
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return [finding for findings in pool.map(one, checks.items()) for finding in findings]
+        return [finding for findings in pool.map(run, checks.items()) for finding in findings]

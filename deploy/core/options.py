@@ -19,7 +19,7 @@ def is_folder(given: str) -> bool:
 
 
 def project_id(given: str | None) -> str | None:
-    """The project id for `--project`: an id, or that in a folder's config.yml. Raises `Problem` if there is none."""
+    """The id that `--project` gives, or that of the folder that it names. Raises `Problem` if the folder has none."""
     if given is None or not is_folder(given):
         return given
     from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is named
@@ -66,17 +66,17 @@ ProjectId = Annotated[
     typer.Option(
         "--project",
         callback=project_id,
-        help="The project's id, or its folder; else that of the config.yml in this folder.",
+        help="The project's id or its folder; if left out, the id in this folder's config.yml.",
         show_default=False,
     ),
 ]
 OneProject = Annotated[
     str | None,
     typer.Option(
-        "--project", callback=project_id, help="Only this project: its id, or its folder.", show_default=False
+        "--project", callback=project_id, help="Only this project, named by its id or its folder.", show_default=False
     ),
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and change nothing.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Answer every question with yes.")]
 Anyway = Annotated[
     bool, typer.Option("--anyway", help="Go on although something is in the way, such as a domain not delegated yet.")

@@ -1,4 +1,7 @@
-"""Who stands where, from a listing of a project's folder alone: the keys of the answers tell the step."""
+"""Reads the list of projects, and counts the participants of a project by their step.
+
+A listing of the project's folder is enough: the keys of a participant's answers tell at which step they are.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +23,19 @@ MEND = "Register it again, or put an older version of that document in its place
 
 @dataclass
 class ParticipantCounts:
-    """How far the participants of a project are. Counts, never ids."""
+    """How many participants of a project are at which step. Counts, never ids."""
 
     participants: int = 0
-    by_step: dict[str, int] = field(default_factory=dict)  # at which step they are; in the order of the study
-    finished: int = 0  # of those, at the last one
+    by_step: dict[str, int] = field(default_factory=dict)  # step → how many are there; in the order of the study
+    finished: int = 0  # how many of them are at the last step
     arrived_today: int = 0
     last_arrival: datetime | None = None
 
 
 def registered_projects(documents: Documents, unread: list[UnreadableEntry] | None = None) -> list[Project]:
-    """Every registered project, live or not, by id. Raises `Problem` if the list cannot be read.
+    """Every registered project, live or not, sorted by id. Raises `Problem` if the list cannot be read.
 
-    Entries that are no projects are put into `unread`; without it, a line of warning tells of them.
+    Entries that cannot be read are added to `unread`; without `unread`, a warning is printed for each of them.
     """
     found = documents.get(MASTER_LIST)
     if found is None:
@@ -53,13 +56,13 @@ def registered_projects(documents: Documents, unread: list[UnreadableEntry] | No
 
 
 def unreadable(entry: UnreadableEntry) -> str:
-    """A sentence on an entry of the list of projects that cannot be read."""
+    """The sentence about an entry in the list of projects that cannot be read."""
     whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
     return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
 
 
 def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
-    """All these projects, or the one that was asked for. Raises `Problem` if that one is not registered."""
+    """All these projects, or the one with the id `wanted`. Raises `Problem` if it is not among them."""
     projects = list(projects)
     if wanted is None:
         return projects
@@ -73,22 +76,22 @@ def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
 def count_participants(
     documents: Documents, project: Project, today: datetime, advance: Callable[[int], None] | None = None
 ) -> ParticipantCounts:
-    """Count the participants of a project; `today` is when the day began. A listing, 1,000 keys a request.
+    """Count the participants of a project; `today` is when the day began. Lists the folder, 1,000 keys a request.
 
-    Other files and ids that are not well formed are not counted.
+    Folders without a participant's record, and ids that are not well formed, are not counted.
     """
     found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in folders(documents, project.id):
         arrived: datetime | None = None
-        seen: list[Entry] = []
-        for entry in entries:  # recordings sort after what we look for; the rest of the group is skipped unread
-            seen.append(entry)
+        listed: list[Entry] = []
+        for entry in entries:  # in key order: answers, the participant's record, then recordings, which are skipped
+            listed.append(entry)
             if entry.key == participant_key(project.id, user_id):
                 arrived = entry.modified
                 break
         if arrived is None:
             continue
-        at = Progress.from_listing(participant_folder(project.id, user_id), seen).position(project)
+        at = Progress.from_listing(participant_folder(project.id, user_id), listed).position(project)
         found.participants += 1
         found.by_step[at.key] += 1
         found.finished += at.key == project.final.key

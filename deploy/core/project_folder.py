@@ -1,4 +1,4 @@
-"""Reads a project folder, compares it with an installation, and completes what is to be registered."""
+"""Reads a project folder, compares it with an installation, and makes the registration from both."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ProjectFolder:
     folder: Path
     config: Config
     registration: dict[str, Any]
-    remarks: tuple[str, ...] = ()  # on what the installation has of its own
+    remarks: tuple[str, ...] = ()  # on values that have no effect in this installation
 
     @property
     def id(self) -> str:
@@ -38,52 +38,52 @@ class ProjectFolder:
 
 
 def read(folder: Path, installation: Installation | None = None) -> ProjectFolder:
-    """The project in `folder`. The installation's values complete what config.yml leaves out.
+    """Read the project in `folder`. The registration gets the installation's values.
 
-    Raises `Problem` with every mistake in config.yml and the step files, and then everything in which the project and
-    the installation do not agree.
+    Raises `Problem` with every mistake in config.yml and the step files; if there is none, with what is missing for AWS
+    or wrong in agent.py; if there is none of that, with every value that contradicts the installation.
     """
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
         raise _mistakes([str(mistake) for mistake in errors.diagnostics]) from None
-    wrong = [*_place(folder, [*_no_id(folder), *_lacking_for_aws(config)]), *_agent(folder, config)]
+    wrong = [*_with_lines(folder, [*_no_id(folder), *_lacking_for_aws(config)]), *_agent(folder, config)]
     if not wrong and installation is not None:
-        wrong = _place(folder, [*_disagreements(config, installation)])
+        wrong = _with_lines(folder, [*_contradictions(config, installation)])
     if wrong:
         raise _mistakes(wrong)
     registration = {**config.registration(), "useAWS": True}  # deploying a study implies it
     remarks: list[str] = []
     if installation is not None:
-        registration["awsSetup"] = {**registration["awsSetup"], **_here(installation)}
+        registration["awsSetup"] = {**registration["awsSetup"], **_aws_setup_of(installation)}
         registration["maxRuntime"] = min(config.project.max_runtime, int(installation["MaxRuntime"]))
-        remarks = _place(folder, [*_no_effect(config, installation)], remark=True)
+        remarks = _with_lines(folder, [*_no_effect(config, installation)], remark=True)
     return ProjectFolder(folder, config, registration, tuple(remarks))
 
 
 def id_in(folder: Path) -> str | None:
     """The project's id, even if config.yml has mistakes elsewhere; None if it cannot be read."""
-    found = _said(folder, "id")
+    found = _value_of(folder, "id")
     return None if found is None else str(getattr(found, "text", found))
 
 
 def uses_aws(folder: Path) -> bool:
     """Whether config.yml says `useAWS: true`."""
-    found = _said(folder, "useAWS")
+    found = _value_of(folder, "useAWS")
     return getattr(found, "value", found) is True
 
 
 def may_use_aws(folder: Path) -> bool:
-    """Whether config.yml leaves it to `deploy` whether the study is on AWS: it has awsSetup, but no useAWS."""
-    return _said(folder, "useAWS") is None and _said(folder, "awsSetup") is not None
+    """Whether config.yml leaves open if the study is on AWS: it has awsSetup, but no useAWS."""
+    return _value_of(folder, "useAWS") is None and _value_of(folder, "awsSetup") is not None
 
 
 def keeps_off_aws(config: Config) -> bool:
-    """Whether config.yml says `useAWS: false`. Without the key, `deploy` decides."""
+    """Whether config.yml says `useAWS: false`. Without the key, `register` puts the study on AWS."""
     return config.project.given("useAWS") and not config.project.use_aws
 
 
-def _said(folder: Path, key: str) -> Any:
+def _value_of(folder: Path, key: str) -> Any:
     """The value of this key in the section `project` of config.yml; None if the key is missing."""
     try:
         return read_source(folder).adapted.at(("project", key))
@@ -91,17 +91,18 @@ def _said(folder: Path, key: str) -> Any:
         return None
 
 
-def reopened(project: Project, live: bool) -> dict[str, Any]:
-    """The stored registration of a project, with this value of `live`."""
+def registration_of(project: Project, live: bool) -> dict[str, Any]:
+    """What `update_project_master_list` takes to register a registered project again, with this value of `live`."""
     known = msgspec.to_builtins(project)
     ours = {"salt", "secret", "version"}
     kept = {key: value for key, value in known.items() if value is not None and key not in ours}
-    if project.aws_setup is not None:  # records leave out what is the default
+    if project.aws_setup is not None:  # a record leaves out values that are the default
         kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
     return {**kept, "live": live}
 
 
-def _here(installation: Installation) -> dict[str, str]:
+def _aws_setup_of(installation: Installation) -> dict[str, str]:
+    """The values of `awsSetup` that the installation decides."""
     return {
         "bucket": installation["Bucket"],
         "region": installation.region,
@@ -110,7 +111,7 @@ def _here(installation: Installation) -> dict[str, str]:
 
 
 def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
-    """A mistake if the id is empty, which on one machine stands for the folder's name."""
+    """A mistake if the id is empty. On one machine an empty id stands for the folder's name."""
     given: Any = read_source(folder).parsed.values.get("project")
     if isinstance(given, dict) and given.get("id") in (None, ""):
         yield (
@@ -120,7 +121,7 @@ def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
 
 
 def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
-    """What a study without mistakes lacks for AWS. With `useAWS: true` its size has been checked already."""
+    """The keys that a study needs on AWS alone. With `useAWS: true` its size has been checked already."""
     setup = config.project.aws_setup
     missing = [key for key in ("cpu", "memory") if not setup.given(key)]
     if keeps_off_aws(config):
@@ -133,10 +134,11 @@ def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
         )
 
 
-def _disagreements(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+def _contradictions(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+    """Values of the project that this installation does not allow."""
     project = config.project
     given = project.aws_setup.model_dump(by_alias=True)
-    for key, here in _here(installation).items():
+    for key, here in _aws_setup_of(installation).items():
         if key != "bucket" and given[key] is not None and given[key] != here:
             yield (
                 ("project", "awsSetup", key),
@@ -175,8 +177,8 @@ def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Key
         )
 
 
-def _place(folder: Path, found: list[tuple[Keys, str]], remark: bool = False) -> list[str]:
-    """The findings with their lines in config.yml."""
+def _with_lines(folder: Path, found: list[tuple[Keys, str]], remark: bool = False) -> list[str]:
+    """The texts, each with its line in config.yml before it."""
     source = read_source(folder) if found else None
     return [str(source.diagnostic(path, text, remark=remark)) for path, text in found] if source else []
 

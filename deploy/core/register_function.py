@@ -1,4 +1,4 @@
-"""Calls the Lambda function that registers projects: only it may write the list and sign links."""
+"""Calls the Lambda function that registers projects: only that function may write the list and sign links."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hippodrome.model.project import MASTER_LIST, read_list
 
 
 def ask(account: Account, installation: Installation, event: Mapping[str, Any]) -> dict[str, Any]:
-    """Call the function and return its answer; empty if that is no object. Raises `Problem` if the function failed."""
+    """Call the function; return its answer, {} if that is no JSON object. Raises `Problem` if the function failed."""
     reply = account.client("lambda").invoke(
         FunctionName=installation["RegisterFunction"], Payload=json.dumps(event).encode()
     )

@@ -1,4 +1,4 @@
-"""The servers' own records (`_servers/{label}.json`): a listing tells which have changed, and only those are read."""
+"""Reads servers' records (`_servers/{label}.json`): a listing tells which have changed, and only those are read."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from hippodrome.ports import Documents, Entry
 from protocol.keys import handover_key
 
 READERS = 8  # documents read at once; botocore keeps ten connections
-SETTLED = timedelta(seconds=5)  # S3's times are whole seconds: what changed a moment ago may change again unseen
-SLACK = timedelta(hours=1)  # how long a server may outlive its deadline until a function has noticed
+SETTLED = timedelta(seconds=5)  # S3's times are whole seconds: of two changes in one second, a listing hides one
+SLACK = timedelta(hours=1)  # how long a record may stay open after its server's deadline
 
 
 class Records:
-    """The records of all servers. They are kept between two looks, so that a second one reads only what has changed."""
+    """Reads the records of servers, and keeps them, so that the next call of `since` reads only those that changed."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -26,7 +26,7 @@ class Records:
 
     @property
     def unreadable(self) -> int:
-        """How many documents among the records cannot be read as a record."""
+        """How many records cannot be read."""
         return len(self.unreadable_labels)
 
     @property
@@ -36,15 +36,16 @@ class Records:
         return [key.removeprefix(RECORDS).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
-        """The records written at `moment` (aware) or later; all without it. `advance`: so many of so many are read."""
+        """The records written at `moment` (aware) or later, or all. `advance` gets how many of how many are read."""
         wanted = [
             entry
             for entry in self._documents.list(RECORDS)
             if _is_record(entry.key) and (moment is None or entry.modified >= moment)
         ]
         stale = [entry for entry in wanted if self._is_stale(entry)]
+        stale_keys = [entry.key for entry in stale]
         with ThreadPoolExecutor(READERS) as pool:
-            for done, (entry, record) in enumerate(zip(stale, pool.map(self._read, stale), strict=True), 1):
+            for done, (entry, record) in enumerate(zip(stale, pool.map(self._load, stale_keys), strict=True), 1):
                 self._kept[entry.key] = (entry.modified, record)
                 if advance:
                     advance(done, len(stale))
@@ -64,14 +65,14 @@ class Records:
         return [record for record in recent if not record.is_closed]
 
     def read(self, labels: Iterable[str]) -> dict[str, Server]:
-        """The records under these labels, as they are now; those that do not exist are missing."""
+        """The records of these labels, as they are now, by label. Labels without a readable record are left out."""
         keys = sorted({server.key(label) for label in labels})
         with ThreadPoolExecutor(READERS) as pool:
             found = pool.map(self._load, keys)
             return {record.label: record for record in found if record is not None}
 
     def owners(self, names: Iterable[str]) -> dict[str, Server]:
-        """The records that own these resource names, by the rule of `Repository.owner`; names without one are missing.
+        """The records that own these resource names, by the rule of `Repository.owner`. Names without one are left out.
 
         Two rounds of reads for all of them: an assigned warm server leads from its own record to the participant's.
         """
@@ -85,16 +86,13 @@ class Records:
         kept = self._kept.get(entry.key)
         return kept is None or kept[0] != entry.modified
 
-    def _read(self, entry: Entry) -> Server | None:
-        return self._load(entry.key)
-
     def _load(self, key: str) -> Server | None:
         document = self._documents.get(key)
         try:
             record = from_json(document.body, Server) if document else None
         except (ValueError, RecursionError):
             return None
-        # A record says whose it is; under another's key it would speak for the wrong server.
+        # A record names its server. One that lies under another server's key does not count.
         return record if record and key == server.key(record.label) else None
 
 
@@ -103,17 +101,17 @@ def _is_record(key: str) -> bool:
     return key.endswith(".json") and ids.parse_server_name(f"{label}-1") is not None
 
 
-def runs(record: Server) -> list[PastAttempt]:
-    """Every attempt that a record holds, oldest first."""
+def attempts_of(record: Server) -> list[PastAttempt]:
+    """Every attempt of a record, oldest first; the last one is the present attempt."""
     return [*record.earlier, past_attempt(record)]
 
 
 def warm_servers_of(record: Server | None) -> list[str]:
     """The names of the warm servers that were assigned to the owner of a record, in all attempts."""
-    return [run.warm_server_name for run in runs(record) if run.warm_server_name] if record else []
+    return [one.warm_server_name for one in attempts_of(record) if one.warm_server_name] if record else []
 
 
 def keys_of_warm_servers(project_id: str, names: Collection[str]) -> list[str]:
-    """The handovers and records of warm servers that were assigned."""
+    """The keys of the handover documents and the records of these warm servers, sorted."""
     labels = [parsed[0] for name in names if (parsed := ids.parse_server_name(name))]
     return sorted([*(handover_key(project_id, name) for name in names), *(server.key(label) for label in labels)])

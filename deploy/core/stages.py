@@ -1,9 +1,9 @@
 """The stages that `apply`, `stop`, `erase` and `destroy` share, and the one executor that runs them.
 
 look      what exists; changes nothing
-plan      what was found → a list of steps: plain data, in the order in which they are to be done; none if nothing is
-execute   each step; a step that fails for a while is tried again (`retry`), and what takes its time is waited for
-verify    look again: what is still found is planned and executed again, until a look finds nothing or time is over
+plan      what was found → a list of steps: plain data, in the order in which they are to be done; may be empty
+execute   each step, in this order; `retry` repeats a step whose failure passes, `wait` waits for a slow one
+verify    look again: if something is found, plan and execute again, until a look finds nothing or time is over
 
 Nothing is remembered between two runs. A run that was cut off anywhere is simply repeated: its look finds what is left.
 """
@@ -52,7 +52,7 @@ class Executor:
     def execute(self, steps: Sequence[PlanStep], note: Callable[[Exception], None] | None = None) -> None:
         """Execute the steps in their order.
 
-        With `note` they are independent: the exception of one goes there, and the others are executed all the same.
+        With `note` they are independent: `note` gets the exception of a step that fails, and the next step follows.
         """
         for one in steps:
             try:
@@ -74,9 +74,9 @@ class Executor:
     ) -> F:
         """Look, execute the plan and look again, until a look finds nothing; return what the last look found.
 
-        Ends after `rounds` plans, or when `seconds` are over; the first plan is executed in any case. With
-        `pause=0` the next round begins with what the last look found. An empty plan for
-        something that was found means that it only has to be waited for.
+        Ends after `rounds` plans, or when `seconds` are over; the first plan is executed in any case. With `pause=0`
+        the next round begins with what the last look found. If something was found and its plan is empty, this only
+        waits until a look finds nothing.
         """
         timer, executed, found = self._timer(), 0, look()
         while found:
@@ -94,7 +94,7 @@ class Executor:
     def wait(self, look: Callable[[], F], seconds: float, *, pause: float | None = None, title: str = "") -> F:
         """Look until nothing is found, or `seconds` are over; return what the last look found.
 
-        With `title` a progress bar shows what is waited for, from the first look that finds something.
+        With `title` a progress bar is shown from the first look that finds something.
         """
         timer, found = self._timer(), look()
         if not found:
@@ -110,8 +110,8 @@ class Executor:
     def retry(self, act: Callable[[], R], recover: Callable[[Exception], bool], tries: int) -> R:
         """Call `act` until it succeeds, `tries` times at most; return what it returns.
 
-        `recover` gets the exception of a try that failed: it does what helps and returns True, or returns False if
-        nothing does. The exception is raised then, and after the last try.
+        `recover` gets the exception of a try that failed. It removes the cause and returns True; if it cannot, it
+        returns False, and the exception is raised. The exception of the last try is raised too.
         """
         for _ in range(tries - 1):
             try:
@@ -126,7 +126,7 @@ class Executor:
 
 
 class _Timer:
-    """Measures seconds: those on the clock, or those that were slept if they are more, as with a test's `sleep`."""
+    """Measures seconds: those on the clock, or the sum of all sleeps if it is more, as with a test's `sleep`."""
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
         self._clock = clock

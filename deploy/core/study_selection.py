@@ -1,4 +1,4 @@
-"""Which study a command is about, and where its data are."""
+"""Finds which study a command is about, and where the study's data are."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from deploy.core import options
 from hippodrome.model import ids
 
 DATA = "data"
-"""The folder in the project's where `make run` keeps its data."""
+"""The folder in the project's folder where `make run` keeps data."""
 TRIED = "data-try"
-"""The folder in the project's where `make try` keeps the data of each rehearsal."""
+"""The folder in the project's folder where `make try` keeps the data of each rehearsal."""
 
 
 @dataclass(frozen=True)
 class StudySelection:
-    """A study: its id, and the project's folder if one was named or is here."""
+    """A study: its id, and its project folder if that was named or is the current folder."""
 
     id: str
     folder: Path | None
 
 
 def project_id(given: str | None) -> str:
-    """`--project`, or the id in this folder's config.yml. Raises `Problem` if there is neither, or if it is no id."""
+    """The id of the study that `selected` finds. Raises `Problem` as `selected` does."""
     return selected(given).id
 
 
 def selected(given: str | None) -> StudySelection:
-    """The study that `--project` names by its id or its folder, or that of this folder's config.yml.
+    """The study that `--project` names by its id or its folder; without it, the one in this folder's config.yml.
 
-    Raises `Problem` if there is none, or what is named is no id.
+    Raises `Problem` if there is none, or if its id is not well formed.
     """
     from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is read
 
@@ -52,8 +52,8 @@ def selected(given: str | None) -> StudySelection:
 def local_data(study: StudySelection) -> Path | None:
     """The data folder of a study that is held on this machine; None if its data are on AWS.
 
-    Where config.yml leaves that open (it has awsSetup and no useAWS), they are here as soon as this machine has a
-    participant's. Raises `Problem` if the study is for this machine, and there are none.
+    Where config.yml leaves that open (it has awsSetup and no useAWS), the data are here if the folder `data` exists.
+    Raises `Problem` if the study is held on this machine, and the folder does not exist.
     """
     from deploy.core.project_folder import may_use_aws, uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
 
@@ -68,7 +68,7 @@ def local_data(study: StudySelection) -> Path | None:
 
 
 def none_here(study: str, folder: Path, on_aws: str) -> Problem:
-    """What is said of a study in this folder without data on this machine; `on_aws` is the advice for data on AWS."""
+    """The problem of a study without data on this machine. `on_aws` is the advice for data that are on AWS."""
     tried = sorted((folder / TRIED).glob("try-*"))
     return Problem(
         f"There are no data of {study} on this machine: there is no folder {folder / DATA}.",
@@ -78,7 +78,9 @@ def none_here(study: str, folder: Path, on_aws: str) -> Problem:
 
 
 def folder_for(study: str, source: Path | None) -> Path:
-    """Where converted data go by default: `data-<project>` here, and for a data folder by another name than
-    `data`, such as that of a rehearsal, a folder of its own."""
+    """The default folder for converted data: `data-<project>` in the current folder.
+
+    The data of a `source` that is not called `data`, such as a rehearsal's, get `data-<project>-<name of the source>`.
+    """
     name = source.resolve().name if source is not None else DATA
     return Path(f"data-{study}" if name == DATA else f"data-{study}-{name}")

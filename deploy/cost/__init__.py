@@ -1,1 +1,1 @@
-"""What a study will cost and did cost, from one table of prices."""
+"""Computes what a study will cost and what it has cost, from one table of prices."""

@@ -1,4 +1,4 @@
-"""What AWS has billed, from Cost Explorer: a day behind, and a cent for each request."""
+"""What AWS has billed, from Cost Explorer, which is a day behind and costs a cent for each request."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ METRIC = "UnblendedCost"
 
 @dataclass
 class Billed:
-    """US dollars by service. `fargate`: of the whole account and region, as long as tasks carry no tag."""
+    """A bill in US dollars, by service. `fargate`: the cost of all tasks in the region, if none has the stack's tag."""
 
     start: date
     end: date
@@ -33,15 +33,15 @@ class Billed:
 
     @property
     def asking(self) -> float:
-        """What the question to Cost Explorer has cost, in US dollars."""
+        """What the requests to Cost Explorer have cost, in US dollars."""
         return self.requests * Prices().explorer_request.usd
 
 
 def billed(account: Account, stack: str, start: date, end: date) -> Billed:
-    """Ask Cost Explorer for what carries the stack's tag, from `start` up to and without `end`.
+    """Ask Cost Explorer for the cost of all resources with the stack's tag, from `start` up to `end`, without that day.
 
-    Tags count from the day on which `hippodrome:stack` was made a cost allocation tag (Billing, "Cost allocation
-    tags"). Raises `Problem` if Cost Explorer is not switched on or may not be asked.
+    A tag counts from the day on which it was made a cost allocation tag (Billing, "Cost allocation tags"). Raises
+    `Problem` if Cost Explorer has no data, and ClientError if it refuses.
     """
     found = Billed(start, end)
     client = account.client("ce", HOME)
@@ -65,7 +65,7 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
 
 
 def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:
-    """The bill; or None and the reason, with what to do. The rest of a command's answer is shown in any case."""
+    """The bill and ""; or None and the reason with advice, so that a command can show the rest of its answer."""
     try:
         return billed(account, stack, start, end), ""
     except Exception as error:

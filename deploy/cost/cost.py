@@ -1,9 +1,9 @@
-"""`deploy cost`: what a study will cost, and what it did cost."""
+"""`deploy cost`: what a study will cost, and what it has cost."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -36,14 +36,14 @@ from hippodrome.model.server import Server
 if TYPE_CHECKING:
     from hippodrome.config import Config
 
-PEOPLE = 100  # by default
+PEOPLE = 100  # participants, if --participants is left out
 
 
 def command(
     folder: options.Folder = Path(),
     *,
     people: Annotated[
-        int, typer.Option("--participants", min=1, max=10_000_000, help="How many are to take part.")
+        int, typer.Option("--participants", min=1, max=10_000_000, help="How many participants the study will have.")
     ] = PEOPLE,
     minutes: Annotated[
         float | None,
@@ -52,7 +52,7 @@ def command(
     spot: Annotated[bool, typer.Option("--spot/--no-spot", help="Whether servers run on Fargate Spot.")] = True,
     project: Annotated[
         str | None,
-        typer.Option("--project", help="What this project did cost, from its servers' records.", show_default=False),
+        typer.Option("--project", help="What this project has cost, from its servers' records.", show_default=False),
     ] = None,
     ask_aws: Annotated[
         bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")
@@ -65,7 +65,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """What a study will cost, or with --project, what it did cost.
+    """What a study will cost, or with --project, what it has cost.
 
     Before: reads the config.yml of FOLDER (cpu, memory, maxRuntime, frame rate) and needs no AWS account. After: counts
     the servers' time from their own records. Both are estimates from list prices; --billed tells what AWS has charged.
@@ -84,7 +84,7 @@ def command(
 
 
 def _read(folder: Path) -> Config:
-    """The study in a folder. Raises `Problem` with every mistake in its config.yml."""
+    """The config.yml in a folder. Raises `Problem` with every mistake in it."""
     from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
 
     try:
@@ -180,7 +180,7 @@ def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
 
 
 def _show_warm(waiting: Sequence[WarmCost]) -> None:
-    """Print what warm servers cost in an hour: for how long their studies are live is not known."""
+    """Print what warm servers cost in an hour and a day. For how long their studies are live is not known."""
     rows: list[Sequence[object]] = []
     for one in waiting:
         size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
@@ -266,9 +266,8 @@ def _row(name: str, one: Spent) -> tuple[object, ...]:
     return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
 
 
-def _notes(found: Any, unreadable: int) -> list[str]:
-    every = list(found)
-    never, guessed = sum(one.never_ran for one in every), sum(one.guessed for one in every)
+def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
+    never, guessed = sum(one.never_ran for one in found), sum(one.guessed for one in found)
     notes = []
     if never:
         notes.append(f"{never:,} more were asked for and never ran: not counted.")
@@ -282,7 +281,7 @@ def _notes(found: Any, unreadable: int) -> list[str]:
 
 
 def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
-    """The bill from the day of the first server on, or from the first of this month; or None, and why there is none."""
+    """The bill from the first server's day, or from the first of this month, on; or None, and why there is none."""
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
     # Cost Explorer remembers about a year.
     start: date = max(first.date(), (now - timedelta(days=364)).date())

@@ -1,8 +1,8 @@
-"""What a study will cost, before it is held: a line for each thing that is billed. Pure.
+"""Estimates what a study will cost: a line for each thing that AWS bills. Pure.
 
 The numbers of calls are those that `make bench` counts for the example study of five steps (docs/architecture.md, "What
 a participant costs": 30 from the link to the clean-up in a running study, 39 for a participant alone), scaled by the
-number of steps. What is not measured is assumed, low, likely and high, and said in `assumptions`.
+number of steps. A figure that is not measured is assumed, low, likely and high; `assumptions` says which.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ from typing import Any, NamedTuple
 
 from deploy.cost.prices import HOURS, Prices, Range, Usd
 
-BENCH_STEPS = 5  # of the example study
-S3_READS = Range(4, 4, 13)  # GET: in a running study, likely, alone with stale caches
-S3_WRITES = 13  # PUT and LIST
-TRIAL_READS, TRIAL_WRITES = 2, 2  # the trial server: its certificate; a recording and the answer
-SIGNED = Range(4, 6, 20)  # requests that a server has signed: certificate, answer, recordings; after a loss more
+BENCH_STEPS = 5  # steps of the example study
+S3_READS = Range(4, 4, 13)  # GET of a participant: in a running study; high: alone, with stale caches
+S3_WRITES = 13  # PUT and LIST of a participant
+TRIAL_READS, TRIAL_WRITES = 2, 2  # of the trial server: its certificate; a recording and the answer
+SIGNED = Range(4, 6, 20)  # presigned requests of a server: certificate, answer, recordings; more after a loss
 PUBLISHES = 2
-LOBBY_POLLS = Range(5, 15)  # looks of a page that waits for others, every two seconds, `patience` seconds at most
-POLLS = Range(2, 12, 60)  # looks of the waiting page, every two to four seconds
-WORKERS = Range(4, 7, 12)  # invocations of the functions behind queues: start, changes and looks, stop
+LOBBY_POLLS = Range(5, 15)  # requests of a page in the lobby, every two seconds, for `patience` seconds at most
+POLLS = Range(2, 12, 60)  # requests of the waiting page, every two to four seconds
+WORKERS = Range(4, 7, 12)  # invocations of the functions behind queues, for a server: start, task changes, stop
 NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; the high one is a cold start each time
 WORKER_SECONDS = Range(0.2, 0.5, 2.0)
 SWEEP_SECONDS = Range(0.3, 0.7, 2.0)
 NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # infra/template.yml
-PAGE_KB = 14  # gzip, the heaviest page of the example: `python -m bench pages`
+PAGE_KB = 14  # with gzip, the largest page of the example: `python -m bench pages`
 PAGE_LOADS = Range(1.0, 1.5, 3.0)
 FRAME_KB = Range(0.4, 0.5, 77.0)  # `python -m bench trial`: Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400
-PLAYED = Range(0.4, 0.6, 1.0)  # the share of a server's time in which frames travel
-RECORDED_KB = Range(0.02, 0.06, 0.2)  # of a step, gzipped, without pictures
+PLAYED = Range(0.4, 0.6, 1.0)  # the share of a server's time in which it sends frames
+RECORDED_KB = Range(0.02, 0.06, 0.2)  # of a step, with gzip, without pictures; each frame counts as a step
 PICTURE_KB = Range(1.0, 4.0, 30.0)  # with `recordObservations`
 ANSWERS_KB = 5
 LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
 IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
 UNUSED = 10  # minutes until a server without its participant ends: IDLE_SECONDS in trial/settings.py
-UNUSED_AHEAD = 35  # until one that was started ahead of a session is stopped: LONGEST_OPEN, and the next sweep
+UNUSED_AHEAD = 35  # minutes until a server started ahead of a session is stopped: LONGEST_OPEN, and the next sweep
 DNS_QUERIES = Range(4, 10, 40)
 
 
@@ -52,25 +52,25 @@ class CostLine(NamedTuple):
 
 @dataclass(frozen=True)
 class StudyToEstimate:
-    """What is known of a study before it is held."""
+    """A study whose cost is estimated."""
 
     participants: int
     steps: int
     cpu: float  # vCPU
     memory: float  # GB
     max_runtime: int  # minutes
-    minutes: float | None = None  # mean time of a server; None: not known
+    minutes: float | None = None  # mean minutes of a server; None: not known
     frame_rate: float = 30  # frames a second
     games: bool = True
     spot: bool = True
     observations: bool = False  # whether recordings hold every picture
     at_link: bool = False  # whether a server starts when a link is opened
-    players: int = 1  # participants of a session, who share a server
-    patience: float = 300  # seconds in the lobby at most
+    players: int = 1  # participants of a session; they share a server
+    patience: float = 300  # seconds that a participant waits in the lobby at most
 
     @property
     def servers(self) -> int:
-        """How many servers run: one for each participant, or for each session, if there is a game."""
+        """The number of servers: one for each participant or session; 0 without a game."""
         return math.ceil(self.participants / self.players) if self.games else 0
 
     @property
@@ -88,12 +88,12 @@ class StudyToEstimate:
 
     @property
     def clients(self) -> int:
-        """How many pages wait for a server and play."""
+        """The number of participants who wait for a server and play; 0 without a game."""
         return self.participants if self.games else 0
 
     @property
     def server_minutes(self) -> Range:
-        """Minutes of one server, from the request to its end."""
+        """Minutes of one server, from its start message to its end."""
         if not self.games:
             return Range()
         if self.minutes is not None:
@@ -102,7 +102,7 @@ class StudyToEstimate:
 
 
 def study_lines(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
-    """What is billed because of participants."""
+    """The lines of what participants cost."""
     return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
 
 
@@ -112,7 +112,7 @@ def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     hours = study.server_minutes * study.servers * (1 / 60)
     hour, on_demand = (prices.server_hour(study.cpu, study.memory, spot=spot) for spot in (study.spot, False))
     address = prices.ipv4_hour.usd
-    # Where Spot has no room, a server runs on demand: at worst all of them.
+    # If Spot has no room, a server runs on demand; in the worst case all servers do.
     machine = Usd(hour.low, hour.likely, on_demand.high) + Usd.exactly(-address)
     size = f"{study.cpu:g} vCPU, {study.memory:g} GB"
     kind = "Fargate Spot" if study.spot else "Fargate"
@@ -123,7 +123,7 @@ def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 
 class WarmCost(NamedTuple):
-    """What an hour of a project's warm servers costs, all together, while they wait: on Spot, and on demand."""
+    """What all warm servers of a project together cost in an hour while they wait: on Spot, and on demand."""
 
     project_id: str
     servers: int
@@ -134,7 +134,7 @@ class WarmCost(NamedTuple):
 
 
 def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> WarmCost:
-    """What a project's warm servers cost. One costs as much as one that is played on: machine and public address."""
+    """What a project's warm servers cost. A server that waits costs as much as one on which a participant plays."""
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
     return WarmCost(project_id, servers, cpu, memory, spot, on_demand)
 
@@ -152,11 +152,11 @@ def _functions(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 def _small_things(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
-    # A read more for each poll, two to sign.
+    # Each poll of the waiting page reads once more, each presigned request twice.
     reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + SIGNED * 2) * servers + POLLS * study.clients
     writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers)
-    # In the lobby a poll reads the participant's membership and the decisions, lists who is there (which costs as much
-    # as a write), and writes that it is there.
+    # A poll in the lobby reads the membership and the decisions, lists the entries (which costs as much as a write),
+    # and writes the participant's own entry.
     reads, writes = reads + study.lobby_polls * 2, writes + study.lobby_polls * 2
     messages = WORKERS * (servers * 3)  # sent, received, deleted
     queries = DNS_QUERIES * servers
@@ -193,15 +193,15 @@ def _data(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 
 def _page_requests(study: StudyToEstimate) -> Range:
-    """Requests to `next_step`: a GET and a POST for each step, none to answer the last; the polls; pages' own files."""
+    """Requests to `next_step`: a GET and a POST for each step, no POST for the last one; the polls."""
     return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
 
 
 @dataclass(frozen=True)
 class FixedResources:
-    """What an installation has whether there are participants or not, as counted in `infra/template.yml`."""
+    """The resources of an installation that cost something without participants, as counted in `infra/template.yml`."""
 
-    queues: int = 3  # that a function listens to
+    queues: int = 3  # queues with a function behind them
     alarms: int = 24
     dashboards: int = 1
     metrics: int = 6
@@ -219,9 +219,9 @@ class FixedResources:
 
 
 def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
-    """What a month without participants costs. The high figure is without free tiers."""
-    # Lambda asks each queue with five pollers, 20 seconds a request when nothing comes; that these become two is not
-    # for mappings with a maximum concurrency (Lambda Developer Guide, "Configuring scaling behavior for SQS").
+    """The lines of what a month costs without participants. The high figure is without free tiers."""
+    # Five pollers of Lambda ask each queue; a request to an empty queue takes 20 seconds. Lambda reduces five to two
+    # only for mappings without a maximum concurrency (Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0
     sweeps = SWEEP_SECONDS * (fixed.sweeps * WORKER_GB)
     gb_second = prices.lambda_gb_second.usd
@@ -244,13 +244,13 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
 
 
 def _fixed(what: str, count: int, price: float, free: float) -> CostLine:
-    """Likely within the free tier, which the account's other things may have used up."""
+    """A line for `count` resources: likely within the free tier, which the account may have used up otherwise."""
     least = max(0.0, count - free) * price
     return CostLine(what, f"{count}", Usd(least, least, count * price))
 
 
 def assumptions(study: StudyToEstimate) -> list[str]:
-    """What the estimate assumes, in sentences."""
+    """The assumptions of the estimate, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
     found = [

@@ -1,10 +1,10 @@
-"""What AWS charges: list prices in US dollars, in one table with its date and where each one comes from.
+"""What AWS charges: list prices in US dollars, in one table with its date and the source of each price.
 
 The prices are those of us-east-1 (N. Virginia), without taxes, savings plans, credits and, unless it says so, free
-tiers. Other regions cost up to about a third more; `current` asks AWS's Price List API for what matters most there.
+tiers. Other regions cost up to about a third more; `current` asks AWS's Price List API for Fargate's prices there.
 
-AWS's pricing pages fill in their figures by scripts. Those marked `twice` below were found in at least one more place
-of 2026 that quotes the Price List API or the page; the others are as AWS's page has had them for years.
+AWS's pricing pages fill in their figures by scripts. Prices with `twice` (the default) were found in at least one more
+place of 2026 that quotes the Price List API or the page; the others are as AWS's page has had them for years.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 REGION = "us-east-1"
 DATE = "2026-11-21"
-HOURS = 730  # of a month, as AWS reckons
-FARGATE_MINIMUM = 60  # seconds billed of a task at least (Linux)
+HOURS = 730  # in a month, as AWS computes
+FARGATE_MINIMUM = 60  # seconds of a task that are billed at least (Linux)
 
 
 @dataclass(frozen=True)
 class Range:
-    """An estimate: the least, the likely figure, and the most."""
+    """An estimate: the low, the likely and the high figure."""
 
     low: float = 0.0
     likely: float = 0.0
@@ -52,7 +52,7 @@ Usd = Range  # in US dollars
 
 
 class Price(NamedTuple):
-    """What one `unit` costs, and the page that says so."""
+    """The price of one `unit` in US dollars, and the page that says so."""
 
     usd: float
     unit: str
@@ -61,12 +61,12 @@ class Price(NamedTuple):
 
 
 class Prices(NamedTuple):
-    """The table of prices, in the region `region`."""
+    """The table of prices. `region` is the region of Fargate's prices; all others are those of `REGION`."""
 
-    # Fargate, Linux on x86; from the download of the image to the end of the task, by the second, a minute at least.
+    # Fargate, Linux on x86: billed by the second, a minute at least, from the image's download to the task's end.
     vcpu_hour: Price = Price(0.04048, "vCPU-hour", "aws.amazon.com/fargate/pricing; AmazonECS USE1-Fargate-vCPU-Hours")
     gb_hour: Price = Price(0.004445, "GB-hour", "aws.amazon.com/fargate/pricing; AmazonECS USE1-Fargate-GB-Hours")
-    # Since February 2024 for every public IPv4 address, those that Fargate assigns too.
+    # Since February 2024 AWS charges for every public IPv4 address, also for those that Fargate assigns.
     ipv4_hour: Price = Price(0.005, "address-hour", "aws.amazon.com/vpc/pricing")
     lambda_request: Price = Price(0.20e-6, "request", "aws.amazon.com/lambda/pricing")
     lambda_gb_second: Price = Price(0.0000133334, "GB-second, arm64", "aws.amazon.com/lambda/pricing")
@@ -95,21 +95,21 @@ class Prices(NamedTuple):
     region: str = REGION
     date: str = DATE
 
-    # What Spot costs of the price on demand. AWS says "up to 70 %" less, and changes it with supply and demand; 67 %
-    # less was seen in 2020 (0.01334 a vCPU-hour in eu-west-1) and about 69 % in 2026 (us-east-1).
+    # What Spot costs, as a share of the on-demand price. AWS says "up to 70 %" less, and changes it with supply and
+    # demand; 67 % less was seen in 2020 (0.01334 a vCPU-hour in eu-west-1) and about 69 % less in 2026 (us-east-1).
     spot_low: float = 0.30
     spot_likely: float = 0.35
     spot_high: float = 0.50
 
     def server_hour(self, cpu: float, memory: float, *, spot: bool) -> Usd:
-        """An hour of a server with its public address. `cpu` in vCPU, `memory` in GB."""
+        """What a server with its public address costs in an hour. `cpu` in vCPU, `memory` in GB."""
         machine = cpu * self.vcpu_hour.usd + memory * self.gb_hour.usd
         shares = (self.spot_low, self.spot_likely, self.spot_high) if spot else (1.0, 1.0, 1.0)
         low, likely, high = (machine * share + self.ipv4_hour.usd for share in shares)
         return Usd(low, likely, high)
 
     def note(self, region: str) -> str:
-        """A sentence on how far these prices hold for an installation in `region`."""
+        """A sentence that says how well these prices fit an installation in `region`."""
         if self.region == region:
             return f"List prices of {self.region}, {self.date}, without taxes and credits."
         return (
@@ -121,8 +121,8 @@ class Prices(NamedTuple):
 def current(client: Any, region: str, today: str) -> Prices:
     """The table with today's prices of Fargate in `region`, as AWS gives them; the other prices stay.
 
-    `client` is one of the Price List API, which lives in us-east-1 and costs nothing. Raises LookupError if the answer
-    has no such prices.
+    `client` is the boto3 client `pricing` (the Price List API, which is in us-east-1 and free). Raises LookupError if
+    the answer has no such prices.
     """
     found: dict[str, float] = {}
     pages = client.get_paginator("get_products").paginate(
@@ -131,7 +131,7 @@ def current(client: Any, region: str, today: str) -> Prices:
     for page in pages:
         for text in page["PriceList"]:
             product: Mapping[str, Any] = json.loads(text) if isinstance(text, str) else text
-            # USE1-Fargate-vCPU-Hours:perCPU; some regions have no prefix. ARM, Windows and Spot are called otherwise.
+            # USE1-Fargate-vCPU-Hours:perCPU; some regions have no prefix. ARM, Windows and Spot have other names.
             usage = str(product.get("product", {}).get("attributes", {}).get("usagetype", ""))
             prefix, _, kind = usage.rpartition("Fargate-")
             price = _on_demand(product)
@@ -152,7 +152,7 @@ def current(client: Any, region: str, today: str) -> Prices:
 
 
 def _on_demand(product: Mapping[str, Any]) -> float | None:
-    """The first price above zero."""
+    """The product's first on-demand price above zero; None if there is none."""
     for term in product.get("terms", {}).get("OnDemand", {}).values():
         for dimension in term.get("priceDimensions", {}).values():
             amount = float(dimension.get("pricePerUnit", {}).get("USD", 0))

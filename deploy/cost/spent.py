@@ -1,4 +1,4 @@
-"""What servers did cost: from their own records, and the price table. Pure."""
+"""Computes what servers have cost, from their records and the price table. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from deploy.core.server_records import runs
+from deploy.core.server_records import attempts_of
 from deploy.cost.prices import FARGATE_MINIMUM, Prices, Usd
 from hippodrome.model.server import PastAttempt, Reason, Server
 
@@ -15,13 +15,13 @@ Size = tuple[float, float]  # vCPU, GB
 
 @dataclass
 class Spent:
-    """The sum of what servers cost."""
+    """The sum of what some servers have cost."""
 
     usd: Usd = field(default_factory=Usd)
     hours: float = 0.0  # of servers
-    attempts: int = 0  # that ran; one that took over a warm server is no other server
-    never_ran: int = 0  # asked for, and not counted: no room, refused, or lost before it ran
-    guessed: int = 0  # whose size was not on record
+    attempts: int = 0  # that ran; an attempt on a warm server is not counted, since the warm server's own record is
+    never_ran: int = 0  # attempts that are not in the sum: no room, refused, or lost before the task ran
+    guessed: int = 0  # attempts whose record has no size
 
     def add(self, other: Spent) -> None:
         self.usd += other.usd
@@ -34,36 +34,36 @@ class Spent:
 def spent(
     records: Iterable[Server], prices: Prices, now: datetime, sizes: dict[str, Size], since: datetime | None = None
 ) -> Spent:
-    """What these servers have cost until now, or since `since`.
+    """What these servers have cost until now, from the beginning or from `since` on.
 
-    Fargate bills from the download of the image, which begins seconds after the request and is not on record: so from
-    the request on. A warm server is two records: its own says how long it waited, and that of the participant who took
-    it how long it was played on. `sizes` are those of the projects by id, for records that do not say what the server
-    ran on.
+    Fargate bills from the download of the image on. That begins seconds after the request and is not in the record, so
+    the time counts from the request. A warm server has two records: its own says how long it waited, and the record of
+    the participant who got it says how long they played. `sizes` are the projects' sizes by id, for attempts whose
+    record has no size.
     """
     total = Spent()
     for record in records:
-        for run in runs(record):
-            total.add(_of(run, prices, now, sizes.get(record.project_id, (1.0, 2.0)), since))
+        for attempt in attempts_of(record):
+            total.add(_cost_of(attempt, prices, now, sizes.get(record.project_id, (1.0, 2.0)), since))
     return total
 
 
-def _of(run: PastAttempt, prices: Prices, now: datetime, usual: Size, since: datetime | None) -> Spent:
-    end = run.closed or now
+def _cost_of(attempt: PastAttempt, prices: Prices, now: datetime, usual: Size, since: datetime | None) -> Spent:
+    end = attempt.closed or now
     if since and end <= since:
         return Spent()
-    if run.running is None and run.closed is not None:
+    if attempt.running is None and attempt.closed is not None:
         return Spent(never_ran=1)
-    begin = max(run.requested, since) if since else run.requested
+    begin = max(attempt.requested, since) if since else attempt.requested
     seconds = (end - begin).total_seconds()
-    if begin == run.requested and not _is_part(run):
+    if begin == attempt.requested and not _is_part(attempt):
         seconds = max(seconds, FARGATE_MINIMUM)
     hours = max(seconds, 0.0) / 3600
-    cpu, memory = (run.cpu, run.memory) if run.cpu else usual
-    usd = prices.server_hour(cpu, memory, spot=run.spot) * hours
-    return Spent(usd, hours, attempts=int(not run.warm_server_name), guessed=int(not run.cpu))
+    cpu, memory = (attempt.cpu, attempt.memory) if attempt.cpu else usual
+    usd = prices.server_hour(cpu, memory, spot=attempt.spot) * hours
+    return Spent(usd, hours, attempts=int(not attempt.warm_server_name), guessed=int(not attempt.cpu))
 
 
-def _is_part(run: PastAttempt) -> bool:
-    """Whether it is the waiting, or the play, of one task: the minute that is billed at least is that of both."""
-    return run.reason is Reason.ASSIGNED or run.warm_server_name is not None
+def _is_part(attempt: PastAttempt) -> bool:
+    """Whether the attempt is one of two parts of a warm server's task: the billed minimum is that of both together."""
+    return attempt.reason is Reason.ASSIGNED or attempt.warm_server_name is not None

@@ -1,4 +1,4 @@
-"""`deploy apply`: make the stack, or bring it up to date."""
+"""`deploy apply`: makes the stack, or brings it up to date."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ from hippodrome.aws import errors
 if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
-ROLE_PAUSE = 10  # seconds until a role that was just made is known
-ROLE_TRIES = 3
+ROLE_PAUSE = 10  # seconds to wait until AWS knows a new role everywhere
+ROLE_TRIES = 3  # at making the stack
 
 
-def _hint(python: str | None) -> None:
+def _suggest_python(python: str | None) -> None:
+    """Say that zips would hold bytecode if this machine had the functions' version of Python."""
     if python and bytecode.compiler(python) is None:
         screen.info(
-            f"With Python {python} on this machine, functions would start about a fifth faster: no need, though."
+            f"With Python {python} on this machine, functions would start about a fifth faster. It is not needed."
         )
 
 
@@ -52,9 +53,9 @@ class ApplyOutcome:
 
 @dataclass(frozen=True)
 class ApplyRequest:
-    """What to apply for: the `study` to put there, findings that are `wrong` already, and the administrator's answers.
+    """For which `study` to apply, findings that are known to be `wrong`, and the administrator's answers.
 
-    `yes` agrees to the loss of something. `anyway`: go on although something is in the way.
+    `yes` agrees to the loss of something. With `anyway`, bad findings do not stop the apply.
     """
 
     study: ProjectFolder | None = None
@@ -69,15 +70,15 @@ def apply(
     settings: StackSettings,
     request: ApplyRequest = ApplyRequest(),
 ) -> ApplyOutcome:
-    """Bring the stack to what template and settings say, and print what is done. May be repeated after an interruption.
+    """Make the stack, or change it, as template and settings say, and print each step. May be repeated at any time.
 
-    Looks first whether anything is in the way, and asks before anything is lost. Raises `Problem`.
+    Checks first whether that can succeed, and asks before anything is lost. Raises `Problem`.
     """
     began = time.monotonic()
     Stack(account, stack).settle()
     prepared = _without_remains(_prepare(account, stack, settings, request))
     if not request.wrong and prepared.unchanged():
-        return _nothing(account, stack, began)
+        return _unchanged(account, stack, began)
     preflight.check(prepared, request.study, request.wrong, anyway=request.anyway)
     if prepared.existing is None and preflight.make_ecs_role(account):
         screen.info(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
@@ -99,7 +100,7 @@ def apply(
 
 
 def _prepare(account: Account, stack: str, settings: StackSettings, request: ApplyRequest) -> Prepared:
-    """`prepare`; before a first installation, what it refuses is told together with all else that is wrong."""
+    """`prepare`. If it fails before a first installation, show the other findings on the account, too."""
     try:
         return prepare(account, stack, settings)
     except Problem as problem:
@@ -110,27 +111,27 @@ def _prepare(account: Account, stack: str, settings: StackSettings, request: App
 
 
 def _without_remains(prepared: Prepared) -> Prepared:
-    """The same without a stack whose creation failed: it is deleted."""
-    if not states.broken(prepared.status):
+    """Delete the stack if its creation failed; return `prepared` without it."""
+    if not states.never_complete(prepared.status):
         return prepared
-    _clear_away(prepared)
+    _delete_failed(prepared)
     return replace(prepared, found=None)
 
 
 def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> ApplyOutcome:
-    """Upload, plan, ask, execute."""
+    """Upload the functions, make a change set, ask before a loss, and execute it."""
     account, stack = prepared.account, prepared.stack.name
     if prepared.bucket.make():
         screen.success(f"The code bucket {prepared.bucket.name} is there.")
     uploaded = prepared.bucket.upload(prepared.functions)
     if uploaded:
         screen.success(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
-        _hint(prepared.functions[0].python)
-    _discard_old(prepared)
+        _suggest_python(prepared.functions[0].python)
+    _delete_old_change_sets(prepared)
     cooldown.wait(account, stack)  # CloudFormation refuses names that are taken already when it makes the change set
     with change_set(prepared, keep=True) as made:
         if not made.changes:
-            return _nothing(account, stack, began)
+            return _unchanged(account, stack, began)
         changes = plans.of_change_set(made.changes, prepared.template)
         kind = "update" if prepared.existing else "create"
         changed = prepared.changed_parameters() if prepared.existing else {}
@@ -150,14 +151,14 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
     return ApplyOutcome(True, seconds, prepared.existing is None, dict(installation.outputs))
 
 
-def _nothing(account: Account, stack: str, began: float) -> ApplyOutcome:
+def _unchanged(account: Account, stack: str, began: float) -> ApplyOutcome:
     seconds = time.monotonic() - began
     screen.success(f"Nothing to do: the stack {stack} in {account.region} is as it should be ({seconds:.1f} s).")
     return ApplyOutcome(False, seconds, outputs=dict(find_installation(account, stack).outputs))
 
 
-def _clear_away(prepared: Prepared) -> None:
-    """Delete a stack whose creation failed, so that it can be made anew. What it kept and is empty goes, too."""
+def _delete_failed(prepared: Prepared) -> None:
+    """Delete a stack whose creation failed, so that it can be made anew, and its buckets if they are empty."""
     stack, found = prepared.stack, prepared.found
     assert found
     screen.info(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
@@ -176,7 +177,7 @@ def _clear_away(prepared: Prepared) -> None:
                 raise
 
 
-def _discard_old(prepared: Prepared) -> None:
+def _delete_old_change_sets(prepared: Prepared) -> None:
     """Delete change sets that an interrupted run left behind."""
     if not prepared.found:
         return
@@ -187,14 +188,14 @@ def _discard_old(prepared: Prepared) -> None:
                 if one["ChangeSetName"].startswith(PREFIX) and one.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
                     client.delete_change_set(ChangeSetName=one["ChangeSetId"], StackName=prepared.stack.name)
     except ClientError as error:
-        if errors.code(error) != "ValidationError":  # the stack went away
+        if errors.code(error) != "ValidationError":  # the stack does not exist any more
             raise
 
 
 def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     stack = prepared.stack
     after = stack.last_event(stack_id)
-    # RetainExceptOnCreate: a creation that fails takes its empty data bucket with it.
+    # RetainExceptOnCreate: a creation that fails deletes its empty data bucket, too.
     prepared.account.client("cloudformation").execute_change_set(
         ChangeSetName=arn, StackName=stack_id, RetainExceptOnCreate=True
     )
@@ -231,7 +232,7 @@ def command(
 
 
 def report(outcome: ApplyOutcome, settings: StackSettings, as_json: bool) -> None:
-    """Print where participants go, and what the administrator still has to do."""
+    """Print the outcome: the participants' address, the researchers' policy, and whether a mail has to be confirmed."""
     if as_json:
         answer: dict[str, Any] = {"changed": outcome.changed, "seconds": round(outcome.seconds, 1)}
         screen.result_json(answer | {"outputs": dict(outcome.outputs)})

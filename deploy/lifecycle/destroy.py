@@ -1,4 +1,4 @@
-"""`deploy destroy`: remove the installation, proven by listing. Participants' data stay unless told otherwise."""
+"""`deploy destroy`: removes the installation, and lists what is left. Without --data, participants' data stay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def command(
     Run it again after any interruption. At the end it lists what AWS still has of it.
     """
     account = open_account(profile, region)
-    account.id  # noqa: B018 - whose credentials these are: the first thing that can be wrong
+    account.id  # noqa: B018 - raises at once if AWS does not accept the credentials
     removal = Removal(account, stack)
     screen.info(f"Looking for what there is of {stack} in {account.region} …", "dim")
     found = removal.look()

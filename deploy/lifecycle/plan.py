@@ -1,4 +1,4 @@
-"""`deploy plan`: what `apply` would change, told so that a person understands it."""
+"""`deploy plan`: shows what `apply` would change, in words."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from deploy.stack.states import StackAction
 if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
-STATEFUL = {  # what holds something that no new one would have, and what that is
+STATEFUL = {  # resource type → what its resource holds and a new one in its place would not
     "AWS::S3::Bucket": "participants' data",
     "AWS::ECR::Repository": "the projects' images",
     "AWS::SQS::Queue": "messages on their way",
@@ -37,7 +37,7 @@ STATEFUL = {  # what holds something that no new one would have, and what that i
     "AWS::Scheduler::ScheduleGroup": "the shutdown timers of running servers",
     "AWS::ApiGatewayV2::DomainName": "the links that participants have",
 }
-_KINDS = {  # what a person calls one of them; others go by their type
+_KINDS = {  # resource type → its name in words; other types are shown as they are
     "AWS::ApiGatewayV2::Api": "HTTP API",
     "AWS::ApiGatewayV2::DomainName": "address of the site",
     "AWS::ApiGatewayV2::Route": "HTTP route",
@@ -73,7 +73,7 @@ _STYLES = {
 
 @dataclass(frozen=True)
 class Change:
-    """What happens to a resource: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
+    """A change of one resource. `action`: `create`, `change`, `replace`, `may replace`, `remove` or `import`."""
 
     action: str
     name: str  # the function's file name in lambdas/, or the logical id
@@ -81,7 +81,7 @@ class Change:
     logical_id: str
     physical_id: str = ""
     properties: tuple[str, ...] = ()
-    kept: bool = False  # the old one stays, outside of the stack
+    kept: bool = False  # the old resource stays, outside of the stack
 
     @property
     def danger(self) -> str:
@@ -96,20 +96,20 @@ class Change:
 
 @dataclass(frozen=True)
 class Plan:
-    """What an apply would do. `kind` is `create`, `update` or `nothing`."""
+    """What `apply` would do. `kind` is `create`, `update` or `nothing`."""
 
     stack: str
     region: str
     kind: str
     changes: Sequence[Change] = ()
-    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # before and after, of those that change
+    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # those that change: name → (present, new)
     seconds: float = 0.0
-    findings: Sequence[Finding] = ()  # what is in the way, or to be looked at, before it is made
-    site: str = ""  # the host that participants will open, where it is new
+    findings: Sequence[Finding] = ()  # what would make it fail, or is worth a look
+    site: str = ""  # the host name that participants will open, if it is new
 
     @property
     def dangers(self) -> list[str]:
-        """What is lost or left behind, to which the administrator has to agree."""
+        """Sentences on what is lost or left behind. The administrator has to agree to them."""
         return [change.danger for change in self.changes if change.danger]
 
     def as_json(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ class Plan:
 
 
 def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> list[Change]:
-    """The changes of a change set (`Changes` of DescribeChangeSet)."""
+    """The changes in `answer`, the list `Changes` of DescribeChangeSet."""
     files = template.function_names()
     found = []
     for one in answer:
@@ -173,7 +173,7 @@ def _properties(change: Mapping[str, Any]) -> Iterator[str]:
 
 
 def lines(plan: Plan) -> Iterator[tuple[str, str]]:
-    """The plan as lines, each with its style."""
+    """The plan as lines of text, each with its style of rich."""
     if plan.kind == "nothing":
         yield f"The stack {plan.stack} in {plan.region} is as it should be: nothing to do.", ""
         return
@@ -225,7 +225,7 @@ def _called(kind: str) -> str:
 
 
 def show(plan: Plan, answer: bool = False) -> None:
-    """Print the plan: to stdout if it is the command's `answer`, else to stderr, as what is going to happen."""
+    """Print the plan: to stdout if it is the command's `answer`, else to stderr, before it is carried out."""
     console = screen.out if answer else screen.err
     for line, style in lines(plan):
         console.print(Text(line, style=style))
@@ -235,9 +235,9 @@ def show(plan: Plan, answer: bool = False) -> None:
 
 
 def plan(account: Account, stack: str, settings: StackSettings, *, study: ProjectFolder | None = None) -> Plan:
-    """What `apply` would do now. Nothing that runs is touched; for an update a change set is made and deleted again.
+    """The plan of what `apply` would do now. The stack is not changed; an update needs a change set, which is deleted.
 
-    Raises `Problem`.
+    Raises `Problem` if `apply` could not begin.
     """
     began = time.monotonic()
     prepared = prepare(account, stack, settings)
@@ -279,7 +279,7 @@ def new_site(prepared: Prepared) -> str:
 def run(
     account: Account, stack: str, settings: StackSettings, as_json: bool, study: ProjectFolder | None = None
 ) -> int:
-    """Make the plan, print it and what would be in its way, and return the command's exit code."""
+    """Make the plan, print it with its findings, and return the command's exit code."""
     found = plan(account, stack, settings, study=study)
     if as_json:
         screen.result_json(found.as_json())

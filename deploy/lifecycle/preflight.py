@@ -1,7 +1,7 @@
-"""What is looked at before anything is made: one list of what is wrong, so that mistakes cost seconds and no rollback.
+"""Checks before anything is made. One list of findings shows all mistakes in seconds, without a rollback.
 
-What would make the stack fail, or wait for hours, is bad and stops. What a first study can do without is a remark, and
-so is what these credentials may not look at.
+A finding is bad if the stack would fail, or wait for hours; bad findings stop the command. A finding that a first study
+can live with is only worth a look, and so is a check that these credentials may not make.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from hippodrome.certificates.rules import names_of
 if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
-FEW = 20  # servers at once; with fewer than that it is worth asking AWS for more before a study
-USUAL = 1.0  # vCPU of a server, while no study says
+FEW = 20  # servers at once; if the quota allows fewer, the advice is to ask AWS for more
+USUAL = 1.0  # vCPU of a server, if there is no study that says
 
 
 @dataclass(frozen=True)
 class InstallationCheck:
-    """An installation that is about to be made or changed, and the study that is to be put there, if there is one."""
+    """An installation that will be made or changed, and the study that will be registered there, if any."""
 
     prepared: Prepared
     study: ProjectFolder | None = None
@@ -48,25 +48,25 @@ class InstallationCheck:
 def check(
     prepared: Prepared, study: ProjectFolder | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
 ) -> None:
-    """Check all that is new, and show what is wrong, also what is known to be `wrong` already.
+    """Check everything that is new or changes; show all findings, those in `wrong` included.
 
-    Raises `Problem` if anything is in the way, unless `anyway`.
+    Raises `Problem` if one of them is bad, unless `anyway`.
     """
     _stop(list(wrong) + look_at(InstallationCheck(prepared, study)), anyway)
 
 
 def check_account(account: Account, wrong: Sequence[Finding], study: ProjectFolder | None = None) -> None:
-    """Check the account before a first installation; show what is wrong, also what is known. Raises `Problem`."""
+    """Check the account before a first installation; show all findings. Raises `Problem` if one of them is bad."""
     _stop([*wrong, *examine((account, study), _OF_ACCOUNT)])
 
 
 def of_problem(name: str, problem: Problem) -> Finding:
-    """A problem as a line of the list of findings."""
+    """A problem as a bad finding."""
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
 def look_at(checked: InstallationCheck) -> list[Finding]:
-    """All findings that are not good; those that are in the way come last. Nothing is changed."""
+    """Make all checks that apply; return the findings that are not good, the bad ones last. Changes nothing."""
     before, after = checked.prepared.before, checked.prepared.parameters
     found: list[Finding] = []
     checks: dict[str, Callable[[InstallationCheck], Iterable[Finding]]] = {}
@@ -102,7 +102,7 @@ def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
 
 # -- the account ------------------------------------------------------------------------------------------------------
 
-Newcomer = tuple[Account, "ProjectFolder | None"]  # an account without an installation, and what is to be put there
+Newcomer = tuple[Account, "ProjectFolder | None"]  # an account without an installation, and the study for it
 
 
 def _region(newcomer: Newcomer) -> Iterator[Finding]:
@@ -118,10 +118,9 @@ def _root(newcomer: Newcomer) -> Iterator[Finding]:
 
 
 def _executions(newcomer: Newcomer) -> Iterator[Finding]:
-    """Participants' pages and the functions behind queues share them (`deploy.aws.concurrency`)."""
+    """Lambda's concurrent executions, which pages and the functions behind queues share (`deploy.aws.concurrency`)."""
     account, _ = newcomer
-    limit = account.client("lambda").get_account_settings()["AccountLimit"]
-    free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+    free = concurrency.unreserved(account)
     if concurrency.starts(free) < concurrency.USUAL:
         pages, starts = max(0, free - concurrency.workers(free)), concurrency.starts(free)
         yield look(
@@ -152,7 +151,7 @@ def _servers(newcomer: Newcomer) -> Iterator[Finding]:
 
 def _builds(newcomer: Newcomer) -> Iterator[Finding]:
     """Whether the image of a study with a game can be built: by Docker here, or by CodeBuild."""
-    from deploy.study.image import docker  # noqa: PLC0415 - pydantic, only looked at before a first installation
+    from deploy.study.image import docker  # noqa: PLC0415 - pydantic, needed only before a first installation
 
     account, study = newcomer
     if (study and not study.plays) or docker.available():
@@ -160,16 +159,16 @@ def _builds(newcomer: Newcomer) -> Iterator[Finding]:
     value = quotas.applied(account, quotas.BUILDS)
     if value is None or value >= 1:
         return
-    what = "This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine"
+    missing = "This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine"
     remedy = f"Start Docker here, or ask for a build: {quotas.request(account, quotas.BUILDS, 1)}"
     if study:
         yield bad(
             "CodeBuild",
-            f"{what}: the image of {study.id} cannot be built.",
+            f"{missing}: the image of {study.id} cannot be built.",
             f"{remedy} (`python -m deploy apply` makes the installation alone meanwhile)",
         )
     else:
-        yield look("CodeBuild", f"{what}: images of studies cannot be built.", remedy)
+        yield look("CodeBuild", f"{missing}: images of studies cannot be built.", remedy)
 
 
 _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
@@ -185,7 +184,7 @@ _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
 
 
 def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
-    """Without it the stack waits for ACM, which asks the Internet's DNS, for up to twelve hours before it fails.
+    """The zone's delegation. Without it the stack waits for ACM, which asks DNS, for up to twelve hours, then fails.
 
     (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
@@ -204,13 +203,13 @@ def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
-    """Amazon's authority for the site, Let's Encrypt for the servers' names."""
+    """The CAA records: Amazon must be allowed for the site, Let's Encrypt for the servers' names."""
     after = checked.prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
     servers = names_of(domain_change.servers_domain(after))
     known = partial(exists, checked.account, read_zone(checked.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
-    for who, name, authorities in wanted:
+    for issuer, name, authorities in wanted:
         found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
         if not found.certain:
             yield look("CAA", f"DNS could not be asked which authorities may issue certificates for {name}.")
@@ -219,7 +218,7 @@ def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
             records = ", ".join(f'0 {tag} "{value}"' for tag, value in forbidding)
             yield bad(
                 "CAA",
-                f"The CAA records of {found.where} ({records}) keep {who} from issuing a certificate for {name}.",
+                f"The CAA records of {found.where} ({records}) keep {issuer} from issuing a certificate for {name}.",
                 f'Add two CAA records to {place}: 0 issue "{caa.AMAZON[0]}" and 0 issuewild "{caa.LETS_ENCRYPT[0]}".',
             )
 
@@ -250,7 +249,7 @@ def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
-    """They use the site's present address, and the present network."""
+    """Running servers, which use the present address of the site and the present network."""
     for check in (domain_change.check_site, domain_change.check_network):
         try:
             check(checked.prepared)
@@ -259,7 +258,7 @@ def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
-    """Two installations may share a domain as long as they never hold the same study: servers would share names."""
+    """Two installations may share a domain if they never have the same study: its servers would have the same names."""
     name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
     for page in checked.account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:
@@ -310,23 +309,23 @@ def _subnets(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _vpcs(checked: InstallationCheck) -> Iterator[Finding]:
-    """The installation's own network needs room under the quota of VPCs, which is 5 in a Region at first."""
+    """The quota of VPCs, for an installation with a VPC of its own. It is 5 in a Region at first."""
     if checked.prepared.parameters["VpcId"]:
         return
     pages = checked.account.client("ec2").get_paginator("describe_vpcs").paginate()
-    there = sum(len(page["Vpcs"]) for page in pages)
+    present = sum(len(page["Vpcs"]) for page in pages)
     allowed = quotas.applied(checked.account, quotas.VPCS)
-    if allowed is not None and there >= allowed:
+    if allowed is not None and present >= allowed:
         yield bad(
             "VPCs",
-            f"There are {there} VPCs in {checked.account.region}, and this account may have no more.",
+            f"There are {present} VPCs in {checked.account.region}, and this account may have no more.",
             "Use one of them (--vpc vpc-… --subnets subnet-…,subnet-…), or ask for one more: "
-            + quotas.request(checked.account, quotas.VPCS, there + 1),
+            + quotas.request(checked.account, quotas.VPCS, present + 1),
         )
 
 
 def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
-    """Names that a stack of this name would make, and that are taken by what an unfinished `destroy` has left."""
+    """Log groups that an unfinished `destroy` has left: the stack could not make groups of the same names."""
     if checked.prepared.found is not None:
         return
     name = checked.prepared.stack.name
@@ -344,13 +343,13 @@ def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
 def make_ecs_role(account: Account) -> bool:
     """Make ECS's service-linked role if the account has none: without it, a template's first cluster fails.
 
-    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Return whether it was made now: IAM makes it known
-    some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Return whether it was made now: AWS knows it
+    everywhere some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
     """
     try:
         account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
     except ClientError as error:
-        # InvalidInput: it is there. Credentials that may not make it may well find it made.
+        # InvalidInput: it exists. If these credentials may not make it, it may exist all the same.
         if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
             raise
         return False

@@ -1,4 +1,4 @@
-"""After `destroy`: what AWS still has of the installation, by listing; what should be gone, and what stays."""
+"""After `destroy`: lists what AWS still has of the installation: what should be gone, and what stays."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from deploy.stack.inventory import ListedResource
 from deploy.stack.listings import KINDS
 
 LISTED = 180
-"""Seconds that AWS may list what is deleted: a queue up to 60 (SQS API reference, DeleteQueue), a schedule group until
-its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings for a while."""
+"""Seconds for which AWS may still list deleted resources: a queue up to 60 (SQS API reference, DeleteQueue), a schedule
+group until its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings a while."""
 PAUSE = 20  # seconds between two looks
 OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not current (the template's lifecycle rule)
 
 
 def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Remains:
-    """List what exists after a removal. Waits for what AWS still lists for a while after it was deleted.
+    """List what exists after a removal. Waits up to `LISTED` seconds while AWS still lists deleted resources.
 
-    `remembered`: what CloudFormation says that the installation had.
+    `remembered`: the resources that the installation had, by CloudFormation.
     """
 
     def look() -> Remains:
@@ -44,7 +44,7 @@ def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Re
 
 @dataclass
 class Remains:
-    """What a last listing found: `left` should be gone; the rest stays on purpose."""
+    """What the last listing found. The resources in `left` should be gone; all others stay on purpose."""
 
     removal: Removal
     remembered: Sequence[inventory.Resource]
@@ -60,27 +60,27 @@ class Remains:
 
     @cached_property
     def stored(self) -> Mapping[str, int]:
-        """Bytes in the data buckets that stay."""
+        """Data bucket that stays → its size in bytes."""
         return {bucket: inventory.stored(self._account, bucket) for bucket in self.after.data}
 
     @cached_property
     def service_roles(self) -> Sequence[str]:
-        """Roles that AWS has made for the whole account."""
+        """The names of the roles that AWS has made for the whole account."""
         return inventory.service_roles(self._account)
 
     @cached_property
     def server_names(self) -> Sequence[str]:
-        """DNS names of servers, of this installation or another one of the same domain; none while the stack stands."""
+        """DNS names of servers, of this or another installation of the same domain; empty while the stack exists."""
         where = [] if self.after.stack else self.after.addresses
         return [name for one in where for name in inventory.server_names(self._account, one)]
 
     @cached_property
     def records(self) -> Sequence[tuple[Validation, str, str]]:
-        """Validation records that are not deleted: each with the reason, and the command that deletes it."""
+        """Validation records that stay, each with the reason and the command that deletes it."""
         found = [(one, f"it renews {users} as well") for one, users in self.removal.kept]
         known = {one for one, _ in found}
         for addresses in self.after.addresses if not self.after.stack else ():
-            for one in acm_records.alike(self._account, addresses.zone, addresses.site):
+            for one in acm_records.of_domain(self._account, addresses.zone, addresses.site):
                 if one not in known:
                     users = acm_records.users(self._account, one)
                     why = f"it renews {', '.join(users)}" if users else "it may prove the name for another AWS account"
@@ -111,7 +111,7 @@ class Remains:
         }
 
     def show(self) -> None:
-        """A table of what is left or kept; the kinds of which nothing is left are only counted."""
+        """Print a table of what is left or kept. Kinds of which nothing is left are only counted."""
         rows = [*self._rows()]
         if rows:
             screen.table(["what", "left", "a month", ""], rows)
@@ -134,7 +134,7 @@ class Remains:
             yield "AWS's own role", "kept", "nothing", role
 
     def conclude(self, place: str) -> int:
-        """Print what stays and what to do; return the exit code. Raises `Problem` if something is left by mistake.
+        """Print what stays, and how to fetch or delete it; return the exit code. Raises `Problem` if something is left.
 
         `place` are the options with which other commands find this account and region.
         """
@@ -175,7 +175,7 @@ class Remains:
 
 
 def _tell_kept(account: Account, bucket: str, place: str) -> None:
-    """Say how to get at the data, now that no stack leads to them."""
+    """Print how to fetch the data in a kept bucket."""
     projects = retained_bucket.projects(account, bucket)
     if not projects:
         found = (

@@ -1,4 +1,4 @@
-"""Removing an installation: what there is of it, and the steps that take it away."""
+"""Removes an installation: finds what exists of it, and carries out the steps that remove it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hippodrome.aws.challenges import TTL
 from hippodrome.aws.tasks import EcsTasks
 from hippodrome.certificates.rules import names_of
 
-STOPPING = 180  # seconds that servers may take: a task has 120 to save what it has
+STOPPING = 180  # seconds that servers may take to stop: a task has 120 to store its recordings
 
 _GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
@@ -38,18 +38,18 @@ class FoundInstallation:
     """What exists of an installation."""
 
     stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
-    things: Sequence[ListedResource]  # what the commands made beside it, and what it left
+    things: Sequence[ListedResource]  # resources outside of the stack, made by the commands or left by the stack
     data: Sequence[str]  # data buckets
-    installation: Installation | None  # if its outputs are known
-    addresses: Sequence[Addresses] = ()  # of the stack, and of those of its name that were deleted
-    attached: Sequence[PolicyAttachments] = ()  # who has the stack's policies
+    installation: Installation | None  # None if the stack's outputs are not complete
+    addresses: Sequence[Addresses] = ()  # of the stack, and of deleted stacks of its name
+    attached: Sequence[PolicyAttachments] = ()  # to whom the stack's policies are attached
 
     def __bool__(self) -> bool:
         return bool(self.stack or self.things or self.data)
 
 
 class Removal:
-    """Removes an installation. Every step may be repeated; what is done already counts as done."""
+    """Removes an installation. Every step may be repeated; a step that finds nothing to do does nothing."""
 
     def __init__(self, account: Account, name: str, executor: Executor | None = None) -> None:
         self.account = account
@@ -85,7 +85,7 @@ class Removal:
         )
 
     def plan(self, found: FoundInstallation, data: bool) -> list[PlanStep]:
-        """The steps in their order: the stack, what is beside it, and last the data, only with `data`."""
+        """The steps in their order: the stack, the resources outside of it, and last, only with `data`, the data."""
         steps: list[PlanStep] = [step(self._prepare_stack, found.stack)] if found.stack else []
         steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
         steps += [step(self._remember, found), step(self._delete_stack, found)]
@@ -95,7 +95,7 @@ class Removal:
         return steps + ([step(self._data_buckets)] if data else [])
 
     def run(self, found: FoundInstallation, data: bool) -> None:
-        """Remove everything; the data only with `data`. Raises `Problem` when something is in the way."""
+        """Remove everything; the data only with `data`. Raises `Problem` if AWS or another resource prevents it."""
         self.executor.execute(self.plan(found, data))
 
     def _data(self) -> list[str]:
@@ -105,15 +105,15 @@ class Removal:
     # -- steps
 
     def _prepare_stack(self, described: Mapping[str, Any]) -> None:
-        """Wait for what goes on in the stack. Raises `Problem` if it is protected, or binds others."""
+        """Wait for the stack's present operation. Raises `Problem` if it is protected, or its policy is a boundary."""
         self._stack.must_not_be_protected(described)
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
             policies.must_be_no_boundary(self.account, arn)
-        if described["StackStatus"] != "CREATE_IN_PROGRESS":  # which may be deleted, and may last for hours
+        if described["StackStatus"] != "CREATE_IN_PROGRESS":  # a creation may take hours, and can be deleted
             self._stack.attach()
 
     def _remember(self, found: FoundInstallation) -> None:
-        """Write down which records the site's certificate has left in DNS, while it still says so."""
+        """Write down the validation records of the site's certificate, while ACM still knows them."""
         if not found.stack or not found.addresses:
             return
         arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(found)
@@ -130,7 +130,7 @@ class Removal:
             screen.success(f"The stack {self.name} is deleted.")
 
     def _stop_servers(self, installation: Installation) -> None:
-        """By their records while those can be read; then whatever runs in the cluster."""
+        """Stop servers by their records, if the bucket exists; then stop all other tasks in the cluster."""
         ecs, cluster = self.account.client("ecs"), installation["Cluster"]
         if not inventory.cluster_exists(self.account, cluster):
             return
@@ -148,7 +148,7 @@ class Removal:
         def running() -> Sequence[str]:
             found = tasks.arns(cluster)
             for arn in found:
-                self._gone(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
+                self._remove(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
             return found
 
         if left_running := self.executor.wait(running, STOPPING):
@@ -157,7 +157,7 @@ class Removal:
             )
 
     def _validation_records(self) -> None:
-        """Delete the records that proved the site's name to ACM, unless another certificate needs them."""
+        """Delete the records that prove the site's name to ACM, unless another certificate needs them."""
         for one in dict.fromkeys([*self._records, *acm_records.remembered(self._code)]):
             if acm_records.present(self.account, one) is None:
                 continue
@@ -167,7 +167,7 @@ class Removal:
                 screen.success(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
 
     def _acme_records(self, addresses: Addresses) -> None:
-        """Proofs of interrupted orders of certificates, if any were left in the zone: of this version or an earlier."""
+        """Delete the challenge records that interrupted orders of certificates left, also those of earlier versions."""
         for domain in dict.fromkeys((addresses.servers, addresses.root)):
             for name in names_of(domain):
                 self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
@@ -179,10 +179,9 @@ class Removal:
         except client.exceptions.NoSuchHostedZone:
             return
         for record in answer["ResourceRecordSets"]:
-            mine = record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL
-            if mine:
-                batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
-                self._gone(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+            if record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL:
+                batch = acm_records.deletion(record)
+                self._remove(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
 
     def _task_definitions(self) -> None:
         ecs = self.account.client("ecs")
@@ -194,20 +193,20 @@ class Removal:
             for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten
                 chunk = arns[start : start + 10]
                 for arn in chunk:
-                    self._gone(ecs.deregister_task_definition, taskDefinition=arn)
-                self._gone(ecs.delete_task_definitions, taskDefinitions=chunk)
+                    self._remove(ecs.deregister_task_definition, taskDefinition=arn)
+                self._remove(ecs.delete_task_definitions, taskDefinitions=chunk)
                 bar.advance(task, len(chunk))
 
     def _log_groups(self) -> None:
         for group in inventory.log_groups(self.account, self.name):
-            self._gone(self.account.client("logs").delete_log_group, logGroupName=group)
+            self._remove(self.account.client("logs").delete_log_group, logGroupName=group)
 
     def _data_buckets(self) -> None:
         for bucket in self._data():
             self._bucket(bucket, "data")
 
     def _bucket(self, name: str, what: str) -> None:
-        """Delete a bucket of ours with everything in it, old versions too."""
+        """Delete a bucket of the account with all versions of all objects. `what` names it in messages."""
         if not inventory.bucket_exists(self.account, name):
             return
         with screen.progress() as bar:
@@ -222,8 +221,8 @@ class Removal:
                 raise
         screen.success(f"The {what} bucket {name} is deleted.")
 
-    def _gone(self, call: Callable[..., Any], **arguments: Any) -> None:
-        """Call; what is gone already is fine."""
+    def _remove(self, call: Callable[..., Any], **arguments: Any) -> None:
+        """Make the call; ignore that the resource is gone already."""
         try:
             call(**arguments)
         except ClientError as error:
@@ -232,13 +231,13 @@ class Removal:
 
 
 def _zone(found: FoundInstallation) -> str:
-    """The hosted zone of the stack that is there."""
+    """The hosted zone of the present stack; without one, of the stack of its name that was deleted last."""
     standing = inventory.addresses([found.stack] if found.stack else [])
     return (standing or found.addresses)[0].zone
 
 
 def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:
-    """The outputs of a stack, whatever its state; None if they are not all there (it never came to life)."""
+    """The installation of a stack in any state; None if outputs are missing, since it was never complete."""
     installation = Installation.of(account, found) if found else None
     whole = installation and {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(installation.outputs)
     return installation if whole else None

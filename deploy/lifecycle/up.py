@@ -1,4 +1,4 @@
-"""`deploy up`, what `make deploy` runs: the installation, its certificate, and the study in the folder."""
+"""`deploy up`, which `make deploy` runs: puts the installation, its certificate and a study on AWS."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hippodrome.config import ConfigErrors, layout, read_project
 
 
 def may_apply(account: Account, stack: str) -> bool:
-    """Whether these are an administrator's credentials. Without an installation, any credentials count as such."""
+    """Whether these are an administrator's credentials. Without an installation, all credentials count as such."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         return True
@@ -41,14 +41,14 @@ def may_apply(account: Account, stack: str) -> bool:
 
 
 def study_in(folder: Path) -> project_folder.ProjectFolder | None:
-    """The folder's project, if it has one, and does not keep it off AWS. Raises `Problem` with the mistakes in it."""
+    """The project in the folder; None if there is none, or it says `useAWS: false`. Raises `Problem` with mistakes."""
     if folder.is_dir() and not layout.has_config(folder):
         screen.info(f"{folder} has no config.yml: there is no study to put there.")
         return None
     try:
         config = read_project(folder)
     except ConfigErrors:
-        return project_folder.read(folder)  # says them all
+        return project_folder.read(folder)  # raises `Problem` with all of them
     if project_folder.keeps_off_aws(config):
         screen.warning(
             f"The study {config.project.id} stays on one machine, as its config.yml says (useAWS: false); "
@@ -59,21 +59,18 @@ def study_in(folder: Path) -> project_folder.ProjectFolder | None:
 
 
 def certify(account: Account, stack: str) -> Report:
-    """See to the certificate: a rehearsal with Let's Encrypt's test authority comes before the first real order.
+    """Order the servers' certificate if one is due. Before the first real one, a test certificate is ordered.
 
-    A certificate that is fresh, or that was put there by hand or ordered elsewhere, stays. Raises `Problem`.
+    A certificate that was uploaded by hand stays. One of another authority is renewed there. Raises `Problem`.
     """
     installation = find_installation(account, stack)
     certificate_transfer.take_over(account, installation)
     now = certificate.inspect(account, installation)
     if now.decision.verdict is Verdict.FOREIGN or (now.stored and now.directory not in {"", STAGING, PRODUCTION}):
-        return (
-            now
-            if now.decision.verdict is not Verdict.ORDER
-            else certificate.obtain_visibly(account, installation, Choice())
-        )
+        is_due = now.decision.verdict is Verdict.ORDER
+        return certificate.obtain_visibly(account, installation, Choice()) if is_due else now
     if not now.stored:
-        screen.info("First a test certificate, to see whether all that it takes is there.")
+        screen.info("First comes a test certificate, which shows whether a real one can be ordered.")
         certificate.obtain_visibly(account, installation, Choice(STAGING))
     return certificate.obtain_visibly(account, installation, Choice(PRODUCTION))
 
@@ -84,7 +81,7 @@ def command(
     *,
     no_certificate: Annotated[
         bool,
-        typer.Option("--no-certificate", help="Leave the servers' certificate for later; no game until then."),
+        typer.Option("--no-certificate", help="Order no certificate for servers now; until then no game works."),
     ] = False,
     base: register.Base = "",
     stack: options.Stack = STACK,
@@ -103,7 +100,7 @@ def command(
     found, wrong = _study(folder)
     account = _account(profile, region, wrong)
     if wrong and (dry_run or describe_stack(account, stack)):
-        raise wrong[0]  # where there is an installation, nothing else has to be told
+        raise wrong[0]  # with an installation, the account needs no further check
     if dry_run:
         code = plans.run(account, stack, settings, False, found)
         if found:
@@ -127,7 +124,7 @@ def command(
 
 
 def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Problem]]:
-    """The study, and what is wrong with it: with a first installation, that is told together with all else."""
+    """The study; or None and its problem, which is shown with other findings before a first installation."""
     try:
         return study_in(folder), []
     except Problem as problem:
@@ -135,7 +132,7 @@ def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Prob
 
 
 def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> Account:
-    """The account, its credentials tried. Raises what is in the way after showing what is `wrong` already."""
+    """The account, after its credentials were tried. If they fail, show the problems in `wrong` first, then raise."""
     try:
         account = open_account(profile, region)
         who = account.identity["Arn"].rpartition(":")[2]

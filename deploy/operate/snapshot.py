@@ -17,7 +17,7 @@ from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.core import explain, participants
 from deploy.core.participants import ParticipantCounts
-from deploy.core.server_records import SLACK, Records, runs
+from deploy.core.server_records import SLACK, Records, attempts_of
 from deploy.cost.prices import Prices
 from deploy.cost.spent import Spent, spent
 from deploy.stack.stack import Stack
@@ -116,7 +116,7 @@ class Snapshot:
         """Why servers have failed since a day ago: those that can be prevented first, then by number."""
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
-            for one in runs(record):
+            for one in attempts_of(record):
                 cause = parse_cause(one.cause)
                 if cause and one.closed and one.closed >= self.at - DAY:
                     name = one.warm_server_name or ids.server_name(record.label, one.attempt)

@@ -1,1 +1,1 @@
-"""The parts of an installation on AWS: its stack, buckets, certificate, policies, and what stands in their way."""
+"""The parts of an installation on AWS: its stack, buckets, certificate and policies, and what blocks their changes."""

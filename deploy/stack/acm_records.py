@@ -1,13 +1,12 @@
-"""The DNS record with which ACM has proved the site's name: CloudFormation makes it, and never deletes it.
+"""The DNS record that proves the site's name to ACM: CloudFormation makes it, and never deletes it.
 
 Facts: `AWS::CertificateManager::Certificate` leaves its CNAME behind
 (aws-cloudformation/cloudformation-coverage-roadmap issue 1603), and a zone that holds it cannot be deleted. The record
 is made "specifically for your domain and your account" and "works for any AWS Region" (ACM user guide, DNS validation):
-two certificates of one account for one name share it, in whatever region they are, and so do a name and its wildcard.
-Without it none of them is renewed.
+all certificates of an account for a name and its wildcard share it, in all regions. Without it none of them is renewed.
 
-Once the certificate is deleted, AWS does not tell the record's name any more. So it is written down in the code bucket
-before the stack is deleted, and that bucket goes last.
+AWS does not tell the record's name any more once the certificate is deleted. So `remember` writes it into the code
+bucket before the stack is deleted, and the code bucket is deleted last.
 """
 
 from __future__ import annotations
@@ -40,22 +39,22 @@ class Validation(NamedTuple):
 
     @property
     def domain(self) -> str:
-        """The domain that the record proves, for its name and its wildcard."""
+        """The domain for which the record validates certificates: for the name itself and its wildcard."""
         return self.name.partition(".")[2]
 
 
 def of_certificate(account: Account, arn: str, zone: str) -> list[Validation]:
-    """The records of a certificate; none if it is gone."""
+    """The validation records of a certificate; empty if it is gone."""
     return [Validation(zone, name, value) for name, value in _records(_describe(account, arn, account.region))]
 
 
 def in_use_by(account: Account, arn: str) -> list[str]:
-    """The ARNs of what uses a certificate; none if it is gone."""
+    """The ARNs of the resources that use a certificate; empty if it is gone."""
     return list(_describe(account, arn, account.region).get("InUseBy", ()))
 
 
 def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
-    """Write down which records have to be deleted after the stack."""
+    """Write into the code bucket which records have to be deleted after the stack."""
     known = remembered(bucket)
     wanted = list(dict.fromkeys([*known, *found]))
     if wanted != known and bucket.exists():
@@ -63,7 +62,7 @@ def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
 
 
 def remembered(bucket: CodeBucket) -> list[Validation]:
-    """The records that were written down and not deleted yet."""
+    """The records that `remember` has written."""
     body = bucket.get(NOTE)
     return [Validation(**one) for one in json.loads(body)] if body else []
 
@@ -86,8 +85,8 @@ def present(account: Account, one: Validation) -> dict[str, Any] | None:
     return None
 
 
-def alike(account: Account, zone: str, domain: str) -> list[Validation]:
-    """All records in a zone that prove this name to ACM, for whichever account."""
+def of_domain(account: Account, zone: str, domain: str) -> list[Validation]:
+    """All records in a zone that prove this domain to ACM, for any account."""
     if not domain:
         return []
     found: list[Validation] = []
@@ -108,19 +107,23 @@ def alike(account: Account, zone: str, domain: str) -> list[Validation]:
 
 
 def removal(zone: str, record: Mapping[str, Any]) -> str:
-    """The command that deletes a record."""
-    batch = json.dumps({"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]})
+    """The AWS CLI command that deletes a record."""
+    batch = json.dumps(deletion(record))
     return f"aws route53 change-resource-record-sets --hosted-zone-id {zone} --change-batch {shlex.quote(batch)}"
 
 
+def deletion(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The ChangeBatch that deletes a record."""
+    return {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
+
+
 def remove(account: Account, one: Validation) -> bool:
-    """Delete the record; False if it was gone."""
+    """Delete the record; return False if there was none."""
     record = present(account, one)
     if record is None:
         return False
-    batch = {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
     try:
-        account.client("route53").change_resource_record_sets(HostedZoneId=one.zone, ChangeBatch=batch)
+        account.client("route53").change_resource_record_sets(HostedZoneId=one.zone, ChangeBatch=deletion(record))
     except ClientError as error:
         if errors.code(error) not in {"InvalidChangeBatch", *_GONE}:  # another run was faster
             raise
@@ -128,7 +131,7 @@ def remove(account: Account, one: Validation) -> bool:
 
 
 def users(account: Account, one: Validation) -> list[str]:
-    """Who needs the record: certificates of this account by ARN, and regions that could not be asked."""
+    """What needs the record: the ARNs of this account's certificates; in words, regions that could not be asked."""
     try:
         regions = _regions(account)
     except ClientError:
@@ -139,7 +142,7 @@ def users(account: Account, one: Validation) -> list[str]:
 
 
 def _regions(account: Account) -> Sequence[str]:
-    """Those that are switched on for this account."""
+    """The regions that are enabled for this account."""
     return sorted(one["RegionName"] for one in account.client("ec2").describe_regions()["Regions"])
 
 
@@ -157,12 +160,12 @@ def _users_in(account: Account, region: str, one: Validation) -> Iterator[str]:
 
 
 def _may_name(found: dict[str, Any], names: Collection[str]) -> bool:
-    told = {found.get("DomainName", ""), *found.get("SubjectAlternativeNameSummaries", ())}
-    return bool(told & set(names)) or bool(found.get("HasAdditionalSubjectAlternativeNames"))
+    listed = {found.get("DomainName", ""), *found.get("SubjectAlternativeNameSummaries", ())}
+    return bool(listed & set(names)) or bool(found.get("HasAdditionalSubjectAlternativeNames"))
 
 
 def _needs(account: Account, arn: str, region: str, one: Validation) -> bool:
-    """Whether that certificate is validated by the record. One that has not been told its record yet counts as well."""
+    """Whether the record validates the certificate. A certificate whose record ACM has not made yet counts as well."""
     described = _describe(account, arn, region)
     options = described.get("DomainValidationOptions", ())
     waiting = any(
@@ -178,7 +181,7 @@ def _describe(account: Account, arn: str, region: str) -> dict[str, Any]:
     try:
         return dict(account.client("acm", region).describe_certificate(CertificateArn=arn)["Certificate"])
     except ClientError as error:
-        if errors.code(error) in _GONE | {"ValidationException"}:  # never made: its id is none
+        if errors.code(error) in _GONE | {"ValidationException"}:  # never made, so its physical id is no ARN
             return {}
         raise
 

@@ -1,6 +1,6 @@
-"""`certificate`: one wildcard certificate for the servers, ordered by ACME DNS-01 and stored where they fetch it."""
+"""`certificate`: orders one wildcard certificate for all servers by ACME DNS-01, and stores it in the data bucket."""
 
-# ruff: noqa: PLC0415 - the library acme comes with the order itself
+# ruff: noqa: PLC0415 - the library acme is imported only to order
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
 CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
-"""The names that a CAA record must have to let this directory issue."""
-_SOME = ("<the authority>",)
+"""ACME directory → the names by which CAA records allow its authority to issue."""
+_UNKNOWN_AUTHORITY = ("<the authority>",)
 
 REAL = "python -m deploy certificate --production"
 _LONGEST_BUNDLE = 1_000_000  # bytes
@@ -46,25 +46,25 @@ _LONGEST_BUNDLE = 1_000_000  # bytes
 
 @dataclass(frozen=True)
 class Choice:
-    """What to order. Without `directory`: from where the present certificate comes, or from Let's Encrypt's staging."""
+    """What to order. Without `directory`: from the present certificate's authority, or from Let's Encrypt's staging."""
 
     directory: str = ""
     email: str = ""
-    trusted: str = ""  # PEM of the roots that an own CA's address is checked with
+    trusted: str = ""  # PEM of the roots with which the address of a CA of one's own is checked
     force: bool = False
     seconds: float = 300.0
 
 
 @dataclass(frozen=True)
 class Report:
-    """The present certificate, and what was done or would be done."""
+    """The certificate in place, and what `certificate` decided about it."""
 
     domain: str
-    directory: str  # of the certificate that is in place
+    directory: str  # the ACME directory from which the certificate in place comes; "" if unknown
     decision: Decision
     stored: StoredCertificate | None
     now: datetime
-    wanted: str = ""  # the directory that was, or would be, asked
+    wanted: str = ""  # the ACME directory at which a new one was, or would be, ordered
 
     @property
     def ordered(self) -> bool:
@@ -76,7 +76,7 @@ class Report:
 
     @property
     def for_tests(self) -> bool:
-        """Whether it comes from Let's Encrypt's staging environment, which browsers do not trust."""
+        """Whether the certificate comes from Let's Encrypt's staging environment, which browsers do not trust."""
         return bool(self.stored) and self.directory == STAGING
 
     def as_json(self) -> dict[str, Any]:
@@ -97,13 +97,13 @@ class Report:
 
 def command(
     *,
-    production: Annotated[bool, typer.Option("--production", help="Let's Encrypt's real certificates.")] = False,
+    production: Annotated[bool, typer.Option("--production", help="Order Let's Encrypt's real certificate.")] = False,
     staging: Annotated[
         bool,
         typer.Option(
             "--staging",
-            help="Its test certificates, which browsers do not trust. Without either the same as before, and test ones "
-            "at first.",
+            help="Order its test certificate, which browsers do not trust. Without both options, the authority of the "
+            "present certificate is asked again; the first certificate is a test certificate.",
         ),
     ] = False,
     email: Annotated[str, typer.Option("--email", help="An address that the authority may write to.")] = "",
@@ -123,8 +123,8 @@ def command(
     It proves by a DNS record in Route 53 that the domain is yours, and stores the certificate in the installation's
     bucket, where servers fetch it when they start and every hour. A function renews it by itself from then on.
 
-    The first one is a test certificate, so that nothing is used up while you find out whether everything works; then
-    take --production. What there is and what would be done: --dry-run (exit code 3 if there is something to do).
+    The first one is a test certificate, which does not count toward the limits for real ones; when it works, order
+    with --production. --dry-run shows the present certificate and what would be done (exit code 3: something).
     """
     choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
@@ -140,7 +140,7 @@ def command(
 
 
 def inspect(account: Account, installation: Installation, choice: Choice = Choice()) -> Report:
-    """The present certificate, and what `obtain` would do. Changes nothing. Raises `Problem` if it could not work."""
+    """Report the certificate in place and what `obtain` would do. Changes nothing. Raises `Problem` as `check` does."""
     renewal, wish = renewal_of(account, installation, choice, lambda _: None)
     decision = renewal.decide(wish)
     if decision.verdict is Verdict.ORDER:
@@ -156,7 +156,7 @@ def obtain(
     *,
     tell: Callable[[OrderStage], None] = lambda _: None,
 ) -> Report:
-    """Order a certificate if one is due. Raises `Problem`; the present one stays then."""
+    """Order a certificate if one is due. Raises `Problem` if that fails; then the present certificate stays."""
     renewal, wish = renewal_of(account, installation, choice, tell)
     if renewal.decide(wish).verdict is Verdict.ORDER:
         check(account, installation, wish.directory, own=bool(wish.trusted))
@@ -187,7 +187,7 @@ def obtain_visibly(account: Account, installation: Installation, choice: Choice)
 def renewal_of(
     account: Account, installation: Installation, choice: Choice, tell: Callable[[OrderStage], None]
 ) -> tuple[Renewal, RenewalRequest]:
-    """What looks after the installation's certificate, and what to ask of it for this choice."""
+    """The service that renews the installation's certificate, and the request to it for this choice."""
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
     domain = installation.servers_domain
@@ -205,13 +205,13 @@ def renewal_of(
     return renewal, RenewalRequest(domain, directory, choice.email, trusted, choice.force, choice.seconds)
 
 
-# ---- what must hold before anything is ordered
+# ---- before an order
 
 
 def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
-    """Check that the domain is in the zone, the Internet finds the zone, and no CAA record forbids. Raises `Problem`.
+    """Check that the domain is in the zone, the zone is delegated, and no CAA record forbids. Raises `Problem`.
 
-    `own`: the directory is a CA of one's own, which may look elsewhere than in the Internet's DNS; then only a warning.
+    With `own`, the directory is a CA of one's own, which may use another DNS: then only the domain's zone is checked.
     """
     domain = installation.servers_domain
     zone = read_zone(account, installation["HostedZoneId"])
@@ -237,7 +237,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
 
 
 def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str], bool]) -> None:
-    """Let's Encrypt would look at the same records, and refuse, which counts as a failure there."""
+    """Raise `Problem` if a CAA record forbids: Let's Encrypt would refuse, and count it as a failure."""
     for name in names_of(domain):
         found = caa.find(name.removeprefix("*."), known)
         if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
@@ -248,7 +248,7 @@ def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str],
             )
 
 
-# ---- what the options say
+# ---- the options
 
 
 def _directory(production: bool, staging: bool, directory: str) -> str:
@@ -271,7 +271,7 @@ def _bundle(path: Path | None) -> str:
     return text
 
 
-# ---- what people read
+# ---- the messages
 
 
 def _show(report: Report, dry_run: bool) -> None:
@@ -299,7 +299,7 @@ def _show(report: Report, dry_run: bool) -> None:
 
 
 def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:
-    """Why nothing was ordered although something is needed."""
+    """The problem of a certificate that is needed and was not ordered."""
     if decision.verdict is Verdict.FOREIGN:
         until = f", valid until {_day(stored.not_after)}" if stored and stored.not_after > datetime.now(UTC) else ""
         return Problem(
@@ -318,45 +318,48 @@ def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:
 
 
 def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
-    who, said = _who(wish.directory), str(error)
+    authority, message = _authority(wish.directory), str(error)
     sentences: dict[FailureReason, tuple[str, str]] = {
         FailureReason.VALIDATION: (
-            f"{who} could not see the proof in DNS.",
+            f"{authority} could not see the proof in DNS.",
             f"Check that {wish.domain} leads to its hosted zone (`python -m deploy doctor`), and run this again.",
         ),
         FailureReason.CAA: (
-            f"A CAA record of {wish.domain}, or of a domain above it, forbids {who} to issue.",
-            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _SOME)[0]}" and run this again.',
+            f"A CAA record of {wish.domain}, or of a domain above it, forbids {authority} to issue.",
+            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _UNKNOWN_AUTHORITY)[0]}" and run this again.',
         ),
         FailureReason.RATE_LIMITED: (
-            f"{who} wants no further orders{_until(error.until)}.",
+            f"{authority} wants no further orders{_until(error.until)}.",
             "Wait; the certificate in place stays. Tests are better done with --staging.",
         ),
         FailureReason.DNS: (
             "The proof could not be published in DNS.",
             "Look at that record in Route 53, and run this again.",
         ),
-        FailureReason.REFUSED: (f"{who} refuses the order.", "See what it says; its terms may forbid this domain."),
+        FailureReason.REFUSED: (
+            f"{authority} refuses the order.",
+            "Read its message; its terms may forbid this domain.",
+        ),
         FailureReason.UNREACHABLE: (
-            f"{who} cannot be reached just now.",
+            f"{authority} cannot be reached just now.",
             "Check the network, and run this again later.",
         ),
-        FailureReason.TIMEOUT: (f"The order at {who} took too long.", "Run this again; nothing is lost."),
+        FailureReason.TIMEOUT: (f"The order at {authority} took too long.", "Run this again; nothing is lost."),
         FailureReason.WRONG: (
-            f"What came from {who} is not what was ordered, so it was not stored.",
+            f"What came from {authority} is not what was ordered, so it was not stored.",
             "Run this again.",
         ),
         FailureReason.OVERTAKEN: (
             "Another run was faster.",
             "See what there is now: `python -m deploy certificate --dry-run`.",
         ),
-        FailureReason.BROKEN: (f"{who} could not be understood.", "Is that the address of an ACME directory?"),
+        FailureReason.BROKEN: (f"{authority} could not be understood.", "Is that the address of an ACME directory?"),
     }
-    what, advice = sentences[error.reason]
-    return Problem(what, advice, [said] if said else ())
+    text, advice = sentences[error.reason]
+    return Problem(text, advice, [message] if message else ())
 
 
-def _who(directory: str) -> str:
+def _authority(directory: str) -> str:
     known = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
     return known.get(directory) or f"The certificate authority {urlsplit(directory).hostname}"
 

@@ -1,9 +1,9 @@
-"""The servers' certificate of an installation that was removed, taken over by the one that follows it.
+"""Takes over the servers' certificate of an earlier installation that was removed.
 
 `destroy` keeps the data bucket, with the certificate in it; the next installation has a bucket of its own. Ordering
 anew each time would meet Let's Encrypt's limit of five certificates for the same names in seven days (see
-`hippodrome.certificates.rules`). So a certificate that is still fresh, and the account's key that renews it, are copied
-from the bucket that was kept: from one private bucket of the installation to another, with the administrator's rights.
+`hippodrome.certificates.rules`). So this copies a certificate that is not due for renewal, and the key of the ACME
+account that renews it, from the kept bucket to the new one, with the administrator's rights. Both are private.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def take_over(account: Account, installation: Installation) -> StoredCertificate | None:
-    """Copy a fresh certificate of an earlier installation, if this one has none; return what was copied.
+    """Copy a certificate of an earlier installation, if this one has none; return the copied one, or None.
 
     `Renewal.obtain` writes the rest (`fullchain.pem`, `certificate.json`) from it.
     """
@@ -55,7 +55,7 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
 
 
 def _kept(account: Account, installation: Installation) -> Iterator[str]:
-    """The data buckets that earlier installations of that name have left in this region."""
+    """The data buckets of earlier installations with this name in this region."""
     code = CodeBucket(account, installation.stack).name
     for bucket in inventory.data_buckets(account, installation.stack, code):
         if bucket != installation["Bucket"]:
@@ -63,7 +63,7 @@ def _kept(account: Account, installation: Installation) -> Iterator[str]:
 
 
 def _read(account: Account, bucket: str, key: str) -> bytes:
-    """A document; nothing if there is none, or if it cannot be had: then a new one is ordered."""
+    """A document; empty if there is none, or if S3 refuses: then a new certificate is ordered."""
     try:
         answer = account.client("s3").get_object(Bucket=bucket, ExpectedBucketOwner=account.id, Key=key)
     except ClientError:
@@ -72,7 +72,7 @@ def _read(account: Account, bucket: str, key: str) -> bytes:
 
 
 def _write(documents: Documents, key: str, body: bytes) -> bool:
-    """Create a document; False if there is one by now, or nothing to write."""
+    """Create a document; return False if it exists by now, or `body` is empty."""
     try:
         if body:
             documents.create(key, body)

@@ -1,4 +1,4 @@
-"""What stands compared with what should: the built template and its parameters, and CloudFormation's change sets."""
+"""Compares the stack with the built template and its parameters, and makes CloudFormation's change sets."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from deploy.stack.stack import Stack
 from deploy.stack.states import StackAction
 from hippodrome.aws import errors
 
-PREFIX = "hippodrome-"  # of the names of our change sets
-_NOTHING = ("didn't contain changes", "No updates are to be performed")
+PREFIX = "hippodrome-"  # of the names of Hippodrome's change sets
+_NO_CHANGES = ("didn't contain changes", "No updates are to be performed")
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a plan and an apply begin with: the stack, and the template and parameters that it is to have."""
+    """The input of `plan` and `apply`: the stack, and the template and parameters that it is to have."""
 
     account: Account
     stack: Stack
-    found: Mapping[str, Any] | None  # what DescribeStacks says, if anything
+    found: Mapping[str, Any] | None  # the stack from DescribeStacks; None if there is none
     template: Template
     functions: Sequence[build.Function]
     parameters: Mapping[str, str]
@@ -48,17 +48,17 @@ class Prepared:
 
     @property
     def existing(self) -> Mapping[str, Any] | None:
-        """The described stack; None if there is none, or none that was ever complete."""
+        """The stack from DescribeStacks; None if there is none, or if it was never complete."""
         makes = states.action_for(self.status) in {StackAction.CREATE, StackAction.RECREATE}
         return None if makes else self.found
 
     @cached_property
     def before(self) -> dict[str, str]:
-        """The parameters of the stack."""
+        """The present parameters of the stack."""
         return parameters_of(self.existing)
 
     def changed_parameters(self) -> dict[str, tuple[str, str]]:
-        """By name, the parameters that differ: the stack's value, and the new one."""
+        """The parameters that will change: name → (present value, new value)."""
         names = sorted(set(self.before) | set(self.parameters))
         pairs = {name: (self.before.get(name, ""), self.parameters.get(name, "")) for name in names}
         return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
@@ -76,7 +76,7 @@ class Prepared:
 
 
 def _same_text(stored: str, ours: str) -> bool:
-    """Whether GetTemplate gave this template: it has question marks for what is not ASCII.
+    """Whether the text from GetTemplate is this template. GetTemplate returns ? for characters outside of ASCII.
 
     (aws-cloudformation/cloudformation-coverage-roadmap, issues 814 and 1220.)
     """
@@ -84,7 +84,7 @@ def _same_text(stored: str, ours: str) -> bool:
 
 
 def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
-    """Build the functions, read the stack, decide on the parameters. Changes nothing in AWS. Raises `Problem`."""
+    """Build the functions, read the stack, and determine its parameters. Changes nothing in AWS. Raises `Problem`."""
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
     source = Template.read()
@@ -98,7 +98,7 @@ def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
 
 
 def _subnets(found: Mapping[str, Any] | None) -> list[str]:
-    """The subnets that a described stack has given as its output."""
+    """The ids in the output `Subnets` of a described stack; empty if it has none."""
     outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
     return [name for name in outputs.get("Subnets", "").split(",") if name]
 
@@ -109,15 +109,16 @@ class ChangeSet:
 
     arn: str
     stack_id: str
-    changes: list[dict[str, Any]] = field(default_factory=list)  # none: there is nothing to do
-    warnings: list[str] = field(default_factory=list)  # what may make it fail, such as a quota that is used up
+    changes: list[dict[str, Any]] = field(default_factory=list)  # empty: there is nothing to do
+    warnings: list[str] = field(default_factory=list)  # reasons why it may fail, such as a quota that is used up
 
 
 @contextlib.contextmanager
 def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = time.sleep) -> Iterator[ChangeSet]:
-    """Make a change set, with the template uploaded for it. It is deleted afterwards, unless it was executed.
+    """Upload the template and make a change set. After the block, delete it and the empty stack that a first one makes.
 
-    With `keep` it stays when the block ends well (it is executed there). Raises `Problem` if CloudFormation refuses it.
+    With `keep`, for a block that executes it, it stays if it has changes and the block raises nothing. Raises `Problem`
+    if CloudFormation refuses it.
     """
     client = prepared.account.client("cloudformation")
     url = prepared.bucket.put_template(prepared.template.text)
@@ -158,7 +159,7 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
             break
         if answer["Status"] in {"FAILED", "DELETE_COMPLETE"}:
             reason = str(answer.get("StatusReason", "")).strip()
-            if any(text in reason for text in _NOTHING):
+            if any(text in reason for text in _NO_CHANGES):
                 return []
             raise Problem(
                 f"CloudFormation cannot make a plan of this: {reason or answer['Status']}",
@@ -176,9 +177,9 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
 
 
 def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
-    """What CloudFormation's validation before deployment found wrong with a change set; best effort.
+    """The findings of CloudFormation's validation of a change set, five at most; empty if they cannot be read.
 
-    `mode`: FAIL for what has made it fail, WARN for what it is made in spite of, such as a quota that is used up
+    `mode`: FAIL for those that made the change set fail, WARN for those that did not, such as a quota that is used up
     (CloudFormation User Guide, "Validate stack deployments"; API Reference, OperationEvent).
     """
     found: list[str] = []
@@ -195,7 +196,7 @@ def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
 
 
 def _discard(client: Any, made: ChangeSet, prepared: Prepared) -> None:
-    """Take the change set back; and the empty stack that a first one brings."""
+    """Delete the change set, and the empty stack that comes with a first one."""
     with contextlib.suppress(ClientError):
         client.delete_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
     if prepared.existing is None:

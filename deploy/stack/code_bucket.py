@@ -1,4 +1,4 @@
-"""The bucket where the functions' zips and the templates lie, made before the stack: private, encrypted, ours."""
+"""The code bucket, made before the stack, with the functions' zips and the templates: private and encrypted."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SETTLING_PAUSE = 5  # seconds
 
 
 class CodeBucket:
-    """The code bucket of a stack. Every request names the account that must own it, so another's is never written."""
+    """The code bucket of a stack. Every request names the account that must own it, so no other bucket is written."""
 
     def __init__(self, account: Account, stack: str) -> None:
         self._account = account
@@ -43,7 +43,7 @@ class CodeBucket:
         self._owner = {"Bucket": self.name, "ExpectedBucketOwner": account.id}
 
     def exists(self) -> bool:
-        """Whether the bucket exists and is ours. Raises `Problem` if it is another account's."""
+        """Whether the bucket exists. Raises `Problem` if it belongs to another account."""
         try:
             return bucket_exists(self._account, self.name)
         except ClientError as error:
@@ -52,7 +52,7 @@ class CodeBucket:
             raise
 
     def make(self) -> bool:
-        """Make the bucket, or finish a half-made one; return whether something was done. Its tag is set last."""
+        """Make the bucket, or finish what a run has begun; return whether anything was done. The tag is set last."""
         exists = self.exists()
         if exists and self._tagged():
             return False
@@ -76,7 +76,7 @@ class CodeBucket:
         return True
 
     def upload(self, functions: Sequence[Function]) -> int:
-        """Upload the zips that are not there yet; return how many."""
+        """Upload the zips that the bucket does not have; return how many."""
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             there = list(pool.map(lambda function: self._has(function.key), functions))
         missing = [function for function, found in zip(functions, there, strict=True) if not found]
@@ -91,7 +91,7 @@ class CodeBucket:
         return len(missing)
 
     def put(self, key: str, body: bytes) -> str:
-        """Store an object, whose hash S3 checks; return its https URL."""
+        """Store an object, and let S3 check its sha256; return its URL."""
         checksum = base64.b64encode(hashlib.sha256(body).digest()).decode()
         self._s3.put_object(**self._owner, Key=key, Body=body, ChecksumSHA256=checksum)
         return self.url(key)
@@ -107,13 +107,13 @@ class CodeBucket:
         return bytes(answer["Body"].read())
 
     def put_template(self, text: str) -> str:
-        """Store a template under its hash, if it is not there; return its URL for CloudFormation."""
+        """Store a template under its hash, unless the bucket has it; return its URL for CloudFormation."""
         body = text.encode()
         key = f"templates/{hashlib.sha256(body).hexdigest()[:16]}.yml"
         return self.url(key) if self._has(key) else self.put(key, body)
 
     def url(self, key: str) -> str:
-        """The address of an object as CloudFormation takes it."""
+        """The URL of an object, in the form that CloudFormation takes."""
         return f"{self._s3.meta.endpoint_url.rstrip('/')}/{self.name}/{key}"
 
     def _has(self, key: str) -> bool:
@@ -136,7 +136,7 @@ class CodeBucket:
 
     def _create(self) -> None:
         place: dict[str, Any] = {}
-        if self._account.region != "us-east-1":  # which S3 does not take as a constraint
+        if self._account.region != "us-east-1":  # S3 refuses us-east-1 as a LocationConstraint
             place = {"CreateBucketConfiguration": {"LocationConstraint": self._account.region}}
         for waited in range(0, LONGEST_DELETION, PAUSE):
             try:
@@ -158,7 +158,7 @@ class CodeBucket:
         self._s3.get_waiter("bucket_exists").wait(**self._owner, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
 
     def _set(self, call: Callable[..., Any], **setting: Any) -> None:
-        """Make a setting of the bucket; while S3 is at work on the new bucket, try again. Raises `Problem`."""
+        """Make a setting; try again while S3 answers OperationAborted. Raises `Problem` after `SETTLING` seconds."""
         for waited in range(0, SETTLING, SETTLING_PAUSE):
             try:
                 call(**self._owner, **setting)

@@ -1,15 +1,15 @@
-"""Names that AWS keeps for a while after what they named was deleted: nothing may be made under them so soon.
+"""Waits until the names of deleted queues and schedule groups are free again, so that a stack can be made with them.
 
 SQS: "When you delete a queue, you must wait at least 60 seconds before creating a queue with the same name" (API
-reference, DeleteQueue; QueueDeletedRecently otherwise), and CloudFormation does not wait: the stack rolls back, which
-deletes queues once more. So what a destroyed stack, a failed creation or an update that was taken back has deleted in
-the last minute is waited for before anything is made.
+reference, DeleteQueue; QueueDeletedRecently otherwise). CloudFormation does not wait: the stack rolls back, which
+deletes queues once more. So `wait` looks for queues that were deleted in the last minute by a destroyed stack, a failed
+creation or an update that was rolled back, and waits for the rest of the minute.
 
-EventBridge Scheduler: a group that is deleted is in the state DELETING until its schedules are (user guide, "Deleting a
-schedule group"), and its name is taken.
+EventBridge Scheduler: a deleted group is in the state DELETING until its schedules are deleted (user guide, "Deleting a
+schedule group"); until then its name is taken.
 
-CloudFormation looks for taken names when a change set is made, and refuses it (user guide, "Validate stack
-deployments": resource name conflict detection). So the wait comes before that.
+CloudFormation refuses a change set whose names are taken (user guide, "Validate stack deployments": resource name
+conflict detection). So the wait comes before the change set.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from console import screen
 from deploy.aws.account import Account
 from deploy.core.stages import Executor
 
-KEPT = {"AWS::SQS::Queue": 60.0}  # seconds, by the type of what was deleted
-MARGIN = 10.0  # seconds more: the events' times are CloudFormation's
-PAUSE = 5  # seconds between two looks at the timers
-LONGEST = 300  # seconds that they are waited for
-_STACKS = 3  # of one name that are looked into, the newest first
+KEPT = {"AWS::SQS::Queue": 60.0}  # resource type → seconds that AWS keeps its name
+MARGIN = 10.0  # seconds more: the events' times are CloudFormation's, not the service's
+PAUSE = 5  # seconds between two looks at the schedule group
+LONGEST = 300  # seconds to wait for the schedule group at most
+_STACKS = 3  # stacks of one name whose events are read, the newest first
 
 
 def remaining(account: Account, stack: str) -> float:
-    """Seconds until all names of the stack's resources are free again; 0 if they are."""
+    """Seconds until all names of deleted resources of the stack are free again; 0 if they are free."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     answers = list(pages)
@@ -48,10 +48,10 @@ def remaining(account: Account, stack: str) -> float:
 
 
 def wait(account: Account, stack: str, executor: Executor | None = None) -> None:
-    """Wait until every name is free, with a progress bar."""
+    """Wait until the names are free, with a progress bar."""
     executor = executor or Executor()
     title = "EventBridge is still deleting the timers of before: waiting for that"
-    executor.wait(lambda: _deleting_timers(account, stack), LONGEST, pause=PAUSE, title=title)
+    executor.wait(lambda: _group_is_deleting(account, stack), LONGEST, pause=PAUSE, title=title)
     left = round(remaining(account, stack))
     if left <= 0:
         return
@@ -62,7 +62,7 @@ def wait(account: Account, stack: str, executor: Executor | None = None) -> None
             bar.advance(task)
 
 
-def _deleting_timers(account: Account, group: str) -> bool:
+def _group_is_deleting(account: Account, group: str) -> bool:
     try:
         found = account.client("scheduler").get_schedule_group(Name=group)
     except ClientError:  # there is none, or these credentials may not look: CloudFormation will say
@@ -71,7 +71,7 @@ def _deleting_timers(account: Account, group: str) -> bool:
 
 
 def _deleted(client: Any, stack_id: str, now: datetime) -> Iterator[tuple[str, datetime]]:
-    """What was deleted in that stack lately, and when."""
+    """The types of resources in `KEPT` that were deleted in this stack lately, each with the time."""
     longest = max(KEPT.values()) + MARGIN
     for page in client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
         for event in page["StackEvents"]:  # newest first
@@ -88,9 +88,9 @@ def _last_change(summary: Mapping[str, Any]) -> datetime:
 
 
 def _now(answer: Mapping[str, Any]) -> datetime:
-    """AWS's clock, as its answer says; this machine's without one."""
-    told = answer.get("ResponseMetadata", {}).get("HTTPHeaders", {}).get("date", "")
+    """The time by AWS's clock, from the answer's header `date`; without the header, by this machine's clock."""
+    date = answer.get("ResponseMetadata", {}).get("HTTPHeaders", {}).get("date", "")
     try:
-        return parsedate_to_datetime(told)
+        return parsedate_to_datetime(date)
     except (TypeError, ValueError):
         return datetime.now(UTC)

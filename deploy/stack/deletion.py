@@ -1,4 +1,4 @@
-"""Deleting a stack: what keeps AWS from it for a while is waited for or removed, and the deletion tried again."""
+"""Deletes a stack. If something blocks the deletion for a while, waits for it or removes it, and tries again."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from deploy.stack.deletion_failures import Recovery, recoveries, recovery_from
 from deploy.stack.stack import FailedResource, NotDeleted, Stack
 
 TRIES = 8  # at deleting the stack
-PAUSE = 20  # seconds between two looks at what is in the way
+PAUSE = 20  # seconds between two looks at what blocks the deletion
 IN_USE = 75 * 60
 """Seconds that a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
 (aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
-DISAGREEING = 5 * 60  # seconds to wait when a certificate is refused as in use, and ACM lists nothing that uses it
+DISAGREEING = 5 * 60  # seconds to wait if CloudFormation says that the certificate is in use, and ACM lists no use
 NETWORK_IN_USE = 25 * 60
 """Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
 (alchemy-run/alchemy pull request 1125)."""
@@ -34,10 +34,10 @@ class StackDeletion:
         self._stack = stack
         self._executor = executor
         self._stop_servers = stop_servers
-        self._without: list[str] = []  # resources that the next try leaves out
+        self._without: list[str] = []  # logical ids of resources that the next try leaves out
 
     def run(self, title: str = "Deleting the stack") -> None:
-        """Delete the stack; wait for, or remove, what is in the way for a while. Raises `Problem` for all else."""
+        """Delete the stack, in up to `TRIES` tries. Raises `Problem` for a failure that waiting does not end."""
         self._executor.retry(lambda: self._try(title), self._recover, TRIES)
 
     def _try(self, title: str) -> None:
@@ -46,18 +46,18 @@ class StackDeletion:
         self._stack.delete(title, self._without)
 
     def _recover(self, error: Exception) -> bool:
-        """Wait for, or remove, what keeps CloudFormation from deleting the stack; False if nothing that passes."""
+        """Wait for, or remove, what blocks the deletion; return False if that is not possible."""
         needed = recoveries(error.failures) if isinstance(error, NotDeleted) else []
         if not isinstance(error, NotDeleted) or not needed:
             return False
         self._without = [one.logical_id for one in error.failures if recovery_from(one) is Recovery.GONE]
-        for wait in needed:
-            screen.info(f"This has to wait until {wait.value}; then the rest is deleted.")
-            self._wait(wait, error.failures)
+        for recovery in needed:
+            screen.info(f"This has to wait until {recovery.value}; then the rest is deleted.")
+            self._help(recovery, error.failures)
         return True
 
-    def _wait(self, wait: Recovery, failures: Sequence[FailedResource]) -> None:
-        match wait:
+    def _help(self, recovery: Recovery, failures: Sequence[FailedResource]) -> None:
+        match recovery:
             case Recovery.CERTIFICATE:
                 for failure in failures:
                     if failure.type == "AWS::CertificateManager::Certificate":
@@ -71,7 +71,7 @@ class StackDeletion:
             case Recovery.PAUSE:
                 self._executor.sleep(PAUSE)
             case Recovery.SERVERS | Recovery.POLICY | Recovery.GONE:
-                pass  # done before, or in, each try
+                pass  # each try does that itself
 
     def _free_policies(self) -> None:
         """Detach the stack's managed policies, and print from whom."""
@@ -84,9 +84,9 @@ class StackDeletion:
 
         def users() -> list[str]:
             found = acm_records.in_use_by(self._account, arn)
-            if ours := [one for one in found if _is_in(self._account, one)]:
+            if others := [one for one in found if _is_other_use(self._account, one)]:
                 raise Problem(
-                    f"The site's certificate is used by {', '.join(ours)}.",
+                    f"The site's certificate is used by {', '.join(others)}.",
                     "Take the certificate away from there, and run the same command again.",
                 )
             return found
@@ -101,7 +101,7 @@ class StackDeletion:
             )
 
     def _network_free(self) -> None:
-        """Wait until no network interface is left in what is ours. Raises `Problem` after `NETWORK_IN_USE` seconds."""
+        """Wait until the stack's network has no network interface. Raises `Problem` after `NETWORK_IN_USE` seconds."""
         vpcs, groups = self._stack.ids_of("AWS::EC2::VPC"), self._stack.ids_of("AWS::EC2::SecurityGroup")
         where = {"Name": "vpc-id", "Values": vpcs} if vpcs else {"Name": "group-id", "Values": groups}
         client = self._account.client("ec2")
@@ -129,7 +129,7 @@ class StackDeletion:
     ) -> Sequence[str]:
         """Wait until a look finds nothing; return what the last look found.
 
-        If already the first one finds nothing, although AWS has refused the deletion: wait `disagreeing` seconds.
+        If the first look finds nothing, AWS's lists disagree with its refusal: wait `disagreeing` seconds.
         """
         if not look():
             self._executor.sleep(disagreeing)
@@ -137,7 +137,7 @@ class StackDeletion:
         return self._executor.wait(look, seconds, pause=PAUSE, title=f"{title}; it is safe to interrupt this")
 
 
-def _is_in(account: Account, arn: str) -> bool:
-    """Whether it is something of this account that uses a certificate: API Gateway's part in it goes by itself."""
+def _is_other_use(account: Account, arn: str) -> bool:
+    """Whether this is a use by a resource of the account outside of API Gateway. API Gateway's own uses end alone."""
     _, _, service, _, owner, *_ = arn.split(":")
     return owner == account.id and service != "apigateway"

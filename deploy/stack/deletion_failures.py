@@ -1,8 +1,8 @@
-"""Failures of a deletion that pass or can be mended, by CloudFormation's words: one table with its sources.
+"""A table of failures of a stack's deletion that pass or can be mended, found by their text, each with its source.
 
-CloudFormation deletes what it can and ends in DELETE_FAILED, with a sentence of the service for each resource that is
-left. Deleting the stack again goes on from there. For a sentence that is not in this table, such as a missing
-permission, waiting does not help.
+CloudFormation deletes what it can and ends in DELETE_FAILED, with a service's message for each resource that is left.
+Deleting the stack again goes on from there. If a message is not in this table, such as that of a missing permission,
+waiting does not help.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from deploy.stack.stack import FailedResource
 
 
 class Recovery(Enum):
-    """What helps before the deletion is tried again."""
+    """What must happen before the deletion is tried again. The value follows "This has to wait until"."""
 
     SERVERS = "servers are stopped"
     NETWORK = "the addresses of servers that have ended are given back"
@@ -28,12 +28,12 @@ class Recovery(Enum):
 
 
 class KnownFailure(NamedTuple):
-    """Resource types ("" for all), what their service says (a pattern, in any case), and what helps."""
+    """A failure: its resource types ("" for all), its message (a pattern, ignoring case), and what helps."""
 
     types: str
     says: str
     recovery: Recovery
-    source: str  # of the wording
+    source: str  # where the message was seen
 
 
 TABLE: tuple[KnownFailure, ...] = (
@@ -109,7 +109,7 @@ _DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECA
 
 
 def recovery_from(failure: FailedResource) -> Recovery | None:
-    """What to do about this failure before the next try; None if it does not pass by itself and we cannot mend it."""
+    """What helps against this failure; None if it does not pass and no command can mend it."""
     if _DENIED.search(failure.reason):
         return None
     for known in TABLE:
@@ -121,6 +121,6 @@ def recovery_from(failure: FailedResource) -> Recovery | None:
 
 
 def recoveries(failures: Iterable[FailedResource]) -> list[Recovery]:
-    """What helps against all of these, each once; nothing if one of them is nothing that passes."""
+    """What helps against these failures, each once; empty if nothing helps against one of them."""
     found = [recovery_from(failure) for failure in failures]
-    return [] if None in found else list(dict.fromkeys(wait for wait in found if wait))
+    return [] if None in found else list(dict.fromkeys(recovery for recovery in found if recovery))

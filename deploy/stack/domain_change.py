@@ -1,8 +1,8 @@
-"""Moving the servers' names, the site or the network of an existing installation: what must hold, and what comes first.
+"""Checks and prepares a change of an installation's domain of servers, site or network.
 
-Earlier versions named servers directly below the installation's domain; now they have a level of their own. Servers
-that run keep their names and the certificate for those (`hippodrome.certificates.rules.location`). Servers get new
-names only when there is a certificate for them.
+Earlier versions named servers directly below the installation's domain; now servers have a level of their own. Running
+servers keep their names and the certificate for these (`hippodrome.certificates.rules.location`). Servers get new names
+only when there is a certificate for them.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ _WAIT_FOR_WARM_TOO = (
 
 
 def moves(prepared: Prepared) -> bool:
-    """Whether this apply moves servers' names to another domain; True as well if there is no installation yet."""
+    """Whether this apply moves servers' names to another domain. True also if there is no installation yet."""
     before = _before(prepared)
     return before is None or before.servers_domain != servers_domain(prepared.parameters)
 
 
 def check(prepared: Prepared) -> None:
-    """Check whether servers may have names in the domain of the parameters. Raises `Problem`. Changes nothing."""
+    """Check that servers may have names in the domain of the new parameters. Raises `Problem`. Changes nothing."""
     if not moves(prepared):
         return
     before, after = _before(prepared), servers_domain(prepared.parameters)
-    if after != prepared.parameters["RootDomain"]:  # whose own NS record is in the zone and is no delegation
-        _delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
-    _neighbours(prepared, after)
+    if after != prepared.parameters["RootDomain"]:  # a zone's own domain has an NS record that is no delegation
+        _must_not_be_delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
+    _must_not_cover_a_site(prepared, after)
     if before is not None:
         _refuse(
             [one for one in _running(prepared.account, before) if _stays(one, prepared)],
@@ -53,10 +53,10 @@ def check(prepared: Prepared) -> None:
 
 
 def check_site(prepared: Prepared) -> None:
-    """Check that no server runs that was told the site's present address, if that changes. Raises `Problem`.
+    """Check that no server uses the site's present address, if that changes. Raises `Problem`.
 
-    A server asks there for each document that it stores (`hippodrome/servers/signing.py`). API Gateway's name of the
-    site can only be replaced, so CloudFormation deletes the old one.
+    A server asks the site for a presigned request for each document (`hippodrome/servers/signing.py`). A domain name of
+    API Gateway can only be replaced, so CloudFormation deletes the old one.
     """
     before = _before(prepared)
     sites = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
@@ -70,9 +70,9 @@ def check_site(prepared: Prepared) -> None:
 
 
 def check_network(prepared: Prepared) -> None:
-    """Check that no server runs in the present network, if that is given up for another. Raises `Problem`.
+    """Check that no server runs in the present network, if another one replaces it. Raises `Problem`.
 
-    CloudFormation would take the servers' way out of the installation's own VPC, and then fail to delete what they use.
+    CloudFormation would delete the route to the Internet that the servers use, and then fail to delete the rest.
     """
     before = _before(prepared)
     if before is None or (prepared.before.get("VpcId") or "") == prepared.parameters["VpcId"]:
@@ -85,13 +85,13 @@ def check_network(prepared: Prepared) -> None:
 
 
 def _refuse(running: Collection[Server], why: str, advice: str) -> None:
-    """Raise `Problem` if there are such servers."""
+    """Raise `Problem` if any server runs."""
     if running:
         raise Problem(why, advice, [f"{len(running)} of them"])
 
 
 def certify(prepared: Prepared) -> None:
-    """Obtain a certificate for the new names before any server gets one of them. Raises `Problem`.
+    """Obtain a certificate for servers' new names before any server has such a name. Raises `Problem`.
 
     If the present names have no certificate, nothing is ordered here; `certificate` orders one later.
     """
@@ -100,12 +100,12 @@ def certify(prepared: Prepared) -> None:
         return
     changed = {key: prepared.parameters.get(key, "") for key in ("RootDomain", "ServersHost", "HostedZoneId")}
     after = replace(before, outputs={**before.outputs, **changed})
-    standing, wish = certificate.renewal_of(prepared.account, before, Choice(), lambda _: None)
-    stored = standing.read()[1]
+    renewal, wish = certificate.renewal_of(prepared.account, before, Choice(), lambda _: None)
+    stored = renewal.read()[1]
     if stored is None:
         return
     if not stored.directory:
-        _by_hand(prepared.account, after)
+        _must_be_uploaded(prepared.account, after)
         return
     choice = Choice(wish.directory, trusted=wish.trusted)
     try:
@@ -120,8 +120,8 @@ def certify(prepared: Prepared) -> None:
         ) from None
 
 
-def _by_hand(account: Account, after: Installation) -> None:
-    """If the administrator uploaded the certificate by hand, they must upload the next one too. Raises `Problem`."""
+def _must_be_uploaded(account: Account, after: Installation) -> None:
+    """Raise `Problem` unless the administrator has uploaded, as before, a certificate for the new names by hand."""
     if account.platform(after).documents.get(after.certificate.privkey) is None:
         raise Problem(
             f"The servers' certificate was put there by hand, and there is none for *.{after.servers_domain}.",
@@ -153,12 +153,13 @@ def _running(account: Account, installation: Installation) -> list[Server]:
 
 
 def _stays(server: Server, prepared: Prepared) -> bool:
-    """Whether its DNS record would stay in the zone: the functions may remove only names that look like a server's."""
+    """Whether the server's DNS record would stay in the zone: functions may only delete names like those of servers."""
     moved = any(prepared.before.get(key) != prepared.parameters[key] for key in ("RootDomain", "HostedZoneId"))
     return bool(server.host) and (moved or ids.parse_server_name(server.dns.partition(".")[0]) is None)
 
 
-def _delegated(account: Account, zone: str, domain: str) -> None:
+def _must_not_be_delegated(account: Account, zone: str, domain: str) -> None:
+    """Raise `Problem` if the zone delegates this domain: then its records are not used."""
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone, StartRecordName=f"{domain}.", StartRecordType="NS", MaxItems="1"
     )
@@ -170,8 +171,11 @@ def _delegated(account: Account, zone: str, domain: str) -> None:
             )
 
 
-def _neighbours(prepared: Prepared, domain: str) -> None:
-    """Raise `Problem` if servers' certificates would also be for a site's name: every agent can read their key."""
+def _must_not_cover_a_site(prepared: Prepared, domain: str) -> None:
+    """Raise `Problem` if the servers' certificate of one installation would be valid for the site of another.
+
+    Every agent can read the key of the servers' certificate.
+    """
     ours = prepared.parameters["RootDomain"]
     for page in prepared.account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:

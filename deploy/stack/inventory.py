@@ -1,4 +1,4 @@
-"""What AWS has of an installation, found by listing: to take it away, and to prove that it is gone."""
+"""Lists what AWS has of an installation: for its removal, and to prove afterwards that nothing is left."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Resource(NamedTuple):
     physical_id: str
 
 
-REMEMBERED = 10  # deleted stacks of one name that are looked into
+REMEMBERED = 10  # stacks of one name, deleted ones included, whose resources are listed
 
 
 def cost_of(kind: str) -> str:
@@ -42,7 +42,7 @@ def cost_of(kind: str) -> str:
 
 
 def removal_of(thing: ListedResource, account: Account) -> str:
-    """The command that removes a resource by hand; "" if only its service's console can."""
+    """The AWS CLI command that removes a resource; "" if there is only the service's console."""
     listing = BY_KIND.get(thing.kind)
     if listing is None:
         return ""
@@ -51,7 +51,7 @@ def removal_of(thing: ListedResource, account: Account) -> str:
 
 
 def resources(account: Account, stack: str) -> list[Resource]:
-    """The resources of the stack of that name, also if it was deleted (CloudFormation keeps them for 90 days)."""
+    """The resources of all installations of that name, also of deleted ones (CloudFormation lists them for 90 days)."""
     found = [
         Resource(one["ResourceType"], one["PhysicalResourceId"])
         for known in stacks(account, stack)
@@ -62,17 +62,17 @@ def resources(account: Account, stack: str) -> list[Resource]:
 
 
 def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
-    """The installations of that name as CloudFormation describes them: the present one, and those deleted last."""
+    """The installations of that name from DescribeStacks: the present one, then those that were deleted last."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
     found.sort(key=lambda one: one["StackStatus"] == "DELETE_COMPLETE")
     described = [_described(client, one["StackId"]) for one in found[:REMEMBERED]]
-    return [one for one in described if one and is_ours(one)]  # what others left under the name is theirs
+    return [one for one in described if one and is_ours(one)]  # a stack of others may have had the name
 
 
 def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
-    """A stack, which may be deleted; None if CloudFormation has forgotten it."""
+    """A stack, also a deleted one; None if CloudFormation does not know it any more."""
     try:
         found: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
     except ClientError as error:
@@ -103,7 +103,7 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
 
 
 def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedResource]:
-    """Those of these resources that exist, by one listing for each kind. Kinds that are parts of others are skipped."""
+    """The resources of `wanted` that exist, by one listing for each type. Skips types that are not in `LISTINGS`."""
     by_type: dict[str, set[str]] = {}
     for resource in wanted:
         by_type.setdefault(resource.type, set()).add(resource.physical_id)
@@ -153,12 +153,14 @@ def _last(arn: str) -> str:
     return arn.rsplit("/", 1)[-1]
 
 
-# -- what the commands make beside the stack --------------------------------------------------------------------------
+# -- what the commands make outside of the stack ----------------------------------------------------------------------
 
 
 def task_definitions(account: Account, stack: str) -> list[str]:
-    """The revisions of this stack's task definitions, deregistered ones too. By their tag: names of stacks may begin
-    alike, and `hippodrome-lab` is another installation than `hippodrome`."""
+    """The revisions of this stack's task definitions, deregistered ones too.
+
+    They are recognised by their tag, since `hippodrome-lab` is another installation than `hippodrome`.
+    """
     ecs = account.client("ecs")
     found: list[str] = []
     for status in ("ACTIVE", "INACTIVE"):
@@ -179,7 +181,7 @@ def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
 
 
 def log_groups(account: Account, stack: str) -> list[str]:
-    """The log groups with the stack's name in theirs, made by the stack or by a service."""
+    """The log groups whose names contain the stack's name, made by the stack or by a service."""
     pages = account.client("logs").get_paginator("describe_log_groups")
     return [
         group["logGroupName"]
@@ -190,15 +192,15 @@ def log_groups(account: Account, stack: str) -> list[str]:
 
 
 def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:
-    """The data buckets that exist: the stack's, and what earlier stacks of that name left in this region.
+    """The existing data buckets of the stack, and of earlier stacks of that name in this region.
 
-    By what CloudFormation remembers (`known`), and by the tag, which lasts longer.
+    They are found among the `known` resources of CloudFormation, and by their tag, which stays longer.
     """
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
     buckets = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
     prefix = resource_names.bucket_prefix(stack)
     buckets = [name for name in buckets if name != code_bucket and (name in remembered or name.startswith(prefix))]
-    # A list may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
+    # ListBuckets may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
     return [
         name
         for name in buckets
@@ -207,11 +209,11 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
 
 
 def server_names(account: Account, where: Addresses) -> list[str]:
-    """DNS names of servers in the zone, also those of another installation with the same root domain."""
-    told = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
+    """The DNS names of servers in the zone, those of another installation with the same domains included."""
+    settings = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
     host = where.servers.removesuffix(where.root).rstrip(".")
     try:
-        return [one.name for one in Route53Dns(lambda: account.client("route53"), told.__getitem__, host).list()]
+        return [one.name for one in Route53Dns(lambda: account.client("route53"), settings.__getitem__, host).list()]
     except ClientError as error:
         if errors.code(error) == "NoSuchHostedZone":
             return []
@@ -219,7 +221,7 @@ def server_names(account: Account, where: Addresses) -> list[str]:
 
 
 SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
-"""Roles that AWS makes once for an account: `apply` asks for ECS's, API Gateway makes its own with a domain name."""
+"""Roles that AWS makes once in an account: `apply` asks for ECS's; API Gateway makes its own with a domain name."""
 
 
 def service_roles(account: Account) -> list[str]:
@@ -238,13 +240,13 @@ def service_roles(account: Account) -> list[str]:
 
 
 def stored(account: Account, bucket: str, most: int = 200_000) -> int:
-    """Bytes in a bucket, with all versions. If there are more than `most` versions: at least so many bytes."""
+    """Bytes of all versions in a bucket; only of the first `most` versions if there are more."""
     found = VersionedBucket(account, bucket).versions()
     return sum(version.size for version in itertools.islice(found, most))
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:
-    """Whether the bucket has the stack's tag, and lies in this region: another region may have a stack of that name."""
+    """Whether the bucket has the stack's tag and is in this region. Another region may have a stack of this name."""
     tags = _tags(account, bucket)
     if tags.get(TAG) != stack:
         return False
@@ -253,9 +255,9 @@ def _belongs(account: Account, bucket: str, stack: str) -> bool:
 
 
 def mark(account: Account, bucket: str, stack: str) -> None:
-    """Make sure that the bucket can be found by its tag when its stack is forgotten.
+    """Give the bucket the stack's tag if it has none, so that it can be found when CloudFormation forgets the stack.
 
-    CloudFormation has put the stack's tags on it; some emulators do not.
+    CloudFormation puts the stack's tags on it; some emulators do not.
     """
     tags = _tags(account, bucket)
     if TAG not in tags and bucket_exists(account, bucket):
@@ -267,13 +269,13 @@ def mark(account: Account, bucket: str, stack: str) -> None:
 def _tags(account: Account, bucket: str) -> dict[str, str]:
     try:
         answer = account.client("s3").get_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id)
-    except ClientError:  # no tags, or not ours to see: nothing of the installation's
+    except ClientError:  # it has no tags, or belongs to others
         return {}
     return {tag["Key"]: tag["Value"] for tag in answer["TagSet"]}
 
 
 def bucket_exists(account: Account, name: str) -> bool:
-    """Whether the bucket exists and is ours."""
+    """Whether the account has a bucket of this name. Raises ClientError with status 403 if it is another account's."""
     try:
         account.client("s3").head_bucket(Bucket=name, ExpectedBucketOwner=account.id)
     except ClientError as error:
@@ -284,12 +286,12 @@ def bucket_exists(account: Account, name: str) -> bool:
 
 
 def cluster_exists(account: Account, name: str) -> bool:
-    """Whether the ECS cluster is there (a deleted one stays visible for a while, as INACTIVE)."""
+    """Whether the ECS cluster exists. A deleted one stays visible for a while, as INACTIVE."""
     found = account.client("ecs").describe_clusters(clusters=[name])["clusters"]
     return any(cluster.get("status") != "INACTIVE" for cluster in found)
 
 
-_TAGGED = {  # what the tagging API finds that no listing above looks for: services in ARNs
+_TAGGED = {  # services, as in ARNs, whose resources no listing above finds; the tagging API does
     "elasticfilesystem",
     "secretsmanager",
     "ssm",
@@ -297,7 +299,7 @@ _TAGGED = {  # what the tagging API finds that no listing above looks for: servi
 
 
 def tagged(account: Account, stack: str) -> list[ListedResource]:
-    """Further resources with the stack's tag. The tagging API lags, so it is asked only for what is not listed."""
+    """Resources with the stack's tag that no listing finds. The tagging API is late, so it is asked for no others."""
     client = account.client("resourcegroupstaggingapi")
     found = []
     try:
@@ -306,6 +308,6 @@ def tagged(account: Account, stack: str) -> list[ListedResource]:
                 arn = one["ResourceARN"]
                 if arn.split(":")[2] in _TAGGED:
                     found.append(ListedResource("tagged", arn))
-    except ClientError:  # not allowed, or not here: the listings stand
+    except ClientError:  # these credentials may not ask, or the region has no such API
         return []
     return found

@@ -1,4 +1,4 @@
-"""How AWS lists all that an installation has, what it costs a month unused, and how it is removed by hand."""
+"""A table of resource types: how AWS lists them, what one costs a month unused, and how to remove one by hand."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from deploy.cost.prices import Prices
 
 
 class Listing(NamedTuple):
-    """How all resources of a kind are listed, what one costs a month, and how one is removed by hand."""
+    """A kind of resource: how AWS lists all of them, what one costs a month, and how to remove one by hand."""
 
     kind: str
     service: str
     operation: str
-    path: str  # where the answer has them, and what of each is its id
-    remove: str  # the AWS command line's operation and option
-    cost: str = "nothing"  # a month, unused
+    path: str  # the key of the list in the answer, and of the id in each item
+    remove: str  # the AWS CLI's command and option that remove one
+    cost: str = "nothing"  # of one unused resource, a month
 
     def removal(self, name: str, region: str) -> str:
-        """The command that removes one resource."""
+        """The AWS CLI command that removes the resource of this name."""
         return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
 
 
@@ -33,7 +33,7 @@ _COSTS = {
 }
 
 # type | kind | service
-#     operation that lists them | where its answer has the ids | command that removes one
+#     operation that lists them | where its answer has the ids | AWS CLI command that removes one
 _TABLE = """
 AWS::ApiGatewayV2::Api | HTTP API | apigatewayv2
     get_apis | Items.ApiId | delete-api --api-id

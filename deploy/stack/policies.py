@@ -1,7 +1,7 @@
-"""The managed policy of an installation, and the roles: what IAM wants taken away before it deletes them.
+"""Removes what keeps IAM from deleting an installation's managed policy and its roles.
 
 IAM deletes no managed policy that is attached to a user, group or role, or that has other versions than its default
-(API reference, DeletePolicy; DeleteConflict otherwise), and no role that has policies (DeleteRole).
+(API reference, DeletePolicy; DeleteConflict otherwise). It deletes no role that has policies (DeleteRole).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MISSING = "NoSuchEntity"
 
 
 class PolicyAttachments(NamedTuple):
-    """A managed policy and the users, groups and roles that have it."""
+    """A managed policy, and the users, groups and roles to which it is attached."""
 
     name: str
     users: tuple[str, ...] = ()
@@ -31,13 +31,13 @@ class PolicyAttachments(NamedTuple):
 
     @property
     def whom(self) -> str:
-        """The users, groups and roles in words: `the user ada, the group lab`."""
+        """The users, groups and roles, in words: `the user ada, the group lab`."""
         named = (("user", self.users), ("group", self.groups), ("role", self.roles))
         return ", ".join(f"the {kind} {name}" for kind, names in named for name in names)
 
 
 def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
-    """Who has the policy, for permissions or (`PermissionsBoundary`) as a boundary; nobody if the policy is gone."""
+    """To whom the policy is attached; with `usage` PermissionsBoundary, whose boundary it is. Empty if it is gone."""
     found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
     try:
@@ -69,7 +69,7 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
 
 
 def detach(account: Account, arn: str) -> PolicyAttachments:
-    """Detach the policy, delete its other versions, return who had it. Raises as `must_be_no_boundary`."""
+    """Detach the policy and delete its other versions; return from whom. Raises `Problem` if it is a boundary."""
     must_be_no_boundary(account, arn)
     found = attached(account, arn)
     iam = account.client("iam")
@@ -85,7 +85,7 @@ def detach(account: Account, arn: str) -> PolicyAttachments:
 
 
 def free_role(account: Account, name: str) -> None:
-    """Remove from a role of ours the policies that others have attached to it."""
+    """Detach all managed policies of a role, and delete its inline policies, such as those that others have added."""
     iam = account.client("iam")
     try:
         given = [
@@ -118,7 +118,7 @@ def _other_versions(iam: Any, arn: str) -> Iterator[str]:
 
 
 def _quietly(call: Any, **arguments: Any) -> None:
-    """Call; what is gone already is fine."""
+    """Make the call; ignore that the entity is gone already."""
     try:
         call(**arguments)
     except ClientError as error:

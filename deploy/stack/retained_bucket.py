@@ -1,4 +1,4 @@
-"""A bucket that outlived its installation: `destroy` keeps participants' data, and no stack leads to them any more."""
+"""Opens a data bucket that `destroy` has kept: participants' data stay in it, and no stack names it any more."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from hippodrome.aws import errors
 from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST
 
-_NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # what S3 takes, and no ARN: that would hide whose it is
+_NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # no ARN: that would hide the owner
 _WHICH = "`python -m deploy destroy --dry-run` names those that it has kept (with --stack and --region)."
 
 
 def open_bucket(account: Account, name: str, project: str) -> Bucket:
     """The bucket, if it is the account's own and holds data of this project's participants. Raises `Problem`.
 
-    A list of projects that is gone is told and stops nothing: the answers are worth more.
+    If the list of projects is missing, this only warns: the answers can be read without it.
     """
     _must_be_ours(account, name)
     source, there = Bucket(account.client("s3"), name, account.id), projects(account, name)
@@ -48,12 +48,12 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
 
 
 def projects(account: Account, name: str) -> list[str]:
-    """The projects whose participants have left something in this bucket, registered or not."""
+    """The projects, registered or not, that have documents of participants in this bucket."""
     return [project for project in _folders(account, name) if _holds(account, name, keys.prefix(project))]
 
 
 def older_versions(account: Account, name: str) -> bool:
-    """Whether S3 has versions, current or not, of anything that participants of any project have left."""
+    """Whether the bucket has a version, current or not, of a document of any project's participants."""
     bucket = VersionedBucket(account, name)
     projects = filter(ids.is_project_id, bucket.folders())
     return any(not one.marker for project in projects for one in bucket.versions(keys.prefix(project)))
@@ -75,7 +75,7 @@ def _holds(account: Account, name: str, prefix: str) -> bool:
 def _must_be_ours(account: Account, name: str) -> None:
     if not _NAME.fullmatch(name):
         raise Problem(f"{name!r} is no bucket's name.", "Give its name alone, without s3:// and without a path.")
-    owner = account.id  # first: S3's refusal would not tell that the credentials have expired
+    owner = account.id  # asked first: S3's 403 does not say whether the credentials have expired
     try:
         there = inventory.bucket_exists(account, name)
     except ClientError as error:

@@ -1,4 +1,4 @@
-"""What an administrator may decide about an installation: options of the commands, parameters of the template."""
+"""The settings of an installation: the administrator's options, which become parameters of the template."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from deploy.aws.account import Account
 from deploy.aws.hosted_zone import clean_domain, find_zone, read_zone
 
 SITE_LENGTH = 64
-"""Characters that the site's name may have: ACM's limit for the first name of a certificate (RequestCertificate)."""
+"""Characters that the site's name may have. ACM's limit for a certificate's first name (RequestCertificate)."""
 
-_PARAMETERS = {  # the template's parameter for each setting that goes there as it is
+_PARAMETERS = {  # setting → the template's parameter that gets its value unchanged
     "site": "SiteHost",
     "email": "AlarmEmail",
     "max_runtime": "MaxRuntime",
@@ -41,7 +41,7 @@ def option(parameter: str) -> str:
 
 @dataclass(frozen=True)
 class StackSettings:
-    """The administrator's options. None: the stack's present value, or else the template's default."""
+    """The administrator's options. None: the stack keeps its value; a new stack gets the template's default."""
 
     domain: Annotated[
         str | None,
@@ -92,9 +92,9 @@ class StackSettings:
         code_bucket: str,
         subnets: Sequence[str] = (),
     ) -> dict[str, str]:
-        """The template's parameters: the option, else the stack's present value, else the default. Raises `Problem`.
+        """The template's parameters: the option, else the stack's present value, else the default.
 
-        `subnets` are those of the installation that stands.
+        `subnets` are the present installation's. Raises `Problem` if a value is missing, or values do not fit together.
         """
         found = {name: value for name, value in defaults.items() if value is not None}
         found |= {name: value for name, value in previous.items() if name in defaults}
@@ -115,7 +115,7 @@ class StackSettings:
                 "--vpc and --subnets go together.", "Give both, or both as '' for a VPC of the installation's."
             )
         found |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
-        limit = concurrency.unreserved(account) if concurrency.PARAMETER in defaults else None
+        limit = concurrency.unreserved_or_none(account) if concurrency.PARAMETER in defaults else None
         if limit is not None:
             found |= concurrency.parameters(limit)
         _check_site(f"{found.get('SiteHost', '')}.{found['RootDomain']}")
@@ -155,14 +155,14 @@ def _check_site(site: str) -> None:
 def _zones(
     account: Account, found: Mapping[str, str], previous: Mapping[str, str], subnets: Sequence[str]
 ) -> dict[str, str]:
-    """The zones of the installation's own network; without one, those that were, for the day it has one again."""
+    """The parameters for zones. With a VPC of the administrator's they are kept, unused, for a later VPC of its own."""
     if found.get("VpcId"):
         return {name: previous.get(name, "") for name in availability_zones.PARAMETERS}
     return availability_zones.choose(account, previous, () if previous.get("VpcId") else subnets)
 
 
 def taking_settings(command: Callable[..., int]) -> Callable[..., int]:
-    """Turn a function that takes `settings` into a command of typer's with an option for each setting."""
+    """Turn a function with the parameter `settings` into a typer command with an option for each setting."""
     hints = get_type_hints(StackSettings, include_extras=True)
     options = [
         inspect.Parameter(

@@ -1,4 +1,4 @@
-"""A stack at CloudFormation: its state, what is going on in it, and why something failed."""
+"""A stack at CloudFormation: its state, its operations and their progress, and why an operation failed."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from deploy.stack import states
 from deploy.stack.states import StackAction
 from hippodrome.aws import errors
 
-FIRST_PAUSE = 0.3  # seconds between two looks, growing
-PAUSE = 3.0
-LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates in a few minutes where the domain is delegated
+FIRST_PAUSE = 0.3  # seconds between the first two looks
+PAUSE = 3.0  # seconds between two looks, later
+LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates a delegated domain in a few minutes
 
 GOOD = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "DELETE_COMPLETE", "IMPORT_COMPLETE"}
 _BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
-_OURSELVES = "AWS::CloudFormation::Stack"
+_STACK_TYPE = "AWS::CloudFormation::Stack"
 _BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
 _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
 _ROLE_IS_NEW = (
     r"Unable to assume the service linked role|cannot be assumed by Lambda|"
     r"CodeBuild is not authorized to perform: sts:AssumeRole|execution role does not have permissions to call"
 )
-"""What is said where IAM does not know a role or its policy everywhere yet: by CreateCluster (1Password/scim-examples,
-issue 356), CreateFunction (pulumi/pulumi-aws-native 148), CodeBuild's CreateProject (terraform-provider-aws 4233), and
-CreateEventSourceMapping (milliHQ/terraform-aws-next-js 138)."""
+"""The messages of services while IAM does not know a new role or its policy everywhere: of CreateCluster
+(1Password/scim-examples, issue 356), CreateFunction (pulumi/pulumi-aws-native 148), CodeBuild's CreateProject
+(terraform-provider-aws 4233), and CreateEventSourceMapping (milliHQ/terraform-aws-next-js 138)."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class FailedResource:
 
 
 class NotDeleted(Problem):
-    """A stack that could not be deleted; `failures` are the resources that are in the way."""
+    """A stack could not be deleted; `failures` are the resources that could not."""
 
     def __init__(self, problem: Problem, failures: Sequence[FailedResource]) -> None:
         super().__init__(str(problem), problem.advice, problem.details, problem.exit_code)
@@ -57,7 +57,7 @@ class NotDeleted(Problem):
 
 @dataclass
 class Operation:
-    """One operation on a stack: states of resources by logical id, and failures in the order in which they came."""
+    """An operation on a stack: the states of resources by logical id, and the failures in the order of time."""
 
     states: dict[str, str] = field(default_factory=dict)
     failures: list[FailedResource] = field(default_factory=list)
@@ -72,7 +72,7 @@ class Operation:
 
 
 class Stack:
-    """One stack by name. Methods that wait show progress on stderr."""
+    """The stack of one name. Methods that wait show progress on stderr."""
 
     def __init__(self, account: Account, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
         self.name = name
@@ -94,7 +94,7 @@ class Stack:
         return str(found["StackStatus"]) if found else ""
 
     def template(self) -> str:
-        """The text of the stack's template; "" if it was JSON, which ours is not."""
+        """The text of the stack's template; "" if it is JSON, so not Hippodrome's."""
         found = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
         return found if isinstance(found, str) else ""
 
@@ -104,7 +104,7 @@ class Stack:
         return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
 
     def ids_of(self, kind: str) -> list[str]:
-        """The physical ids of the stack's resources of a type that exist; none if there is no stack."""
+        """The physical ids of the stack's existing resources of a type; empty if there is no stack."""
         try:
             return ids_of(self.resources(), kind)
         except ClientError as error:
@@ -113,16 +113,17 @@ class Stack:
             raise
 
     def last_event(self, stack_id: str) -> str:
-        """The id of the stack's newest event, by which later ones are recognised; "" if there is none."""
+        """The id of the stack's newest event, by which `follow` recognises later ones; "" if there is none."""
         events = self._client.describe_stack_events(StackName=stack_id)["StackEvents"]
         return str(events[0]["EventId"]) if events else ""
 
     # -- waiting ------------------------------------------------------------------------------------------------------
 
     def follow(self, title: str, stack_id: str, total: int = 0, after: str | None = None) -> str:
-        """Show the present operation until it ends; return the state then. `after`: the last event before it.
+        """Show the present operation until it ends; return the stack's state then.
 
-        Raises `Problem` on Ctrl-C: CloudFormation goes on without us, and the same command attaches again.
+        `after` is the last event before the operation. Raises `Problem` on Ctrl-C: CloudFormation goes on, and the same
+        command follows the operation again.
         """
         try:
             with _bar() as bar:
@@ -135,7 +136,7 @@ class Stack:
             ) from None
 
     def _follow(self, bar: Progress, task: Any, stack_id: str, after: str | None) -> str:
-        pause, began, shown, waited = FIRST_PAUSE, time.monotonic(), 0, False
+        pause, began, failed, waited = FIRST_PAUSE, time.monotonic(), False, False
         while True:
             status = str((describe_stack(self._account, stack_id) or {"StackStatus": "DELETE_COMPLETE"})["StackStatus"])
             operation = self.operation(stack_id)
@@ -144,10 +145,10 @@ class Stack:
             if operation.failures:  # CloudFormation rolls back: how much there is to do is not known
                 bar.update(task, total=None)
             bar.update(task, completed=operation.done, now=now)
-            for failure in operation.failures[shown : shown + 1] if shown == 0 else ():
-                screen.warning(f"{failure.logical_id} failed: {failure.reason}")
-                shown = 1
-            if not waited and time.monotonic() - began > LONG_FOR_A_CERTIFICATE and _certificate(operation):
+            if operation.failures and not failed:
+                failed = True
+                screen.warning(f"{operation.failures[0].logical_id} failed: {operation.failures[0].reason}")
+            if not waited and time.monotonic() - began > LONG_FOR_A_CERTIFICATE and _makes_certificate(operation):
                 waited = True
                 screen.warning(
                     "The certificate is waiting for DNS: it comes only if the domain is delegated to the zone."
@@ -174,7 +175,7 @@ class Stack:
         return found
 
     def _events(self, stack_id: str) -> Iterator[Mapping[str, Any]]:
-        """Newest first, back to where the latest operation began."""
+        """The events of the latest operation, newest first."""
         try:
             for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
                 for event in page["StackEvents"]:
@@ -186,11 +187,11 @@ class Stack:
                 raise
 
     def _is_own(self, event: Mapping[str, Any]) -> bool:
-        """Whether the event is about the stack itself."""
-        return bool(event["ResourceType"] == _OURSELVES and event["LogicalResourceId"] == self.name)
+        """Whether the event is about the stack itself, not about a resource."""
+        return bool(event["ResourceType"] == _STACK_TYPE and event["LogicalResourceId"] == self.name)
 
     def _started(self, stack_id: str, after: str) -> bool:
-        """Whether something has begun since that event."""
+        """Whether an operation has begun since the event `after`."""
         for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
             for event in page["StackEvents"]:
                 if event["EventId"] == after:
@@ -199,19 +200,19 @@ class Stack:
                     return True
         return True
 
-    # -- changes that need no change set ------------------------------------------------------------------------------
+    # -- operations without a change set ------------------------------------------------------------------------------
 
     def attach(self) -> None:
-        """If something is going on in the stack, show it until it ends."""
+        """If an operation on the stack is under way, show it until it ends."""
         found = self.describe()
         if found and states.action_for(str(found["StackStatus"])) is StackAction.WAIT:
             screen.info(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
             self.follow("Waiting for CloudFormation", found["StackId"])
 
     def settle(self) -> None:
-        """Wait for the present operation, and lead the stack out of states in which it takes no change.
+        """Wait for the present operation, and roll back a failed update, so that the stack can be changed.
 
-        Raises `Problem` if that is a matter for people.
+        Raises `Problem` if only the administrator can decide what to do.
         """
         self.attach()
         found = self.describe()
@@ -223,7 +224,7 @@ class Stack:
             self._take_back(found, act)
 
     def _take_back(self, found: Mapping[str, Any], act: StackAction) -> None:
-        """An update that failed, or whose rollback failed: back to where the stack stood before."""
+        """Roll back an update that failed, or go on with a rollback that failed."""
         if act is StackAction.ROLL_BACK:
             screen.info(
                 f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
@@ -239,9 +240,9 @@ class Stack:
             raise self.problem("The update could not be taken back", found["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
-        """Delete the stack and wait. Raises `NotDeleted`, and `Problem` if it is protected.
+        """Delete the stack and wait. Raises `NotDeleted` if that fails, `Problem` if the stack is protected.
 
-        `without`: resources that a deletion has failed at and that the next leaves out, by their names in the template.
+        `without`: logical ids of resources that could not be deleted before, and are now left in AWS.
         """
         found = self.describe()
         if not found:
@@ -250,18 +251,18 @@ class Stack:
         stack_id, total = found["StackId"], len(self.resources())
         after = self.last_event(stack_id)
         try:
-            if without and found["StackStatus"] == "DELETE_FAILED":  # in no other state may it be said
+            if without and found["StackStatus"] == "DELETE_FAILED":  # RetainResources is allowed in no other state
                 self._client.delete_stack(StackName=self.name, RetainResources=[*without])
             else:
                 self._client.delete_stack(StackName=self.name)
         except ClientError as error:
             if not _BUSY.search(errors.message(error)):
                 raise
-            self.attach()  # something has begun in between; then it can be deleted
+            self.attach()  # another operation began in between; after it, the stack can be deleted
             after = self.last_event(stack_id)
             self._client.delete_stack(StackName=self.name)
         status = self.follow(title, stack_id, total, after)
-        if status not in {"DELETE_COMPLETE", ""}:
+        if status != "DELETE_COMPLETE":
             problem = self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
             raise NotDeleted(problem, self.operation(stack_id).failures)
 
@@ -275,7 +276,7 @@ class Stack:
             )
 
     def problem(self, what: str, stack_id: str, status: str) -> Problem:
-        """Why the latest operation failed: the first failure, then other independent ones, as much as fits a screen."""
+        """The problem of the latest operation: its first three failures with reasons, and the names of the others."""
         failures = self.operation(stack_id).failures
         details: list[str] = []
         for failure in failures[:3]:
@@ -290,7 +291,7 @@ class Stack:
 
 
 def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
-    """The physical ids of those of these resources that have this type and exist."""
+    """The physical ids of the resources that have this type and exist."""
     gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
     return [
         str(one["PhysicalResourceId"])
@@ -299,13 +300,11 @@ def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
     ]
 
 
-def _certificate(operation: Operation) -> bool:
-    return operation.states.get("Certificate", "").endswith("_IN_PROGRESS") or any(
-        "ertificate" in name for name in operation.under_way
-    )
+def _makes_certificate(operation: Operation) -> bool:
+    return any("ertificate" in name for name in operation.under_way)
 
 
-_ADVICE = (  # what is known to go wrong, and what helps
+_ADVICE = (  # a pattern for the reason of a failure, and the advice; the first that fits counts
     (r"needs a subscription|not subscribed|not signed up|OptInRequired|SubscriptionRequired", " ".join(NOT_ACTIVE)),
     (r"maximum number of VPCs|VpcLimitExceeded", "Use a VPC that is there: --vpc vpc-… --subnets subnet-…,subnet-…"),
     (
@@ -345,12 +344,12 @@ _ADVICE = (  # what is known to go wrong, and what helps
 
 
 def role_is_new(problem: Problem) -> bool:
-    """Whether something in a stack failed since a role, or the policy of one, was made a moment ago."""
+    """Whether a resource failed because a role or its policy is so new that AWS does not know it everywhere."""
     return any(re.search(_ROLE_IS_NEW, line, re.IGNORECASE) for line in problem.details)
 
 
 def advice(failures: Sequence[FailedResource], details: Sequence[str] = ()) -> str:
-    """The advice for the first failure."""
+    """The advice for the first failure, or for the `details` if no resource failed."""
     reason = failures[0].reason if failures else " ".join(details)
     for pattern, text in _ADVICE:
         if re.search(pattern, reason, re.IGNORECASE):

@@ -1,8 +1,8 @@
 """The states of a CloudFormation stack, and what `apply` does about each of them.
 
-The names are those of CloudFormation's API (Stack, StackStatus). What leads where: its user guide, "Stack status
-codes", "Continue rolling back an update", "Choose how to handle failures when provisioning resources"; and the API's
-RollbackStack, which leads out of CREATE_FAILED and UPDATE_FAILED.
+The names are those of CloudFormation's API (Stack, StackStatus). Sources for the ways out of a state: its user guide,
+"Stack status codes", "Continue rolling back an update", "Choose how to handle failures when provisioning resources";
+its API Reference, RollbackStack (the way out of CREATE_FAILED and UPDATE_FAILED).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from console.problem import Problem
 
 
 class StackAction(Enum):
-    """The first thing that `apply` does."""
+    """What `apply` does first about a stack."""
 
-    CREATE = "make it"  # there is nothing, or an empty shell
+    CREATE = "make it"  # there is no stack, or one without resources
     UPDATE = "bring it up to date"
     WAIT = "wait for what is going on"
-    RECREATE = "delete what is left of it, and make it anew"  # it never came to life
+    RECREATE = "delete what is left of it, and make it anew"  # it was never complete
     ROLL_BACK = "take the failed update back"  # RollbackStack
     CONTINUE = "go on taking the failed update back"  # ContinueUpdateRollback
     STOP = "leave it to the administrator"
@@ -62,13 +62,13 @@ def action_for(status: str) -> StackAction:
     return ACTIONS.get(status, StackAction.STOP) if status else StackAction.CREATE
 
 
-def broken(status: str) -> bool:
-    """Whether the stack was never complete, so that it can only be deleted."""
+def never_complete(status: str) -> bool:
+    """Whether a stack in this state was never complete, so that it can only be deleted."""
     return action_for(status) is StackAction.RECREATE
 
 
 def problem(stack: str, status: str) -> Problem:
-    """The problem of a stack that `apply` leaves to the administrator."""
+    """The problem of a stack in a state that `apply` leaves to the administrator."""
     because = _BECAUSE.get(status, "is in a state that this version does not know")
     return Problem(
         f"The stack {stack} {because} ({status}).",

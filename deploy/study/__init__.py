@@ -1,1 +1,1 @@
-"""A study on AWS: its image, task definition, pages, registration and links."""
+"""Puts a study on AWS: its image, task definition, pages, registration and links."""

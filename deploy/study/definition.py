@@ -1,4 +1,4 @@
-"""A project's task definition in ECS: what its servers run, how large they are, what they may do."""
+"""A project's task definition in ECS: the image of its servers, their size, and their rights."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model.project import LEGACY_PORT
 from protocol import environment
 
-STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, the longest on Fargate: time to store the last recording
-SCRATCH = "/scratch"  # the one place where a trial may write (infra/Dockerfile)
+STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, for a server's last recording; Fargate allows no more
+SCRATCH = "/scratch"  # the only folder into which a trial may write (infra/Dockerfile)
 USER = "10001:10001"
-
-
-PRIVILEGED = 1024  # ports below need a privilege
+PRIVILEGED = 1024  # only a privileged user may listen on lower ports
 
 
 def port(installation: Installation) -> int:
-    """The port on which servers of a study that is registered now must listen."""
-    return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no choice
+    """The port on which the servers of a study listen that is registered now."""
+    return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no such output
 
 
 def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
@@ -33,13 +31,13 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
 
     The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
     the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
-    who is not root can write there. Nothing secret stands in it: what a server is told comes with RunTask. There is no
-    task role: what runs in the container has no rights on AWS (hippodrome/servers/signing.py).
+    who is not root can write there. The definition holds no secret: RunTask gives a server its own values. There is no
+    task role, so the code in the container has no rights on AWS (hippodrome/servers/signing.py).
 
     A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
     namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
-    SystemControl, read November 2026), and people's servers on Fargate use this one (statista-oss/routing-proxy). File
-    capabilities would be void: the capability set below is empty.
+    SystemControl, read November 2026), and others use this one there (statista-oss/routing-proxy). File capabilities
+    would have no effect, since all capabilities are dropped.
     """
     listens = port(installation)
     container = {
@@ -80,22 +78,20 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
 
 
 def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
-    """The ARN of the newest revision, if it has this content; else None."""
+    """The ARN of the family's newest revision if it is active and has this content; else None."""
     try:
         found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
     except ClientError as error:
         if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
-    lives = found.get("status", "ACTIVE") == "ACTIVE" and not found.get(
-        "taskRoleArn"
-    )  # those of earlier versions had one
-    same = lives and _says(found, wanted)
-    return str(found["taskDefinitionArn"]) if same else None
+    if found.get("status", "ACTIVE") != "ACTIVE" or found.get("taskRoleArn"):  # earlier versions had a task role
+        return None
+    return str(found["taskDefinitionArn"]) if _contains(found, wanted) else None
 
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
-    """Make a new revision; return its ARN."""
+    """Register a new revision; return its ARN."""
     tags = {TAG: installation.stack, "hippodrome:project": project_id}
     answer = account.client("ecs").register_task_definition(
         **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
@@ -103,14 +99,14 @@ def register(account: Account, installation: Installation, project_id: str, want
     return str(answer["taskDefinition"]["taskDefinitionArn"])
 
 
-def _says(found: Any, wanted: Any) -> bool:
-    """Whether everything that is wanted is there; ECS adds what we left out (an empty environment, host ports)."""
+def _contains(found: Any, wanted: Any) -> bool:
+    """Whether `found` has all values of `wanted`. ECS adds values that were left out, such as host ports."""
     if isinstance(wanted, Mapping):
-        return isinstance(found, Mapping) and all(_says(found.get(key), value) for key, value in wanted.items())
+        return isinstance(found, Mapping) and all(_contains(found.get(key), value) for key, value in wanted.items())
     if isinstance(wanted, Sequence) and not isinstance(wanted, str):
         return (
             isinstance(found, Sequence)
             and len(found) == len(wanted)
-            and all(_says(one, other) for one, other in zip(found, wanted, strict=True))
+            and all(_contains(one, other) for one, other in zip(found, wanted, strict=True))
         )
     return bool(found == wanted)

@@ -1,4 +1,4 @@
-"""`deploy links`: a signed link for each participant (`signedLinks: true`)."""
+"""`deploy links`: prints a signed link for each participant (`signedLinks: true`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def command(
         Path | None, typer.Argument(help="A file with an id on each line; - reads them from stdin.", show_default=False)
     ] = None,
     *,
-    new: Annotated[int, typer.Option("--new", min=0, max=100_000, help="Make so many new ids.")] = 0,
+    new: Annotated[int, typer.Option("--new", min=0, max=100_000, help="Make this many new ids.")] = 0,
     project: options.ProjectId = None,
     as_json: options.Json = False,
     stack: options.Stack = STACK,
@@ -59,7 +59,7 @@ def command(
 
 
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
-    """The signatures of these ids, in their order, from the function that has the secret."""
+    """Id → signature, in the order of `users`, from the function that has the secret. Raises `Problem`."""
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
         chunk = list(users[start : start + MAX_SIGNED])
@@ -72,7 +72,7 @@ def signed(account: Account, installation: Installation, project_id: str, users:
 
 
 def link(site: str, project: Project, user_id: str, signature: str) -> str:
-    """The address with which this participant takes part."""
+    """The signed address with which this participant begins."""
     return f"{site.rstrip('/')}/next?{urlencode({'projectId': project.id, 'userId': user_id, 'signature': signature})}"
 
 

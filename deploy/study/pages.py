@@ -1,4 +1,4 @@
-"""A project's step pages, and the pictures beside them, from its folder into the data bucket: only what changed."""
+"""Copies a project's step pages, and the files beside them, from its folder into the data bucket, if they changed."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from hippodrome.aws.documents import S3Documents
 from hippodrome.config import layout
 from hippodrome.ports import Conflict
 
-LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` hands it out, and a function's answer is at most 6 MB in base64
+LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` sends it, and the answer of a function has 6 MB at most, in base64
 
 
 @dataclass(frozen=True)
 class Changes:
-    """The differences between folder and bucket. `put`: key → file. `gone`: keys without a file."""
+    """The differences between folder and bucket. `put`: key → file to upload. `gone`: keys without a file."""
 
     put: Mapping[str, Path]
     gone: Sequence[str]
@@ -32,7 +32,7 @@ class Changes:
 
 
 def compare(account: Account, bucket: str, project_id: str, folder: Path, more: Iterable[Path] = ()) -> Changes:
-    """Compare folder and bucket; nothing is changed. `more` are pages from elsewhere. Raises `Problem`."""
+    """Compare folder and bucket; change nothing. `more` are pages outside of the folder. Raises `Problem`."""
     prefix = f"{project_id}/steps/"
     files = {prefix + file.name: file for file in [*_files(folder), *more]}
     there = _listing(account, bucket, prefix)
@@ -41,7 +41,7 @@ def compare(account: Account, bucket: str, project_id: str, folder: Path, more: 
 
 
 def upload(account: Account, bucket: str, changes: Changes) -> None:
-    """Write the pages that are new or different. After an interruption, the next `compare` finds the rest."""
+    """Upload the pages that are new or different. After an interruption, the next `compare` finds the rest."""
     documents = _documents(account, bucket)
     with screen.progress() as progress:
         for key, file in progress.track(changes.put.items(), description="Uploading pages"):
@@ -56,7 +56,7 @@ def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """What lies in the folder of pages, hidden files aside. Raises `Problem`."""
+    """The files in the folder of pages, without hidden ones. Raises `Problem` for a link out of it or a large file."""
     steps = layout.pages_folder(folder)
     files = sorted(file for file in steps.iterdir() if not file.name.startswith(".")) if steps else []
     found = []
@@ -84,10 +84,10 @@ def _listing(account: Account, bucket: str, prefix: str) -> dict[str, Mapping[st
 
 
 def _same(account: Account, bucket: str, key: str, file: Path, there: Mapping[str, Any] | None) -> bool:
-    """Whether the object says what the file says.
+    """Whether the object `there`, from a listing, has the file's content.
 
-    The ETag of an object that was put as a whole is its MD5, unless it is encrypted with a KMS key (S3 API Reference,
-    Object); only when it is something else must the object be read.
+    The ETag of an object from one PUT is its MD5, unless it is encrypted with a KMS key (S3 API Reference, Object). The
+    object is read only if its ETag is another value.
     """
     if there is None:
         return False
@@ -105,7 +105,7 @@ def _documents(account: Account, bucket: str) -> S3Documents:
 
 
 def _put(documents: S3Documents, key: str, body: bytes) -> None:
-    """Write over whatever is there: of two researchers who upload the same page, the later one wins."""
+    """Write the page, whatever is there: of two researchers who upload the same page, the later one wins."""
     while True:
         found = documents.get(key)
         try:

@@ -1,8 +1,8 @@
-"""`register`: put a study on AWS, or a new version of it, and get the link for participants.
+"""`register`: puts a study on AWS, or a new version of it, and prints the link for participants.
 
-What participants can see comes last. First come image and task definition, which may take minutes or fail; then the
-pages, which participants of an open study see at once. Then the project is registered, and pages that are gone are
-removed. If it is interrupted, the next run finds what is done and goes on.
+Image and task definition come first, since they may take minutes or fail. Then come the pages, which participants of an
+open study see at once, then the registration. At last pages that the folder no longer has are removed. After an
+interruption, the next run finds what is done and continues.
 """
 
 from __future__ import annotations
@@ -46,30 +46,30 @@ Base = Annotated[
 
 @dataclass(frozen=True)
 class RegisterRequest:
-    """How to register. `live` None: as config.yml says. `again`: build a new image even if there is one."""
+    """How to register. `live`: instead of config.yml's value, unless None. `again`: build an image even if one exists."""
 
     live: bool | None = None
     again: bool = False
-    on_aws: bool = False
+    on_aws: bool = False  # build the image by CodeBuild even if Docker is here
     yes: bool = False
-    base: str = ""  # what the image is built on, instead of the Dockerfile's own
-    strict: bool = False  # remarks are mistakes
+    base: str = ""  # the base image, instead of the Dockerfile's own
+    strict: bool = False  # stop if there is a remark
 
 
 @dataclass(frozen=True)
 class RegisterPlan:
-    """What registering would do. Nothing is changed yet."""
+    """What `register` would do: the folder compared with AWS."""
 
     study: project_folder.ProjectFolder
-    before: Project | None
+    before: Project | None  # the project as it is registered now
     pages: pages.Changes
     image: image.ImagePlan | None
-    definition: str | None  # the existing revision that fits, if there is one
+    definition: str | None  # the ARN of the newest revision if it has the right content
     port: int = LEGACY_PORT
 
     @property
     def steps(self) -> list[str]:
-        """What there is to do, in one line each; empty if nothing is."""
+        """What `register` would do, a line for each step; empty if nothing has changed."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
             found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
@@ -82,7 +82,7 @@ class RegisterPlan:
         return found + [f"remove {key}" for key in self.pages.gone]
 
     def task(self, revision: str | None) -> dict[str, Any]:
-        """What a project registers of its task definition: the revision, and the port on which its servers listen."""
+        """The keys of a registration for this revision: the revision, and the port on which its servers listen."""
         return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
 
 
@@ -118,7 +118,7 @@ def command(
     """
     _check_qr(qr)
     if live is not False:
-        found = project_folder.read(folder)  # mistakes are told before credentials are asked for
+        found = project_folder.read(folder)  # shows mistakes before credentials are needed
         if qr and found.config.project.signed_links:
             raise Problem(*NO_QR)
     account = open_account(profile, region)
@@ -139,7 +139,7 @@ def command(
 
 
 def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> RegisterPlan:
-    """Compare the folder with AWS. Raises `Problem` if the project cannot be registered here."""
+    """Compare the folder with AWS; change nothing. Raises `Problem` if the project cannot be registered here."""
     found = project_folder.read(folder, installation)
     if request.live is not None:
         found.registration["live"] = request.live
@@ -154,16 +154,16 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
-    """Register the study; return what was done. Raises `Problem`, or KeyboardInterrupt between two steps."""
+    """Register the study; return what was done, as JSON data. Raises `Problem`."""
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)
     found, bucket = doing.study, installation["Bucket"]
     screen.success(f"{found.id}: {found.config.summary()}")
-    said = _remarks(folder, found)
-    if said and request.strict:
-        raise Problem("There are remarks on the project, and --strict was given.", "Nothing was done.", said)
-    for remark in said:
+    remarks_found = _remarks(folder, found)
+    if remarks_found and request.strict:
+        raise Problem("There are remarks on the project, and --strict was given.", "Nothing was done.", remarks_found)
+    for remark in remarks_found:
         screen.warning(remark)
     _confirm(account, installation, doing, request)
     made, revision = None, None
@@ -198,14 +198,14 @@ def register(account: Account, installation: Installation, folder: Path, request
 
 
 def _remarks(folder: Path, found: project_folder.ProjectFolder) -> list[str]:
-    """What to say of a project without mistakes."""
-    lacking = [
+    """Remarks on a project without mistakes: on its files and on the installation, with a game also on its packages."""
+    of_packages = [
         *agent_imports.requirement_remarks(folder),
         *agent_imports.missing(folder),
         *agent_imports.of_players(folder, found.config),
     ]
-    lacking = lacking if found.plays else []
-    return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *lacking]]
+    of_packages = of_packages if found.plays else []
+    return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *of_packages]]
 
 
 def link(installation: Installation, project_id: str) -> str:
@@ -226,28 +226,28 @@ def _registered(
 
 
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
-    """Whether the registration says anything that is not registered yet."""
+    """Whether the registration differs from the registered project."""
     after = from_data(parse_registration(dict(registration)), Project)
     ours = {"version": before.version, "salt": before.salt, "secret": before.secret}
     return bool(msgspec.structs.replace(after, **ours) != before)
 
 
 def _close(account: Account, installation: Installation, folder: Path) -> None:
-    """Close an open study at once, without using the folder, which may have mistakes."""
+    """Close an open study at once. Of the folder, which may have mistakes, only the id is used."""
     project_id = project_folder.id_in(folder)
     before = _registered(account, installation, project_id, []) if project_id else None
     if before is None or not before.live:
         return
     try:
-        invoke(account, installation, project_folder.reopened(before, live=False))
-    except Problem as problem:  # what was registered once may not be acceptable any more
+        invoke(account, installation, project_folder.registration_of(before, live=False))
+    except Problem as problem:  # a newer installation may refuse an old registration
         screen.warning(f"The study could not be closed at once ({problem}); it will be when it is registered anew.")
     else:
         screen.success("The study is closed: no participant can begin or go on")
 
 
 def _confirm(account: Account, installation: Installation, doing: RegisterPlan, request: RegisterRequest) -> None:
-    """Ask if the id belongs to a study of another name that has participants; a copied folder has the same id.
+    """Ask if the id belongs to a study with another name and participants, since a copied folder has the same id.
 
     Ask as well if the steps of an open study with participants change: the steps tell where each participant is.
     """
@@ -277,18 +277,18 @@ def _confirm(account: Account, installation: Installation, doing: RegisterPlan, 
 
 
 def invoke(account: Account, installation: Installation, registration: Mapping[str, Any]) -> None:
-    """Let the installation register the project. Raises `Problem` with its objections."""
+    """Register the project by the installation's function. Raises `Problem` with the mistakes that it finds."""
     answer = register_function.ask(account, installation, {"project": registration})
     if "registered" not in answer:
-        said = [str(problem) for problem in answer.get("problems") or []]
-        raise Problem("The installation did not take the project.", _what_to_do(said), said)
+        problems = [str(problem) for problem in answer.get("problems") or []]
+        raise Problem("The installation did not take the project.", _advice(problems), problems)
 
 
-def _what_to_do(said: Sequence[str]) -> str:
-    """What the researcher does about these problems. This machine has checked the same keys, and knew all of them."""
-    if not said:
+def _advice(problems: Sequence[str]) -> str:
+    """What to do about these problems. If a key is unknown to the function, it is older than this version."""
+    if not problems:
         return "Bring it up to date with `python -m deploy apply`."
-    if any("unknown key" in problem for problem in said):
+    if any("unknown key" in problem for problem in problems):
         return (
             "The installation is older than this study: bring it up to date with `make deploy` "
             "(or `python -m deploy apply`), or ask your administrator to. Then run this again."
@@ -297,7 +297,7 @@ def _what_to_do(said: Sequence[str]) -> str:
 
 
 def _tell_warm(registration: Mapping[str, Any]) -> None:
-    """Warn what warm servers cost from now on, even without participants."""
+    """Warn how much warm servers cost from now on, even without participants."""
     number, setup = registration["warmServers"], registration["awsSetup"]
     if not number or not registration["live"]:
         return
@@ -332,7 +332,7 @@ def _tell(result: Mapping[str, Any]) -> None:
 
 
 def _tell_signed(project_id: str) -> None:
-    """Print how to make signed links: one address for all participants would open for none."""
+    """Print how to make signed links. An address without a signature is refused."""
     command = f"python -m deploy links --project {project_id}"
     screen.result("Links are signed: each participant needs one of their own.")
     screen.result(f"For new participants:  {command} --new 50")

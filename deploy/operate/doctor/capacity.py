@@ -50,8 +50,7 @@ def fargate(context: CheckContext) -> Iterator[Finding]:
 
 def functions(context: CheckContext) -> Iterator[Finding]:
     """Concurrent executions of Lambda, which the whole account shares."""
-    limit = context.account.client("lambda").get_account_settings()["AccountLimit"]
-    free = int(limit.get("UnreservedConcurrentExecutions", limit["ConcurrentExecutions"]))
+    free = concurrency.unreserved(context.account)
     workers = concurrency.workers(free)
     waiting = context.at_once * context.players
     mean = (IN_LOBBY if context.players > 1 else REQUESTS) * waiting

@@ -1,4 +1,4 @@
-"""A project's image: what its servers run. It is built only if no image with the very same content is there."""
+"""A project's image, which its servers run. It is built only if the repository has none with the same content."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from deploy.study.image.codebuild import Builder
 from deploy.study.image.ecr import ImageRepository, content_tag
 from deploy.study.image.order import Order
 
-__all__ = ["Image", "Plan", "build", "plan"]
+__all__ = ["Image", "ImagePlan", "build", "plan"]
 
 
 @dataclass(frozen=True)
 class ImagePlan:
-    """What a project's image must hold, and the image's `uri` (by its digest) if there is one already."""
+    """The content of a project's image, and the `uri` (with digest) of the image with this content, if there is one."""
 
-    content: str  # the tag that says what is in it
+    content: str  # the tag that tells the content
     bundle: Bundle
     uri: str | None
     order: Order
@@ -31,7 +31,7 @@ class ImagePlan:
 
 @dataclass(frozen=True)
 class Image:
-    """An image in the repository, by its digest. `built`: it was built just now."""
+    """An image in the repository. `uri` has its digest. `built`: it was built just now."""
 
     uri: str
     content: str
@@ -48,10 +48,9 @@ def plan(
     base: str = "",
     trial: Mapping[str, Any] | None = None,
 ) -> ImagePlan:
-    """Look at the project's files and at the repository; nothing is changed. `again`: build in any case. `trial`: the
-    section of config.yml, with which the agent is tried.
+    """Compare the project's files with the repository; change nothing. Raises `Problem`.
 
-    Raises `Problem`.
+    `again`: build an image in any case, without layers of earlier ones. `base` and `trial` are as in `make_bundle`.
     """
     bundle = make_bundle(folder, base, trial)
     repository = ImageRepository(account, installation["Repository"])
@@ -63,9 +62,9 @@ def plan(
 
 
 def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
-    """Return the image of the plan, and build it if there is none. Raises `Problem`.
+    """Return the image of the plan; build it first if there is none. Raises `Problem`.
 
-    Built by the Docker of this machine, or by CodeBuild where there is none or `on_aws`.
+    This machine's Docker builds it. If no Docker answers, or with `on_aws`, CodeBuild does.
     """
     if wanted.uri:
         return Image(wanted.uri, wanted.content, built=False)
@@ -80,7 +79,7 @@ def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False
     except Problem:
         if order.arrived() is None:
             raise
-        screen.warning("Another build has made the same image meanwhile.")  # a tag is given only once
+        screen.warning("Another build has made the same image meanwhile.")  # so the repository refused the tag
     uri = order.arrived()
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")

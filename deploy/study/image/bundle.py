@@ -1,4 +1,4 @@
-"""The build context of a project's image: which bytes go in, what hash they have, and the context as folder or zip."""
+"""The build context of a project's image: its files, their hash, and the context as a folder or a zip."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from deploy.study.image.files import project_files
 from hippodrome.config import agent_imports, layout
 from hippodrome.config.layout import REQUIREMENTS
 
-HERE = Path(__file__).resolve().parents[3]
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest a zip can say: the same files make the same bytes
+ROOT = Path(__file__).resolve().parents[3]
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time in a zip, for all files: the same files make the same bytes
 _CHUNK = 1024 * 1024
 
 _ELSEWHERE = re.compile(
@@ -32,7 +32,7 @@ _COMMENT = re.compile(r"(^|\s+)#.*$")
 
 @dataclass(frozen=True)
 class Bundle:
-    """The files of an image's build context: by name there, a file or bytes."""
+    """The files of an image's build context: name in the context → a file of this machine, or bytes."""
 
     entries: Mapping[str, Path | bytes]
 
@@ -62,11 +62,10 @@ class Bundle:
             else:
                 shutil.copyfile(entry, path)
             path.chmod(_mode(entry))
-        for empty in ("project",):  # the Dockerfile copies it, also where a project brings no files of its own
-            (folder / empty).mkdir(exist_ok=True)
+        (folder / "project").mkdir(exist_ok=True)  # the Dockerfile copies it, even if the project has no files
 
     def write_zip(self, file: Path) -> None:
-        """Write the context as a zip; the same content is the same bytes."""
+        """Write the context as a zip. The same content makes the same bytes."""
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(_info("project/", stat.S_IFDIR | 0o755), b"")
             for name, entry in sorted(self.entries.items()):
@@ -78,36 +77,37 @@ class Bundle:
 def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = None) -> Bundle:
     """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image.
 
-    `base` is the image to build on instead of the Dockerfile's own. `trial` is the section of config.yml: its game and
-    options are what the agent is tried with while the image is built (trial/check.py). Where it says who plays whom, or
-    that objects are drawn, that and the names of the actions count too, and nothing else.
+    `base` is the base image, instead of the Dockerfile's own. `trial` is that section of config.yml. While the image is
+    built, the agent is tried with its keys `game`, `options` and `scene`; if it has `players`, also with that and
+    `actionSpace` (trial/check.py). Its other keys do not change the image.
     """
     entries: dict[str, Path | bytes] = {
         "Dockerfile": _dockerfile(base),
-        "check.json": _tried_with(trial or {}),
-        "requirements/trial.txt": HERE / "requirements/trial.txt",
+        "check.json": _check_json(trial or {}),
+        "requirements/trial.txt": ROOT / "requirements/trial.txt",
         "requirements/project.txt": _requirements(folder),
     }
     for ours in ("protocol", "trial"):
-        entries |= {path.relative_to(HERE).as_posix(): path for path in sorted((HERE / ours).rglob("*.py"))}
+        entries |= {path.relative_to(ROOT).as_posix(): path for path in sorted((ROOT / ours).rglob("*.py"))}
     entries |= {f"project/{name}": path for name, path in project_files(folder).items()}
     return Bundle(entries)
 
 
 def _dockerfile(base: str) -> bytes:
-    text = (HERE / "infra/Dockerfile").read_text(encoding="utf-8")
+    text = (ROOT / "infra/Dockerfile").read_text(encoding="utf-8")
     if base and not _IMAGE.fullmatch(base):
         raise Problem(f"{base!r} is no name of an image.", "Write it as docker pull takes it: place/name:tag.")
     return re.sub(r"(?m)^ARG BASE=.*$", f"ARG BASE={base}", text).encode() if base else text.encode()
 
 
-def _tried_with(trial: Mapping[str, Any]) -> bytes:
+def _check_json(trial: Mapping[str, Any]) -> bytes:
+    """The keys of `trial` with which trial/check.py tries the agent."""
     keys = ("game", "options", "scene", *(("players", "actionSpace") if trial.get("players") else ()))
     return json.dumps({key: trial[key] for key in keys if trial.get(key)}, sort_keys=True).encode()
 
 
 def _requirements(folder: Path) -> bytes:
-    """The project's requirements.txt, or nothing. Only what it says itself is there when it is installed."""
+    """The project's requirements.txt; b"" if there is none. Raises `Problem` for a line that cannot be installed."""
     file = layout.requirements_file(folder)
     if file is None:
         return b""
@@ -136,13 +136,13 @@ def _requirements(folder: Path) -> bytes:
 
 
 def _mode(entry: Path | bytes) -> int:
-    """Readable for all users, because the trial's user does not own the files."""
+    """A file's mode in the image: readable for all users, because the trial's user does not own the files."""
     return 0o755 if isinstance(entry, Path) and entry.stat().st_mode & stat.S_IXUSR else 0o644
 
 
 def _info(name: str, mode: int) -> zipfile.ZipInfo:
     info = zipfile.ZipInfo(name, _EPOCH)
-    info.create_system = 3  # Unix, on every system, so that the mode counts
+    info.create_system = 3  # Unix, on every system, so that the mode is used
     info.external_attr = mode << 16
     info.compress_type = zipfile.ZIP_DEFLATED
     return info

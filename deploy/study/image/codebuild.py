@@ -1,6 +1,6 @@
-"""Images by AWS CodeBuild, from a source bundle in the data bucket, with its log followed live.
+"""Builds images with AWS CodeBuild, from a source bundle in the data bucket, and shows the log while it builds.
 
-The build goes on at AWS whether it is followed or not; a second run with the same content joins it.
+The build goes on at AWS if the command ends; a second run with the same content follows it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from botocore.exceptions import ClientError
 from console import formatting, screen
 from console.problem import Problem
 from deploy.aws.account import Account
-from deploy.study.image.bundle import HERE
+from deploy.study.image.bundle import ROOT
 from deploy.study.image.follow import BuildLog
 from deploy.study.image.order import Order
 from hippodrome.aws import errors
@@ -40,14 +40,14 @@ def source_key(content: str) -> str:
 
 @dataclass(frozen=True)
 class Builder:
-    """A CodeBuild project, and the bucket from which it fetches source bundles."""
+    """Builds by a CodeBuild project, which fetches source bundles from `bucket`."""
 
     account: Account
     project: str
     bucket: str
 
     def build(self, order: Order) -> None:
-        """Build and push the image, or follow a build of it that runs already. Raises `Problem` if it fails."""
+        """Build and push the image, or follow a running build of it. Raises `Problem` if the build fails."""
         running = self._running(order)
         if running:
             screen.info("A build of the same content is running already; joining it.")
@@ -63,19 +63,20 @@ class Builder:
             raise
 
     def _running(self, order: Order) -> str | None:
-        """The id of a running build of that image."""
+        """The id of a running build of this image; None if there is none."""
         client = self.account.client("codebuild")
-        listed = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING")
-        newest = listed.get("ids", [])[:100]
+        found = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING")
+        newest = found.get("ids", [])[:100]
         builds = client.batch_get_builds(ids=newest)["builds"] if newest else []
         for build in builds:
-            told = {one["name"]: one["value"] for one in build.get("environment", {}).get("environmentVariables", [])}
-            if build["buildStatus"] == "IN_PROGRESS" and told.get("IMAGE") == order.image:
+            listed = build.get("environment", {}).get("environmentVariables", [])
+            variables = {one["name"]: one["value"] for one in listed}
+            if build["buildStatus"] == "IN_PROGRESS" and variables.get("IMAGE") == order.image:
                 return str(build["id"])
         return None
 
     def _upload(self, order: Order) -> None:
-        """Put the bundle where CodeBuild fetches it, unless it is there: the key says what is in it."""
+        """Upload the bundle, unless the bucket has it. Its key tells its content."""
         s3, key = self.account.client("s3"), source_key(order.content)
         try:
             s3.head_object(Bucket=self.bucket, Key=key)
@@ -91,17 +92,17 @@ class Builder:
                 s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 
     def _start(self, order: Order) -> str:
-        told = {"IMAGE": order.image, "REGISTRY": order.repository.registry}
+        variables = {"IMAGE": order.image, "REGISTRY": order.repository.registry}
         if order.cache_from:  # a variable without a value may be refused
-            told["CACHE_FROM"] = order.cache_from
+            variables["CACHE_FROM"] = order.cache_from
         try:
             started = self.account.client("codebuild").start_build(
                 projectName=self.project,
                 sourceTypeOverride="S3",
                 sourceLocationOverride=f"{self.bucket}/{source_key(order.content)}",
-                buildspecOverride=(HERE / "infra/buildspec.yml").read_text(encoding="utf-8"),
+                buildspecOverride=(ROOT / "infra/buildspec.yml").read_text(encoding="utf-8"),
                 environmentVariablesOverride=[
-                    {"name": name, "value": value, "type": "PLAINTEXT"} for name, value in told.items()
+                    {"name": name, "value": value, "type": "PLAINTEXT"} for name, value in variables.items()
                 ],
             )
         except ClientError as error:
@@ -137,15 +138,15 @@ def _follow(account: Account, build_id: str) -> None:
 
 
 def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log: BuildLog) -> str | None:
-    """Show what is new in the build's log; where to go on."""
-    place = build.get("logs", {})
-    if not place.get("groupName") or not place.get("streamName"):
+    """Show the new lines of the build's log; return the token from which the next call goes on."""
+    logs = build.get("logs", {})
+    if not logs.get("groupName") or not logs.get("streamName"):
         return token
     while True:
         more = {"nextToken": token} if token else {"startFromHead": True}
         try:
             page = account.client("logs").get_log_events(
-                logGroupName=place["groupName"], logStreamName=place["streamName"], **more
+                logGroupName=logs["groupName"], logStreamName=logs["streamName"], **more
             )
         except ClientError as error:
             if errors.code(error) == "ResourceNotFoundException":  # nothing has been written yet
@@ -160,7 +161,7 @@ def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log
 
 def _failure(build: Mapping[str, Any], log: BuildLog) -> Problem:
     status = build["buildStatus"]
-    said = [
+    messages = [
         f"{phase['phaseType']}: {context['message']}"
         for phase in build.get("phases", [])
         for context in phase.get("contexts", [])
@@ -169,5 +170,5 @@ def _failure(build: Mapping[str, Any], log: BuildLog) -> Problem:
     if status == "STOPPED":
         return Problem("The build was stopped.", "Run the same command to build again.")
     if status == "TIMED_OUT":
-        return log.failure("The build took too long and was ended.", said)
-    return log.failure("The image could not be built.", said)
+        return log.failure("The build took too long and was ended.", messages)
+    return log.failure("The image could not be built.", messages)

@@ -1,4 +1,4 @@
-"""Images by the Docker engine of this machine, with buildx."""
+"""Builds images with the Docker engine of this machine, by buildx."""
 
 # ruff: noqa: S603 - docker is found on PATH on purpose, and its arguments are a list that no shell reads
 
@@ -15,25 +15,25 @@ from deploy.study.image.ecr import ImageRepository
 from deploy.study.image.follow import BuildLog
 from deploy.study.image.order import Order
 
-PATIENCE = 15  # seconds for an answer of the engine
+PATIENCE = 15  # seconds to wait for an answer of the engine
 
 
 def available() -> bool:
     """Whether a Docker engine answers and buildx is installed. The command `docker` alone is not enough."""
     if shutil.which("docker") is None:
         return False
-    for question in (["docker", "version", "--format", "{{.Server.Version}}"], ["docker", "buildx", "version"]):
+    for command in (["docker", "version", "--format", "{{.Server.Version}}"], ["docker", "buildx", "version"]):
         try:
-            asked = subprocess.run(question, capture_output=True, timeout=PATIENCE, check=False)
+            answer = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=False)
         except (OSError, subprocess.TimeoutExpired):
             return False
-        if asked.returncode:
+        if answer.returncode:
             return False
     return True
 
 
 def build(order: Order) -> None:
-    """Build and push. Raises `Problem` with the log's last lines. Docker keeps finished layers for the next run."""
+    """Build the image and push it. Raises `Problem` with the log's last lines. Docker keeps finished layers."""
     _login(order.repository)
     command = ["docker", "buildx", "build", "--platform", "linux/amd64", "--provenance=false", "--progress", "plain"]
     command += ["--build-arg", "BUILDKIT_INLINE_CACHE=1"]

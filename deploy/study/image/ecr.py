@@ -1,11 +1,10 @@
-"""The repository of images, in ECR.
+"""The ECR repository of the projects' images.
 
-An image is there when its tag is: a push uploads the layers first and the manifest, which carries the tag, last (ECR
-API Reference, PutImage). So a push that was cut off leaves nothing that could be taken for an image.
+If the repository has an image's tag, it has the whole image: a push uploads the layers first and the manifest, which
+carries the tag, last (ECR API Reference, PutImage). A push that was interrupted leaves no tag.
 
-Tags say what is in an image: `{project}-{content}`. They are never moved to another image (the repository is
-immutable), so one that was built anew from the same content gets `{project}-{content}.2` and so on, and the newest
-counts.
+A tag tells an image's content: `{project}-{content}`. The repository is immutable, so a tag never moves to another
+image. A second image with the same content gets the tag `{project}-{content}.2`, and so on; the newest one is used.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from hippodrome.aws import errors
 
 
 class Tagged(NamedTuple):
-    """An image in the repository. The order of these is that in which they were pushed."""
+    """An image in the repository with one of its tags. Sorted, they are in the order in which they were pushed."""
 
     pushed: datetime
-    number: int  # of images with this content, this was the n-th
+    number: int  # 1 for the first image with this content, 2 for the second, and so on
     content: str  # the tag without the number
     tag: str
     digest: str
@@ -51,7 +50,7 @@ class ImageRepository:
         return self.uri.partition("/")[2]
 
     def images(self) -> Images:
-        """The present images: a DescribeImages for each 1,000. Raises `Problem` if the repository is gone."""
+        """The images that have a tag; one DescribeImages for each 1,000. Raises `Problem` if the repository is gone."""
         found: list[Tagged] = []
         pages = self._client.get_paginator("describe_images").paginate(
             repositoryName=self.name, filter={"tagStatus": "TAGGED"}, PaginationConfig={"PageSize": 1000}
@@ -60,8 +59,8 @@ class ImageRepository:
             for image in (image for page in pages for image in page["imageDetails"]):
                 for tag in image.get("imageTags", []):
                     content, _, number = tag.partition(".")
-                    times = int(number) if number.isdecimal() else 1
-                    found.append(Tagged(image["imagePushedAt"], times, content, tag, image["imageDigest"]))
+                    nth = int(number) if number.isdecimal() else 1
+                    found.append(Tagged(image["imagePushedAt"], nth, content, tag, image["imageDigest"]))
         except ClientError as error:
             if errors.code(error) != "RepositoryNotFoundException":
                 raise
@@ -71,9 +70,9 @@ class ImageRepository:
         return Images(self.uri, sorted(found))
 
     def password(self) -> str:
-        """The password of the user AWS for `docker login`; valid for twelve hours."""
-        given = self._client.get_authorization_token()["authorizationData"][0]["authorizationToken"]
-        return base64.b64decode(given).decode().partition(":")[2]
+        """The password for `docker login` as the user `AWS`. It is valid for twelve hours."""
+        token = self._client.get_authorization_token()["authorizationData"][0]["authorizationToken"]
+        return base64.b64decode(token).decode().partition(":")[2]
 
     @cached_property
     def _client(self) -> Any:
@@ -102,12 +101,12 @@ class Images:
         return f"{content}.{most + 1}" if most else content
 
     def alike(self, project_id: str) -> str:
-        """The image (uri:tag) with which a new one of this project probably shares most layers; "" if there is none."""
+        """The image (uri:tag) that probably shares most layers with a new one of this project; "" if there is none."""
         own = re.compile(re.escape(content_tag(project_id, "")) + r"[0-9a-f]{12}")
         best = max(self.found, key=lambda image: (own.fullmatch(image.content) is not None, image), default=None)
         return f"{self.uri}:{best.tag}" if best else ""
 
 
 def content_tag(project_id: str, content: str) -> str:
-    """The tag of a project's image with this content. A tag cannot begin with a dash, as a project's id may."""
+    """The tag of a project's image with this content. A project's id may begin with a dash, but a tag must not."""
     return f"{'x' if project_id.startswith('-') else ''}{project_id}-{content}"

@@ -1,8 +1,8 @@
-"""Which files of a project folder go into its image.
+"""Chooses the files of a project folder that go into its image.
 
-Left out are what `config.yml` and the pages become elsewhere, people's data, whatever is hidden, caches and virtual
-environments, and what a `.dockerignore` in the folder names (Docker's own rules: patterns are anchored at the folder,
-`**` is any number of folders, `!` takes back, and the last line that matches decides).
+Left out are config.yml and the pages, participants' data, hidden files, caches, virtual environments, and the files
+that a `.dockerignore` in the folder names. Its rules are Docker's: patterns are relative to the folder, `**` is any
+number of folders, `!` includes again, and the last line that matches decides.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from console.problem import Problem
 from hippodrome.config import layout
 from hippodrome.config.layout import REQUIREMENTS
 
-LIMIT_BYTES = 1024**3  # of a project's own files: each server pulls them before its participant can play
+LIMIT_BYTES = 1024**3  # of a project's own files, which each server pulls before its participant can play
 LIMIT_FILES = 20_000
 
-# At the top of the folder only. config.yml is told to the server when it starts (TRIAL), pages lie in the bucket, and
-# `data` is where `make run` keeps participants' data, and `data-try` where `make try` keeps those of its bots.
+# Left out at the top of the folder only. A server gets config.yml when it starts (TRIAL), and the bucket has the pages.
+# `make run` keeps participants' data in `data`, and `make try` those of its bots in `data-try`.
 _TOP = {*layout.CONFIGS, *layout.PAGES, "data", "data-try", REQUIREMENTS}
 _ANYWHERE = {"__pycache__", "node_modules"}
-# Of a clone of HIPPO Gym, what lies beside agent.py: its recordings, and the certificate that updateProject.py fetches.
-# They lie there still if agent.py has moved up.
+# Left out of the folder App of a clone of HIPPO Gym: its recordings, and the certificate that updateProject.py fetches.
+# They may still be there if agent.py was moved to the folder above.
 _OF_HIPPO = {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.pem"}
 
 
 def project_files(folder: Path) -> dict[str, Path]:
-    """The files for the image: path below the folder of agent.py, with slashes → file. Raises `Problem`.
+    """The files for the image: path below the folder of agent.py (with slashes) → file. Raises `Problem`.
 
-    They are the files of the project folder; in a clone of HIPPO Gym those in its folder App, as in HIPPO's own images.
+    They are those of the project folder; of a clone of HIPPO Gym those in its folder App, as in HIPPO's own images.
     """
     folder = folder.resolve()
     code = layout.agent_folder(folder)
@@ -53,7 +53,7 @@ def project_files(folder: Path) -> dict[str, Path]:
 
 
 def inside(folder: Path, path: Path) -> bool:
-    """Whether the path leads into the folder, also through links."""
+    """Whether the path leads to a file or folder inside `folder`, links included."""
     real = _without_links(path)
     return real is not None and real.is_relative_to(folder.resolve())
 
@@ -84,7 +84,7 @@ class Ignore:
             raise Problem(".dockerignore cannot be read.", "Save it as UTF-8 text, or remove it.") from None
 
     def __call__(self, name: str) -> bool:
-        """Whether the file or folder of that name (with slashes) is ignored, itself or with a folder above it."""
+        """Whether the file or folder of this name (with slashes) is ignored, itself or by a folder above it."""
         ignored = False
         for keep, pattern in self._rules:
             if pattern.match(name):
@@ -93,7 +93,7 @@ class Ignore:
 
 
 def _expression(parts: Sequence[str]) -> str:
-    """A pattern as a regular expression that matches a path or the beginning of one that ends before a slash."""
+    """The regular expression of a pattern. It matches a path, or the beginning of a path before a slash."""
     text = ""
     for index, part in enumerate(parts):
         last = index == len(parts) - 1
@@ -105,7 +105,7 @@ def _expression(parts: Sequence[str]) -> str:
 
 
 def _segment(part: str) -> str:
-    """One name with `*`, `?` and `[…]`, none of which matches a slash."""
+    """The regular expression of a part of a pattern. Its `*`, `?` and `[…]` match no slash."""
     text, index = "", 0
     while index < len(part):
         char = part[index]
@@ -134,7 +134,7 @@ def _walk(root: Path, folder: Path, ignored: Ignore) -> Iterator[Path]:
         raise Problem(f"The folder {folder} cannot be read: {error.strerror}.") from None
     for path in entries:
         name = path.relative_to(root).as_posix()
-        if _ours(root, path) or (ignored(name) and not (path.is_dir() and ignored.may_take_back)):
+        if _never_included(root, path) or (ignored(name) and not (path.is_dir() and ignored.may_take_back)):
             continue
         if path.is_dir() and not path.is_symlink():
             if not (path / "pyvenv.cfg").is_file():
@@ -143,8 +143,8 @@ def _walk(root: Path, folder: Path, ignored: Ignore) -> Iterator[Path]:
             yield path
 
 
-def _ours(root: Path, path: Path) -> bool:
-    """Whether it never belongs into an image."""
+def _never_included(root: Path, path: Path) -> bool:
+    """Whether a file or folder is left out, whatever .dockerignore says."""
     return (
         path.name.startswith(".")
         or path.name in _ANYWHERE
@@ -155,7 +155,7 @@ def _ours(root: Path, path: Path) -> bool:
 
 
 def _left_in_app(root: Path, path: Path) -> bool:
-    """Whether a file or folder of App/ is left out; App/ itself is the top where agent.py lies in it."""
+    """Whether a file or folder in App/ is left out. If agent.py is in App/, App/ counts as the top of the folder."""
     return path.name in _OF_HIPPO or (path.name in _TOP and path.parent == layout.agent_folder(root))
 
 
@@ -164,9 +164,9 @@ def _apps(root: Path) -> list[Path]:
 
 
 def _without_links(path: Path) -> Path | None:
-    """The path as it is without links; None if one of them leads to itself, or cannot be followed."""
+    """The path with all links resolved; None if a link leads to itself, or cannot be followed."""
     try:
-        return Path(os.path.realpath(path, strict=True))  # Path.resolve takes a circle for a path from Python 3.13 on
+        return Path(os.path.realpath(path, strict=True))  # not Path.resolve: from Python 3.13 on it accepts circles
     except FileNotFoundError:
         return path.resolve()
     except OSError:
@@ -174,7 +174,7 @@ def _without_links(path: Path) -> Path | None:
 
 
 def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
-    """The file behind the path, which may be a link. Raises `Problem` where a link leads to what must not be there."""
+    """The file to which the path leads. Raises `Problem` for a link to something that must not be in the image."""
     real = _without_links(path)
     if real is None:
         raise Problem(f"{name} is a link that leads to itself.", "Remove it.")
@@ -185,7 +185,7 @@ def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
                 "Put the file itself there, or name the link in .dockerignore.",
             )
         steps = [*real.relative_to(root).parents, real.relative_to(root)]
-        if any(_ours(root, root / step) or ignored(step.as_posix()) for step in steps if step.parts):
+        if any(_never_included(root, root / step) or ignored(step.as_posix()) for step in steps if step.parts):
             raise Problem(f"{name} is a link to something that is left out of the image.", "Put the file itself there.")
         if real.is_dir():
             raise Problem(f"{name} is a link to a folder.", "Put the folder itself there, or name it in .dockerignore.")

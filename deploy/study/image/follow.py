@@ -1,4 +1,4 @@
-"""What a build says: shown as it comes, and if it fails, what to do about it."""
+"""Shows a build's log line by line, and finds advice in it if the build fails."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from console.problem import Problem
 from hippodrome.config import agent_imports
 from trial import check
 
-SHOWN = 12  # lines of a failed build's log; all of it was shown as it came
+SHOWN = 12  # lines of a failed build's log in the problem; all lines were shown before
 
-_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # what could play with a terminal
+_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # what controls a terminal
 _ADVICE: tuple[tuple[str, str], ...] = (
     (
         r"No matching distribution found for (?P<what>\S+)",
@@ -49,7 +49,7 @@ _ADVICE: tuple[tuple[str, str], ...] = (
 
 
 class BuildLog:
-    """The lines of a build. They are shown, and the last ones kept."""
+    """The log of a build. `show` gets each line; the last lines are kept."""
 
     def __init__(self, show: Callable[[str], None] | None = None) -> None:
         self._show = show or (lambda line: screen.info(f"  {line}", style="dim"))
@@ -63,17 +63,17 @@ class BuildLog:
                 self._show(line)
 
     def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
-        """The problem to raise, with the lines on errors (or else the last ones), and what to do."""
+        """The problem to raise, with advice. Its details: the log's lines on errors, else its last lines; then `more`."""
         more, lines = list(more), list(self._last)
-        lacking = _lacking("\n".join(lines))
-        if lacking:
-            return Problem(f"{what.rstrip('.')}: {lacking[0]}", lacking[1])
-        telling = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
-        return Problem(what, advice("\n".join([*lines, *more])), [*(telling or lines)[-SHOWN:], *more])
+        missing = _missing("\n".join(lines))
+        if missing:
+            return Problem(f"{what.rstrip('.')}: {missing[0]}", missing[1])
+        of_errors = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
+        return Problem(what, advice("\n".join([*lines, *more])), [*(of_errors or lines)[-SHOWN:], *more])
 
 
 def advice(log: str) -> str:
-    """What to do about a failed build with this log."""
+    """The advice for a failed build with this log."""
     for pattern, text in _ADVICE:
         found = re.search(pattern, log)
         if found:
@@ -81,8 +81,8 @@ def advice(log: str) -> str:
     return "Mend what the log says and run the same command again: what is done stays done."
 
 
-def _lacking(log: str) -> tuple[str, str] | None:
-    """What trying the agent has missed in the image (trial/check.py), and what to do about it."""
+def _missing(log: str) -> tuple[str, str] | None:
+    """What the agent needs and the image does not have (a line of trial/check.py), and what to do about it."""
     found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
     if found is None:
         return None

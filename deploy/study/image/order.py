@@ -1,4 +1,4 @@
-"""What a builder is asked to build."""
+"""The input of a builder."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Order:
     """Build this bundle and push it to the repository under this tag."""
 
     repository: ImageRepository
-    content: str  # the tag that says what is in it, the same for the same bundle
+    content: str  # the tag that tells the content, the same for the same bundle
     tag: str
     bundle: Bundle
-    fresh: bool = False  # use no layers of earlier images, so that the base and its updates come anew
+    fresh: bool = False  # use no layers of earlier images, so that the newest base is pulled
     cache_from: str = ""  # an earlier image (uri:tag) whose layers may be used
 
     @property
@@ -25,5 +25,5 @@ class Order:
         return f"{self.repository.uri}:{self.tag}"
 
     def arrived(self) -> str | None:
-        """The image as uri@digest, if it is in the repository already; else None."""
+        """The image as uri@digest, if the repository has it; else None."""
         return self.repository.images().tagged(self.tag)

@@ -36,7 +36,7 @@ def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.Monkey
     for part in ("infra/Dockerfile", "requirements/trial.txt", "protocol/trial.py", "trial/server/server.py"):
         (here / part).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / part, here / part)
-    monkeypatch.setattr(bundle, "HERE", here)
+    monkeypatch.setattr(bundle, "ROOT", here)
     seen = {make_bundle(folder).hash}
     for file in (
         here / "infra/Dockerfile",

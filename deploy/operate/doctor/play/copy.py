@@ -18,7 +18,7 @@ from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.aws.versions import VersionedBucket
 from deploy.core import participants
-from deploy.core.project_folder import reopened
+from deploy.core.project_folder import registration_of
 from deploy.core.server_records import Records
 from deploy.operate.eraser import Eraser
 from deploy.study import links
@@ -65,7 +65,7 @@ class Copy:
             found = documents.get(key)
             if found is not None:
                 documents.create(f"{self.id}/{STEPS_FOLDER}/{name}", found.body)
-        invoke(self._account, self._installation, reopened(changed(of, self.id), live=True))
+        invoke(self._account, self._installation, registration_of(changed(of, self.id), live=True))
         self._made = next((one for one in participants.registered_projects(documents, []) if one.id == self.id), None)
         if self._made is None:
             raise Problem("The copy was registered, and is not in the list of projects.", "Run it again.")
