@@ -104,7 +104,7 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
     wrong = [] if found else [_NO_REGION]
     wrong += [_NO_CREDENTIALS] if credentials is None else []
     if wrong or not found:
-        raise Problem(" ".join(what for what, _ in wrong), " ".join(advice for _, advice in wrong))
+        raise Problem(" ".join(text for text, _ in wrong), " ".join(advice for _, advice in wrong))
     return Account(core, found)
 
 

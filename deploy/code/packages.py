@@ -334,11 +334,11 @@ class WheelCache:
                 pip.terminate()
                 raise
         if pip.returncode:
-            said = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR:")] or lines[-3:]
+            error_lines = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR:")] or lines[-3:]
             raise Problem(
                 f"The packages for {self.target} could not be downloaded.",
                 "Check the network and pip's configuration, and try again: what has come is kept.",
-                said[:4],
+                error_lines[:4],
             )
 
 

@@ -203,8 +203,8 @@ def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     status = stack.follow(title, stack_id, total, after)
     if status in GOOD - {"DELETE_COMPLETE"}:
         return
-    what = f"The stack {stack.name} could not be {'updated' if prepared.existing else 'made'}"
-    raise stack.problem(what, stack_id, status)
+    summary = f"The stack {stack.name} could not be {'updated' if prepared.existing else 'made'}"
+    raise stack.problem(summary, stack_id, status)
 
 
 @taking_settings

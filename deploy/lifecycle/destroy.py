@@ -34,7 +34,7 @@ def command(
     account = open_account(profile, region)
     account.id  # noqa: B018 - raises at once if AWS does not accept the credentials
     removal = Removal(account, stack)
-    screen.info(f"Looking for what there is of {stack} in {account.region} …", "dim")
+    screen.info(f"Looking for the resources of {stack} in {account.region} …", "dim")
     found = removal.look()
     if dry_run or not found:
         return _tell(account, stack, found, data, as_json)
@@ -95,10 +95,10 @@ def _as_json(found: FoundInstallation) -> dict[str, Any]:
 def _ask(stack: str, data: bool, yes: bool) -> None:
     if yes:
         return
-    what = "everything, the participants' data included" if data else "all of this"
+    extent = "everything, the participants' data included" if data else "all of this"
     if not sys.stdin.isatty():
         advice = "Add --yes (with make: ARGS=--yes) to go on without."
         raise Problem(f"There is no terminal in which to type {stack}.", advice, exit_code=Exit.DECLINED)
-    screen.err.print(Text(f"To remove {what}, type the stack's name: "), end="")
+    screen.err.print(Text(f"To remove {extent}, type the stack's name: "), end="")
     if screen.read_line() != stack:
         raise Problem("Nothing was removed.", exit_code=Exit.DECLINED)

@@ -89,9 +89,9 @@ class Change:
         if self.type not in STATEFUL or self.action not in {"replace", "may replace", "remove"}:
             return ""
         holds = STATEFUL[self.type]
-        what = {"replace": "is replaced", "may replace": "may be replaced", "remove": "is removed"}[self.action]
+        event = {"replace": "is replaced", "may replace": "may be replaced", "remove": "is removed"}[self.action]
         fate = f"the old one stays in AWS with {holds}, but is no longer used" if self.kept else f"{holds} are lost"
-        return f"{self.name} ({self.type}) {what}: {fate}."
+        return f"{self.name} ({self.type}) {event}: {fate}."
 
 
 @dataclass(frozen=True)

@@ -115,9 +115,10 @@ class Remains:
         rows = [*self._rows()]
         if rows:
             screen.table(["what", "left", "a month", ""], rows)
-        gone = {KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
-        if gone:
-            screen.result(f"{count(len(gone), 'other kind' if rows else 'kind')} of things looked at: nothing left.")
+        removed_kinds = {KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
+        if removed_kinds:
+            kinds = count(len(removed_kinds), "other kind" if rows else "kind")
+            screen.result(f"{kinds} of things looked at: nothing left.")
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         for kind in sorted({one.kind for one in self.left}):
@@ -153,8 +154,8 @@ class Remains:
         for role in self.service_roles:
             screen.info(f"The role {role} is the whole account's. If nothing else in it needs that:")
             screen.info(f"  aws iam delete-service-linked-role --role-name {role}")
-        what = " else" if self.after.data or self.records or self.server_names or self.service_roles else ""
-        screen.success(f"Nothing{what} is left of {name} in {account.region}.")
+        other = " else" if self.after.data or self.records or self.server_names or self.service_roles else ""
+        screen.success(f"Nothing{other} is left of {name} in {account.region}.")
         for bucket in self.after.data:
             _tell_kept(account, bucket, place)
         if self.after.data:

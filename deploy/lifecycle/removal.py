@@ -205,12 +205,12 @@ class Removal:
         for bucket in self._data():
             self._bucket(bucket, "data")
 
-    def _bucket(self, name: str, what: str) -> None:
-        """Delete a bucket of the account with all versions of all objects. `what` names it in messages."""
+    def _bucket(self, name: str, kind: str) -> None:
+        """Delete a bucket of the account with all versions of all objects. `kind` (code or data) is for messages."""
         if not inventory.bucket_exists(self.account, name):
             return
         with screen.progress() as bar:
-            task = bar.add_task(f"Emptying the {what} bucket", total=None)
+            task = bar.add_task(f"Emptying the {kind} bucket", total=None)
             VersionedBucket(self.account, name).empty(lambda deleted: bar.advance(task, len(deleted)))
         try:
             self.account.client("s3").delete_bucket(Bucket=name, ExpectedBucketOwner=self.account.id)
@@ -219,7 +219,7 @@ class Removal:
                 raise Problem(f"Programs still write into {name}.", "Run the same command again.") from None
             if errors.code(error) != "NoSuchBucket":
                 raise
-        screen.success(f"The {what} bucket {name} is deleted.")
+        screen.success(f"The {kind} bucket {name} is deleted.")
 
     def _remove(self, call: Callable[..., Any], **arguments: Any) -> None:
         """Make the call; ignore that the resource is gone already."""

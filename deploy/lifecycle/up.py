@@ -135,13 +135,13 @@ def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> A
     """The account, after its credentials were tried. If they fail, show the problems in `wrong` first, then raise."""
     try:
         account = open_account(profile, region)
-        who = account.identity["Arn"].rpartition(":")[2]
+        user = account.identity["Arn"].rpartition(":")[2]
     except Exception as error:
         if problem := explain.problem_from(error):
             show([preflight.of_problem("study", one) for one in wrong], screen.err)
             raise problem from None
         raise
-    screen.info(f"In account {account.id}, region {account.region}, as {who}.")
+    screen.info(f"In account {account.id}, region {account.region}, as {user}.")
     return account
 
 

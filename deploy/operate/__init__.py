@@ -1,1 +1,1 @@
-"""What an administrator does while studies run: status, logs, doctor, stop, erase, data."""
+"""The commands for the time while studies run: status, logs, doctor, stop, erase, data."""

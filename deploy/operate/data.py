@@ -1,6 +1,6 @@
-"""`data`: answers and recordings from an installation, or from `make run`'s folder, as tables and datasets."""
+"""`data`: converts answers and recordings, from AWS or from a data folder of `make run`, into tables and datasets."""
 
-# ruff: noqa: PLC0415 - each command's own modules are imported when it runs, so that the others start quickly
+# ruff: noqa: PLC0415 - modules that only some runs need are imported there, so that the others start quickly
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ FORMATS = ("csv", "parquet", "minari")
 def command(
     *,
     folder: Annotated[
-        Path | None, typer.Argument(help="Where to put it; else data-<project> in this folder.", show_default=False)
+        Path | None, typer.Argument(help="The folder to write into; else data-<project> here.", show_default=False)
     ] = None,
     project: Annotated[
         str | None,
         typer.Option(
             "--project",
-            help="The project's id, or its folder; else that of the config.yml in this folder.",
+            help="The project's id or its folder; if left out, the id in this folder's config.yml.",
             show_default=False,
         ),
     ] = None,
@@ -45,13 +45,13 @@ def command(
             show_default=False,
         ),
     ] = None,
-    aws: Annotated[bool, typer.Option("--aws", help="From AWS, whatever config.yml says.")] = False,
+    aws: Annotated[bool, typer.Option("--aws", help="Fetch from AWS, whatever config.yml says.")] = False,
     bucket: Annotated[
         str | None,
         typer.Option(
             "--bucket",
             metavar="NAME",
-            help="From this bucket, which `destroy` has kept: no installation is needed.",
+            help="Fetch from this bucket, which `destroy` has kept; no installation is needed.",
             show_default=False,
         ),
     ] = None,
@@ -67,7 +67,7 @@ def command(
             show_default=False,
         ),
     ] = None,
-    long: Annotated[bool, typer.Option("--long", help="Also answers-long: a row for each answered field.")] = False,
+    long: Annotated[bool, typer.Option("--long", help="Write answers-long: a row for each answered field.")] = False,
     spreadsheet: Annotated[
         bool,
         typer.Option("--spreadsheet", help="CSV for Excel and its like: answers that look like formulas stay text."),
@@ -109,7 +109,7 @@ def command(
     study = study_of(project)
     name = study.id
     local = from_ if from_ is not None or aws or bucket is not None else _local(study)
-    where = folder or folder_for(name, local)
+    target = folder or folder_for(name, local)
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
     source: Source
     if local:
@@ -118,17 +118,17 @@ def command(
         undecided = from_ is None and not aws and bucket is None
         source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
     if dry_run:
-        return _dry_run(work.look(source, name, where, wishes), where, as_json)
-    made = work.run(source, name, where, wishes)
+        return _dry_run(work.look(source, name, target, wishes), target, as_json)
+    made = work.run(source, name, target, wishes)
     if as_json:
         screen.result_json(made)
     else:
-        _tell(made, where)
+        _tell(made, target)
     return Exit.DONE
 
 
 def _packages(formats: frozenset[str]) -> None:
-    """Whether there is what writes these formats. Raises `Problem`."""
+    """Raise `Problem` if a package that writes one of these formats is not installed."""
     for name, needed in (("pyarrow", formats & {"parquet", "minari"}), ("minari", formats & {"minari"})):
         if needed and importlib.util.find_spec(name) is None:
             raise Problem(
@@ -138,7 +138,10 @@ def _packages(formats: frozenset[str]) -> None:
 
 
 def _local(study: StudySelection) -> Path | None:
-    """The data folder on this machine that is meant when no option says where the data are; which it is, is told."""
+    """The study's data folder on this machine, if no option says where the data are; None: they are on AWS.
+
+    Prints the choice if this machine has data, and how to choose AWS or the folder. Raises `Problem` as `local_data`.
+    """
     from deploy.core.study_selection import DATA, local_data
 
     found = local_data(study)
@@ -148,16 +151,16 @@ def _local(study: StudySelection) -> Path | None:
             "From AWS: --aws (with make: ARGS=--aws)"
         )
     elif study.folder is not None and (study.folder / DATA).is_dir():
-        here = study.folder / DATA
-        screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {here}")
+        local = study.folder / DATA
+        screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {local}")
     return found
 
 
 def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:
-    """The account to fetch from. Raises `Problem`.
+    """The account to fetch from. Raises `Problem` if it cannot be opened.
 
-    `undecided` is a study that may have its data on this machine as well. If no account can be opened, the sentence is
-    about this machine first: who has never used AWS looks for a folder.
+    `undecided` is a study whose data may be on this machine instead. Then the problem is first about this machine: a
+    researcher who has never used AWS looks for a folder.
     """
     from deploy.core.project_folder import uses_aws
     from deploy.core.study_selection import none_here
@@ -171,19 +174,19 @@ def _account(profile: str | None, region: str | None, undecided: StudySelection 
         raise none_here(undecided.id, undecided.folder, on_aws) from None
 
 
-def _bucket(where: account.Account, stack: str, kept: str | None, project: str) -> Source:
-    """The installation's bucket, or one that outlived its own."""
+def _bucket(aws_account: account.Account, stack: str, kept: str | None, project: str) -> Source:
+    """The installation's bucket, or the bucket `kept` that `destroy` has kept."""
     from deploy.stack.retained_bucket import open_bucket
     from export.source import Bucket
 
     if kept is not None:
-        return open_bucket(where, kept, project)
+        return open_bucket(aws_account, kept, project)
     try:
-        installation = account.find_installation(where, stack)
+        installation = account.find_installation(aws_account, stack)
     except Problem as problem:
         advice = f"{problem.advice} If it was removed, its data are in the bucket that `destroy` has named: --bucket."
         raise Problem(str(problem), advice) from None
-    return Bucket(where.client("s3"), installation["Bucket"], where.id)
+    return Bucket(aws_account.client("s3"), installation["Bucket"], aws_account.id)
 
 
 def _check(folder: Path, as_json: bool) -> int:
@@ -202,9 +205,9 @@ def _check(folder: Path, as_json: bool) -> int:
     )
 
 
-def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
+def _dry_run(tally: Tally, target: Path, as_json: bool) -> int:
     found = {
-        "folder": str(where),
+        "folder": str(target),
         "participants": tally.participants,
         "new": tally.new,
         "changed": tally.changed,
@@ -219,13 +222,13 @@ def _dry_run(tally: Tally, where: Path, as_json: bool) -> int:
         screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
         screen.result(
             f"{formatting.count(tally.participants, 'participant')}; {formatting.size(tally.bytes)} to fetch "
-            f"into {where}/"
+            f"into {target}/"
         )
     return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
 
 
 def _tell_moved(moved: list[dict[str, Any]]) -> None:
-    """Steps with answers from other pages than they have now."""
+    """Warn of steps that have answers from another page than their present one."""
     for step in moved:
         name, page = step["step"], step["page"]
         for other, count in step["others"].items():
@@ -235,7 +238,7 @@ def _tell_moved(moved: list[dict[str, Any]]) -> None:
         screen.info("  `finished` is by the steps as they are now.")
 
 
-def _tell(made: dict[str, Any], where: Path) -> None:
+def _tell(made: dict[str, Any], target: Path) -> None:
     counts, run = made["counts"], made["run"]
     if run["damaged"]:
         screen.warning(f"{run['damaged']:,} files here were damaged, and have been made anew.")
@@ -253,15 +256,16 @@ def _tell(made: dict[str, Any], where: Path) -> None:
     _tell_moved(made["moved"])
     if counts["problems"]:
         problems = formatting.count(counts["problems"], "remark")
-        screen.warning(f"{problems} on files that are not as they should be: {where / 'problems.csv'}")
-    if where.stat().st_mode & 0o077:
-        screen.warning(f"Other users of this machine can read {where}/. To change that: chmod -R go-rwx {where}")
+        screen.warning(f"{problems} on files that are not as they should be: {target / 'problems.csv'}")
+    if target.stat().st_mode & 0o077:
+        screen.warning(f"Other users of this machine can read {target}/. To change that: chmod -R go-rwx {target}")
     rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
     screen.table(["", "count"], rows, right=["count"])
     screen.success(
-        f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {where}/"
+        f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {target}/"
     )
     if made["minari"]:
-        screen.info(f"  MINARI_DATASETS_PATH={where.resolve() / 'minari'} {', '.join(d['id'] for d in made['minari'])}")
+        datasets = ", ".join(dataset["id"] for dataset in made["minari"])
+        screen.info(f"  MINARI_DATASETS_PATH={target.resolve() / 'minari'} {datasets}")
     if made["identities"] == "apart":
-        screen.info(f"  Who is who: {where / 'private/identities.csv'}. Share everything but private/.")
+        screen.info(f"  Who is who: {target / 'private/identities.csv'}. Share everything but private/.")

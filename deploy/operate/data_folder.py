@@ -1,4 +1,4 @@
-"""A data folder of this machine, as a storage of documents. A file has one version."""
+"""A data folder of this machine as a `Storage`: its files are the documents, and each has one version."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from export.fetch import remove_empty
 from protocol import disk
 
 SCRATCH = ".erase"
-"""Where files lie that are being written."""
+"""The folder for files that are being written."""
 
 
 class DataFolder:
-    """The files of a data folder. Only one process may change it."""
+    """The files of a data folder, which only one process may change."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
 
     def versions(self, prefix: str) -> Iterator[Version]:
-        """Every file whose key begins so."""
+        """Every file whose key has this prefix."""
         for top, _, names in os.walk(self.root / prefix.rpartition("/")[0]):
             for name in sorted(names):
                 key = Path(top, name).relative_to(self.root).as_posix()
@@ -37,7 +37,7 @@ class DataFolder:
             yield self._version(key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """Nothing: on one machine a file appears whole."""
+        """None: on one machine a file appears whole."""
         return iter(())
 
     def read(self, version: Version) -> bytes:
@@ -55,7 +55,7 @@ class DataFolder:
         self._put(key, file)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Write a small document if it still is `before`; return whether it was."""
+        """Write a small document if it is still `before`; return whether it was so."""
         if (self.root / key).read_bytes() != before:
             return False
         self._put(key, after)
@@ -63,13 +63,13 @@ class DataFolder:
 
     def delete(self, versions: Iterable[Version], note: Note = lambda _: None) -> int:
         """Delete these files, and folders that become empty."""
-        gone = list(versions)
-        for each in gone:
+        deleted = list(versions)
+        for each in deleted:
             path = self.root / each.key
             path.unlink(missing_ok=True)
             remove_empty(path.parent, self.root)
-        note(gone)
-        return len(gone)
+        note(deleted)
+        return len(deleted)
 
     def remove_unfinished(self) -> None:
         """Remove the files that a process was writing when it was killed."""

@@ -1,4 +1,4 @@
-"""`deploy erase`: everything about one participant is deleted, and a receipt is written that does not name them."""
+"""`deploy erase`: deletes everything about one participant, and writes a receipt that does not name them."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def command(
     project: options.ProjectId = None,
     from_: Annotated[
         Path | None,
-        typer.Option("--from", help="From this data folder of `make run`, and not from AWS.", show_default=False),
+        typer.Option("--from", help="Erase from this data folder of `make run`, not from AWS.", show_default=False),
     ] = None,
     everywhere: Annotated[
-        bool, typer.Option("--everywhere", help="In every project of the installation, not in one.")
+        bool, typer.Option("--everywhere", help="Erase in every project of the installation, not in one.")
     ] = False,
     receipt: Annotated[
         Path | None,
@@ -47,9 +47,9 @@ def command(
 ) -> int:
     """Erase everything about one participant: documents in all their versions, recordings, their server and its traces.
 
-    This cannot be undone. The receipt says what was deleted, when and by whom, and that a last listing found nothing;
-    it names the participant by a salted hash; with the id, the hash can be checked. Afterwards run `data` again in each
-    folder that holds the downloaded study: it removes the participant there.
+    This cannot be undone. The receipt says what was deleted, when and by whom, and that a last listing found nothing.
+    It names the participant by a salted hash, which anyone who knows the id can check. Afterwards run `data` again for
+    each folder with downloaded data of the study: it removes the participant there.
     """
     from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 
@@ -60,18 +60,18 @@ def command(
         return _from_folder(from_, project_id(project), user, dry_run=dry_run, yes=yes, json=json)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    where = _projects(account, installation) if everywhere else [project_id(project)]
-    erasers = [Eraser(account, installation, name, user) for name in where]
+    projects = _projects(account, installation) if everywhere else [project_id(project)]
+    erasers = [Eraser(account, installation, name, user) for name in projects]
     found = {eraser.project: eraser.look() for eraser in erasers}
     if not everywhere and not any(found.values()):
-        _must_be_known(where[0], _projects(account, installation), stack)
+        _must_be_known(projects[0], _projects(account, installation), stack)
     if not json or dry_run:
         _show(found, json, dry_run)
     if dry_run:
         return Exit.CHANGES if any(found.values()) else Exit.DONE
     if any(found.values()):
-        here = [name for name, one in found.items() if one]
-        screen.confirm(f"Erase this participant for good from {', '.join(here)}?", yes)
+        concerned = [name for name, one in found.items() if one]
+        screen.confirm(f"Erase this participant for good from {', '.join(concerned)}?", yes)
     began, whole = datetime.now(UTC), False
     target = receipt or _new_receipt(began)
     if target.exists() or not target.parent.is_dir():
@@ -96,14 +96,14 @@ def command(
 
 
 def _new_receipt(began: datetime) -> Path:
-    """A file in this folder that does not exist: a script may erase several participants in one second."""
+    """A file name that is free in this folder, since a script may erase several participants in one second."""
     name = f"erased-{began:%Y%m%dT%H%M%SZ}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
     return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
 
 
 def _must_fit(project: str | None, everywhere: bool, data: Path | None, receipt: bool) -> None:
-    """Raises `Problem` if these options do not go together."""
+    """Raise `Problem` if these options do not go together."""
     if everywhere and project is not None:
         raise Problem("--project names one project, --everywhere means all of them.", "Give one of the two.")
     if data is not None and (everywhere or receipt):
@@ -114,8 +114,8 @@ def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: boo
     from deploy.operate import folder_eraser  # noqa: PLC0415 - only here
 
     def confirm(files: int, sessions: int) -> None:
-        what = f"{count(files, 'file')}" + (f", and their part of {count(sessions, 'session')}" if sessions else "")
-        screen.confirm(f"Erase this participant for good from {data} ({what})?", yes)
+        extent = f"{count(files, 'file')}" + (f", and their part of {count(sessions, 'session')}" if sessions else "")
+        screen.confirm(f"Erase this participant for good from {data} ({extent})?", yes)
 
     done, unreadable, found = folder_eraser.erase(data, project, user, dry_run=dry_run, confirm=confirm)
     for key in unreadable:
@@ -137,14 +137,14 @@ def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: boo
 
 
 def _projects(account: Account, installation: Installation) -> list[str]:
-    """Every project, also one that is not registered any more but has left documents."""
+    """The ids of all projects that are registered or have documents in the bucket."""
     names = {project.id for project in participants.registered_projects(account.platform(installation).documents)}
     names.update(VersionedBucket(account, installation["Bucket"]).folders())
     return sorted(name for name in names if ids.is_project_id(name))
 
 
 def _must_be_known(project: str, known: list[str], stack: str) -> None:
-    """A slip of the pen must not read as an erasure. Raises `Problem`."""
+    """Raise `Problem` for an unknown project: a mistyped id must not look like an erasure."""
     if project not in known:
         raise Problem(
             f"The installation {stack} holds nothing of a project {project}.",
@@ -171,7 +171,7 @@ def _warn_of_unreadable(erasers: list[Eraser]) -> None:
 
 
 def _advance(bars: Progress, bar: TaskID, count: int) -> None:
-    """The bar goes on; what comes to light while the server is stopped (its last recording) makes it longer."""
+    """Advance the bar. If more is deleted than was found, such as the server's last recording, the total grows."""
     task = bars.tasks[0]
     bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
 
@@ -190,7 +190,7 @@ def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) ->
 
 
 def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
-    """Their session's server is stopped, too: that of others who play there."""
+    """Warn that the server of a running session will be stopped, on which other participants play, too."""
     playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
     if playing:
         screen.warning(

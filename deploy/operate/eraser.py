@@ -1,15 +1,15 @@
-"""Erases one participant from one project: first their server, then their documents, then a look that proves it.
+"""Erases one participant from one project: first their server, then their documents; a last look proves it.
 
-Who has played with others did so on their session's server. It is stopped as one of their own would be; what the others
-need to read their game stays (`session_eraser.py`).
+Several participants play on their session's server. It is stopped like a server of the participant's own; the other
+members' data stay (`session_eraser.py`).
 
-If the participant played on a warm server, its handover document names them, and its own record has their label. The
+If the participant played on a warm server, its handover document names them, and its record has their label. The
 participant's record leads to both, so it is deleted last.
 
-The documents (every version, every delete marker, every unfinished upload) are deleted only when the server's task has
-ended: a trial that is told to stop saves what it has. A server's presigned requests (`hippodrome/servers/signing.py`)
-stay valid for a moment after its end, so this waits for that moment. If the participant or their server has stored
-something meanwhile, the next look finds it and another round erases it.
+The documents (every version, delete marker and unfinished upload) are deleted only after the server's task has ended,
+since a trial that is told to stop still stores recordings. The server's presigned requests
+(`hippodrome/servers/signing.py`) stay valid for a short time after its end, so this waits until they are not. If the
+participant or the server has stored something meanwhile, the next look finds it and the next round erases it.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from protocol.keys import participant_folder
 if TYPE_CHECKING:
     from hippodrome.limits.slots import Slots
 
-ROUNDS = 6  # of erasing and looking again
-WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS takes a while
-SETTLED = timedelta(seconds=60)  # after this, ECS lists every task that was started
+ROUNDS = 6  # rounds of erasing and looking again, at most
+WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS needs some more
+SETTLED = timedelta(seconds=60)  # the age of a server from which on ECS lists its task, if there is one
 SIGNING = 30  # seconds that `sign_requests` may take from reading a server's record to signing
 
 
@@ -57,22 +57,22 @@ class FoundOfParticipant:
     documents: int = 0  # versions, delete markers and unfinished uploads
     record: Server | None = None
     resources: Resources = field(default_factory=Resources)
-    draining: list[RunningTask] = field(default_factory=list)  # tasks that were told to stop and have not ended
-    slots: int = 0  # held by the participant; `maxParticipants` counts them
-    sessions: list[FoundSession] = field(default_factory=list)  # that name the participant
-    of_sessions: list[Server] = field(default_factory=list)  # the records of their servers
+    draining: list[RunningTask] = field(default_factory=list)  # tasks that are stopping
+    slots: int = 0  # documents of slots that name the participant (`maxParticipants`)
+    sessions: list[FoundSession] = field(default_factory=list)  # the participant's sessions
+    of_sessions: list[Server] = field(default_factory=list)  # the records of these sessions' servers
 
     def __bool__(self) -> bool:
         return any(self.counts().values())
 
     @property
     def runs(self) -> bool:
-        """Whether a server, or a part of one, is left."""
+        """Whether a server runs, or resources of one are left."""
         return bool(self.resources or self.draining or any(not each.is_closed for each in self.records))
 
     @property
     def records(self) -> list[Server]:
-        """The records of the participant's own server, and of their sessions'."""
+        """The record of the participant's own server, and the records of their sessions' servers."""
         return [*([self.record] if self.record else []), *self.of_sessions]
 
     def counts(self) -> dict[str, int]:
@@ -84,7 +84,7 @@ class FoundOfParticipant:
 class Eraser:
     """Erases one participant from one project. May be interrupted anywhere and run again.
 
-    With `late=False` it does not wait for the time in which their server could still store something, as bots need not.
+    With `late=False` it does not wait until presigned requests are invalid; this is for bots, whose servers have ended.
     """
 
     def __init__(
@@ -110,16 +110,19 @@ class Eraser:
         self._folder = participant_folder(project, user)
         self._record_key = server.key(self._label)
         self._scope = Scope(labels=frozenset({self._label}))
-        self._warm_servers = frozenset[str]()  # those that were assigned to the participant
+        self._warm_servers = frozenset[str]()  # names of warm servers that were assigned to the participant
         self._sessions = SessionEraser(self._bucket, project, user)
         self._lobby = LobbyEraser(self._bucket, project, user)
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> FoundOfParticipant:
-        """Erase until a look finds nothing, in `ROUNDS` at most; return what the last one found. Raises `Problem`."""
+        """Erase until a look finds nothing, in `ROUNDS` rounds at most; return what the last look found.
+
+        Raises `Problem` if a server does not end.
+        """
         return self._executor.converge(self.look, lambda found: self.plan(found, advance), rounds=ROUNDS, pause=0)
 
     def look(self) -> FoundOfParticipant:
-        """Count everything there is of this participant; change nothing."""
+        """Find everything about this participant; change nothing."""
         record = self._record(self._record_key)
         sessions = self._sessions.sessions()
         labels = {each.id: ids.server_label(self.project, each.id) for each in sessions}
@@ -127,15 +130,15 @@ class Eraser:
         self._warm_servers = self._warm_servers.union(warm_servers_of(record))
         names = self._warm_servers.union(*map(warm_servers_of, of_sessions))
         self._scope = Scope(labels=frozenset({self._label, *labels.values()}), names=names)
-        there = leftovers(resources.list_resources(self._platform), {}, self._scope)
+        left = leftovers(resources.list_resources(self._platform), {}, self._scope)
         own_name = record.dns_record if record else None
-        if own_name and own_name not in there.dns_records and self._resolves(own_name):
-            there.dns_records.append(own_name)
+        if own_name and own_name not in left.dns_records and self._is_in_zone(own_name):
+            left.dns_records.append(own_name)
         found = FoundOfParticipant(
             documents=sum(1 for _ in itertools.chain(self._lobby.look(), *self._documents())),
             record=record,
-            resources=there,
-            draining=self._draining(there.clusters),
+            resources=left,
+            draining=self._draining(left.clusters),
             slots=len(self._slots().documents_naming(self.project, self._user)),
             sessions=sessions,
             of_sessions=of_sessions,
@@ -144,7 +147,7 @@ class Eraser:
         return found
 
     def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
-        """The steps of one round: server, documents, and last the slot, so that nobody takes it too early."""
+        """The steps of one round: server, documents, and last the slot, so that no newcomer takes it too early."""
         steps: list[PlanStep] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
@@ -162,7 +165,7 @@ class Eraser:
         return steps
 
     def unreadable(self) -> list[str]:
-        """Documents that may name this participant, but cannot be read."""
+        """The keys of documents that may name this participant, but cannot be read."""
         return [*self._slots().unreadable(self.project), *self._sessions.unreadable, *self._lobby.unreadable]
 
     # -- looking
@@ -173,7 +176,7 @@ class Eraser:
         return Slots(self._platform)
 
     def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
-        """Their tasks that run, and those that are ending."""
+        """The tasks of the participant and their sessions: those that run, and those that are stopping."""
         tasks = [task for task in self._platform.tasks.list() if self._scope.erases(task.name)]
         return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
 
@@ -185,11 +188,11 @@ class Eraser:
         document = self._platform.documents.get(key)
         try:
             return from_json(document.body, Server) if document else None
-        except (ValueError, RecursionError):  # it will be deleted as any document
+        except (ValueError, RecursionError):  # it is deleted like any other document
             return None
 
-    def _resolves(self, record: DnsRecord) -> bool:
-        """Whether the zone has exactly this record. Our listings leave out the names that `subdomain: userId` makes."""
+    def _is_in_zone(self, record: DnsRecord) -> bool:
+        """Whether the zone has this record. The listing of servers' names has none that `subdomain: userId` makes."""
         answer = self._account.client("route53").list_resource_record_sets(
             HostedZoneId=self._installation["HostedZoneId"],
             StartRecordName=record.name,
@@ -204,10 +207,9 @@ class Eraser:
         )
 
     def _documents(self) -> tuple[Iterator[Version], ...]:
-        """Every version of their documents, in the order in which they must be deleted.
+        """Every version of the participant's own documents, in the order in which they must be deleted.
 
-        The folder ends with a slash: `ann` is not `anna`. Their record leads to the documents of warm servers, so it
-        comes last.
+        The record leads to the documents of warm servers, so it comes last.
         """
         of_warm_servers = itertools.chain.from_iterable(map(self._bucket.versions_of, self._warm_server_keys()))
         return (
@@ -218,7 +220,7 @@ class Eraser:
         )
 
     def _warm_server_keys(self) -> list[str]:
-        """The handovers and records of the warm servers that were assigned to this participant."""
+        """The keys of the handover documents and records of the participant's warm servers."""
         return keys_of_warm_servers(self.project, self._warm_servers)
 
     # -- steps
@@ -227,7 +229,7 @@ class Eraser:
         self.receipt.rounds += 1
 
     def _stop(self, found: FoundOfParticipant) -> None:
-        """Count what is removed, and stop the server as `stop_server` does."""
+        """Count the resources for the receipt, and stop the servers as `stop_server` does."""
         from hippodrome.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.servers.termination import Termination  # noqa: PLC0415 - the same
 
@@ -237,7 +239,7 @@ class Eraser:
             StopServer(self.project, each.user_id, None, Reason.STOPPED) for each in found.records if not each.is_closed
         ]
         if stops:
-            with functions_log():  # what fails here is done by the steps that follow
+            with functions_log():  # the following steps do whatever fails here
                 Termination(ServerServices(self._platform)).stop(stops)
 
     def _wait(self) -> None:
@@ -260,11 +262,11 @@ class Eraser:
         return is_young and record.task is None and bool(record.cluster)
 
     def _settle(self) -> None:
-        """Wait until ECS lists the task, or so long that it would have been listed."""
+        """Wait until ECS lists the task, for `SETTLED` at most: after that there is none."""
         self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
 
     def _leave_session(self, found: FoundSession, advance: Callable[[int], None]) -> None:
-        """Take them out of a session. If its server plays again, the next round stops it first."""
+        """Take the participant out of a session. If its server runs again, the next round stops it first."""
         note = self._noting(advance)
         key = server.key(ids.server_label(self.project, found.id))
         if not found.others:
@@ -295,16 +297,17 @@ class Eraser:
             self._bucket.delete(versions, self._noting(advance))
 
     def _outlast(self, record: Server) -> None:
-        """Wait until all presigned requests of their server are invalid. It gets no more: its record is gone."""
+        """Wait until all presigned requests of the server are invalid. It gets no new ones: its record is deleted."""
         from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
-        signed = STORE_AFTER_CLOSE.total_seconds()  # how long after its end a server may still get one
+        # A server gets presigned requests until so many seconds after its end.
+        signed = STORE_AFTER_CLOSE.total_seconds()
         if record.closed is not None:
             signed -= (self._platform.now() - record.closed).total_seconds()
         self._sleep(VALID_SECONDS + SIGNING + min(signed, 0))
 
     def _outlast_sessions(self, sessions: Sequence[FoundSession]) -> None:
-        """Wait until no presigned request of their sessions' servers is valid, and these get no more."""
+        """Wait until the sessions' servers get no presigned requests any more, and all earlier ones are invalid."""
         from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
         records = (self._record(server.key(ids.server_label(self.project, each.id))) for each in sessions)
@@ -313,7 +316,7 @@ class Eraser:
             over = (self._platform.now() - max(ends)).total_seconds()
             self._sleep(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING - over)
 
-    def _sleep(self, left: float) -> None:
-        if left > 0:
-            screen.info(f"{left:.0f} seconds more: until then what their server was given might store something.")
-            self._executor.sleep(left)
+    def _sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            screen.info(f"{seconds:.0f} seconds more: until then a presigned request of the server might be used.")
+            self._executor.sleep(seconds)

@@ -1,7 +1,7 @@
 """Erases one participant from a data folder of this machine, which `make run` or `make try` has filled.
 
-No study may be held there meanwhile: its servers write recordings, and its functions read records. `make run` keeps
-what it works with beside the data folder, in `.hippodrome/`.
+`make run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
+beside the data folder, in `.hippodrome/`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STATE = ".hippodrome"
 
 @dataclass
 class Erased:
-    """What was deleted, and what was written anew."""
+    """How many files were deleted, and how many recordings were written anew."""
 
     files: int = 0
     rewritten: int = 0
@@ -54,12 +54,12 @@ class FolderEraser:
         self._lobby = LobbyEraser(self._folder, project, user)
 
     def look(self) -> tuple[list[Version], list[FoundSession]]:
-        """The files that are the participant's alone, or name them, and their sessions."""
+        """The participant's own files and those of the lobby that name them; and their sessions."""
         return [*self._own(), *self._lobby.look()], self._sessions.sessions()
 
     def run(self) -> Erased:
-        """Erase. Raises `Problem` if the study is held, or something of it still runs or is unfinished."""
-        with self._alone():
+        """Erase the participant. Raises `Problem` if `make run` runs, or left a server or an unfinished recording."""
+        with self._locked():
             sessions = self._sessions.sessions()
             self._must_be_over(sessions)
             done = Erased()
@@ -72,7 +72,7 @@ class FolderEraser:
                     self._folder.delete(self._of_server(ids.server_label(self._project, found.id)), note)
                 self._sessions.leave(found, note)
             self._lobby.erase(note)
-            self._free_place()
+            self._release_slot()
             self._folder.delete(self._own(), note)
             self._folder.remove_unfinished()  # also of a run that was killed
             spool = DataFolder(self._state / self._folder.root.name / "spool")
@@ -92,7 +92,7 @@ class FolderEraser:
         ]
 
     def _of_server(self, label: str) -> list[Version]:
-        """What there is of the warm servers that were assigned to a server, then its record, which leads to them."""
+        """The documents of warm servers that were assigned to this server, then its record, which leads to them."""
         key = server.key(label)
         try:
             record = from_json((self._folder.root / key).read_bytes(), Server)
@@ -101,7 +101,8 @@ class FolderEraser:
         keys = (*keys_of_warm_servers(self._project, warm_servers_of(record)), key)
         return [version for each in keys for version in self._folder.versions_of(each)]
 
-    def _free_place(self) -> None:
+    def _release_slot(self) -> None:
+        """Take the participant out of the project's documents of slots (`maxParticipants`)."""
         for version in list(self._folder.versions(limits.participant_slots_folder(self._project))):
             body = self._folder.read(version)
             try:
@@ -111,11 +112,11 @@ class FolderEraser:
             if self._label in held.labels:
                 self._folder.replace(version.key, body, to_json(held.without(self._label)))
 
-    # -- what must not be under way
+    # -- what must not run
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Hold the lock of `make run`, if it was ever held. Raises `Problem`."""
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock of `make run`, if that has ever run. Raises `Problem` if it runs now."""
         lock = self._state / f"{self._folder.root.name}.lock"
         if not lock.exists():
             yield
@@ -131,32 +132,32 @@ class FolderEraser:
             yield
 
     def _must_be_over(self, sessions: Sequence[FoundSession]) -> None:
-        """A killed `make run` leaves servers that play on, and recordings that it has not moved yet."""
+        """Raise `Problem` if a killed `make run` has left a running server, or recordings that it has not moved."""
         state = self._state / self._folder.root.name
         theirs = [session_folder(self._project, found.id).rstrip("/") for found in sessions]
         folders = {participant_folder(self._project, self._user).rstrip("/"), *theirs}
-        plays = any(_runs(path, folders) for path in sorted((state / "tasks").glob("*")))
+        runs = any(_runs(path, folders) for path in sorted((state / "tasks").glob("*")))
         spool = DataFolder(state / "spool")
         unfinished = any(any(spool.versions(f"{each}/")) for each in theirs)
-        if plays or unfinished:
+        if runs or unfinished:
             raise Problem(
                 "Their server still runs, or its recording is unfinished: `make run` was killed. Nothing was touched.",
                 "Start `make run` once more and end it with Ctrl-C: it ends all servers and keeps what they recorded.",
             )
 
     def _mentioned(self) -> list[str]:
-        """Files of `.hippodrome/` that name the participant: messages and tasks of the study's functions."""
+        """The files of `.hippodrome/` that name the participant: messages and tasks."""
         state = self._state / self._folder.root.name
-        told = [self._label.encode(), f'"{self._user}"'.encode(), f"/users/{self._user}".encode()]
+        names = [self._label.encode(), f'"{self._user}"'.encode(), f"/users/{self._user}".encode()]
         return [
             path.relative_to(self._state).as_posix()
             for path in (state.rglob("*") if state.is_dir() else ())
-            if path.is_file() and any(each in path.read_bytes() for each in told)
+            if path.is_file() and any(name in path.read_bytes() for name in names)
         ]
 
 
 def _runs(path: Path, folders: set[str]) -> bool:
-    """Whether the process of a task that plays for one of these folders is alive."""
+    """Whether this file describes a task for one of these folders whose process is alive."""
     try:
         task: dict[str, Any] = json.loads(path.read_bytes())
         if task.get("folder", "").rstrip("/") not in folders or task.get("stopped"):
@@ -170,7 +171,11 @@ def _runs(path: Path, folders: set[str]) -> bool:
 def erase(
     data: Path, project: str, user: str, *, dry_run: bool, confirm: Callable[[int, int], None]
 ) -> tuple[Erased | None, list[str], int]:
-    """Erase, unless nothing is found or `confirm` raises. Return what was done, cannot be read, and was found."""
+    """Erase, unless `dry_run`, nothing is found or `confirm` raises.
+
+    Return what was done (None: nothing), the keys of documents that cannot be read, and how many documents were found.
+    Raises `Problem`.
+    """
     if not data.is_dir():
         raise Problem(f"There is no folder {data}.", "Name the data folder of `make run`.")
     eraser = FolderEraser(data, project, user)

@@ -1,4 +1,4 @@
-"""Takes one participant out of a project's lobby: the entries of who waits, the decisions, the questions to `match`."""
+"""Takes one participant out of a project's lobby: out of its entries, its decisions and the questions to `match`."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ class LobbyEraser:
         """Documents that name the participant and cannot be read."""
 
     def look(self) -> list[Version]:
-        """Their entries, and the documents that name them: that of decisions, and those of the function `match`."""
+        """The participant's entries, and the documents of decisions and of `match` that name them."""
         last = newest(self._storage, self._decisions)
         decided = [last] if last is not None and self._names(self._storage.read(last)) else []
         return [*self._entries(), *self._questions(), *decided]
 
     def erase(self, note: Note) -> None:
-        """Delete their entries, and take them out of the lobby's decisions, in all versions."""
+        """Take the participant out of the decisions, and delete their entries and the documents that name them."""
         self.unreadable = []
         last = newest(self._storage, self._decisions)
         if last is not None:
             if not self._take_out(self._storage.read(last)):
-                return  # another has written it: the next round comes back
+                return  # a function has written other decisions: the next round tries again
             self._storage.delete(older(self._storage, self._decisions), note)
         self._storage.delete(self._entries(), note)
-        self._storage.delete(self._questions(), note)  # the lobby asks anew, without them
+        self._storage.delete(self._questions(), note)  # the lobby asks again, without the participant
 
     def _take_out(self, body: bytes) -> bool:
-        """Write these decisions without them; return False if others have been written meanwhile."""
+        """Write these decisions without the participant; return False if other decisions were written meanwhile."""
         if not self._names(body):
             return True
         try:
@@ -56,7 +56,7 @@ class LobbyEraser:
         return [*self._storage.versions(entries.prefix_of(self._project, self._label))]
 
     def _questions(self) -> list[Version]:
-        """All versions of the question to the function `match` and of its answers that hold their label."""
+        """All versions of the questions to the function `match`, and of its answers, that name the participant."""
         folders = (questions_folder(self._project), groups_folder(self._project))
         found = [each for folder in folders for each in self._storage.versions(folder) if not each.marker]
         bodies = read_all(self._storage, found)

@@ -1,4 +1,4 @@
-"""Log events of functions and trials, and the lines that people read of them. Pure."""
+"""Turns log events of functions and trials into lines for people and scripts. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FATAL_TEXT = re.compile(
     r"Task timed out after|Runtime exited|Process exited before|\[ERROR\]|Runtime\.\w+Error|\bstatus: (error|timeout)",
     re.IGNORECASE,
 )
-# what `logging` and Lambda's text format write before the message
+# The beginning of a line of `logging` or of Lambda's text format, and the message after it.
 _TEXT = re.compile(
     r"(?:\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d\S*\s+)?\[?(DEBUG|INFO|WARNING|WARN|ERROR|CRITICAL|FATAL)\]?[\s:]+(.*)",
     re.DOTALL,
@@ -42,14 +42,14 @@ _LEFT_OUT |= {"function_memory_size", "function_request_id", "requestId", "xray_
 
 @dataclass(frozen=True)
 class LogLine:
-    """One event: when, of which function (or `trial`), how bad it is, its text, and further fields."""
+    """A log event: its time, its source (a function, or `trial`), its level, its message and further fields."""
 
     time: datetime
     source: str
-    level: str  # "" where nothing says
+    level: str  # "" if the event has none
     message: str
     fields: Mapping[str, Any] = field(default_factory=dict)
-    platform: bool = False  # Lambda's own START, END and REPORT, when nothing is wrong; numbers for CloudWatch
+    platform: bool = False  # Lambda's own START, END and REPORT without an error, or metrics
     stream: str = ""
 
     @property
@@ -84,44 +84,44 @@ class LogLine:
 
 
 def read(event: Mapping[str, Any], source: str) -> LogLine:
-    """Read an event of FilterLogEvents, whatever wrote it."""
+    """The line of an event from FilterLogEvents, in any format that Hippodrome's log groups contain."""
     time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
     text = str(event.get("message", ""))
     stream = str(event.get("logStreamName", ""))
     try:
-        said = json.loads(text)
+        entry = json.loads(text)
     except (ValueError, RecursionError):
-        said = None
-    if isinstance(said, dict):
-        return _of_json(said, time, source, stream)
+        entry = None
+    if isinstance(entry, dict):
+        return _of_json(entry, time, source, stream)
     return _of_text(text, time, source, stream)
 
 
-def _of_json(said: dict[str, Any], time: datetime, source: str, stream: str) -> LogLine:
-    kind = str(said.get("type", ""))
-    if kind.startswith("platform.") and isinstance(said.get("record"), dict):
-        status = str(said["record"].get("status", "success"))
-        fine = status == "success"
-        message = kind.removeprefix("platform.") + ("" if fine else f": {status}")
-        shown = {key: value for key, value in said["record"].items() if key in ("status", "errorType", "metrics")}
-        return LogLine(
-            time, source, "" if fine else "ERROR", message, {} if fine else shown, platform=fine, stream=stream
-        )
-    if "errorType" in said and "message" not in said:  # an exception that left the function
-        fields = {key: value for key, value in said.items() if key in ("errorType", "stackTrace", "requestId")}
+def _of_json(entry: dict[str, Any], time: datetime, source: str, stream: str) -> LogLine:
+    kind = str(entry.get("type", ""))
+    if kind.startswith("platform.") and isinstance(entry.get("record"), dict):
+        status = str(entry["record"].get("status", "success"))
+        succeeded = status == "success"
+        message = kind.removeprefix("platform.") + ("" if succeeded else f": {status}")
+        shown = {key: value for key, value in entry["record"].items() if key in ("status", "errorType", "metrics")}
+        if succeeded:
+            return LogLine(time, source, "", message, platform=True, stream=stream)
+        return LogLine(time, source, "ERROR", message, shown, stream=stream)
+    if "errorType" in entry and "message" not in entry:  # an exception that left the function
+        fields = {key: value for key, value in entry.items() if key in ("errorType", "stackTrace", "requestId")}
         return LogLine(time, source, "ERROR", "unhandled exception", fields, stream=stream)
-    if "routeKey" in said or "httpMethod" in said:  # an access log of the HTTP API
-        status = str(said.get("status", ""))
+    if "routeKey" in entry or "httpMethod" in entry:  # an access log of the HTTP API
+        status = str(entry.get("status", ""))
         level = "ERROR" if status.startswith("5") else "INFO"
-        method = said.get("httpMethod") or said.get("routeKey")
-        rest = {key: value for key, value in said.items() if key not in ("httpMethod", "routeKey", "status")}
+        method = entry.get("httpMethod") or entry.get("routeKey")
+        rest = {key: value for key, value in entry.items() if key not in ("httpMethod", "routeKey", "status")}
         return LogLine(time, source, level, f"{status} {method}", rest, stream=stream)
-    if "_aws" in said and "message" not in said:  # metrics (CloudWatch's embedded metric format)
-        fields = {key: value for key, value in said.items() if key not in _LEFT_OUT | {"_aws"}}
+    if "_aws" in entry and "message" not in entry:  # metrics (CloudWatch's embedded metric format)
+        fields = {key: value for key, value in entry.items() if key not in _LEFT_OUT | {"_aws"}}
         return LogLine(time, source, "", "metrics", fields, platform=True, stream=stream)
-    level = str(said.get("level", "")).upper()
-    message = said.get("message", "")
-    fields = {key: value for key, value in said.items() if key not in _LEFT_OUT and value is not None}
+    level = str(entry.get("level", "")).upper()
+    message = entry.get("message", "")
+    fields = {key: value for key, value in entry.items() if key not in _LEFT_OUT and value is not None}
     text = message if isinstance(message, str) else json.dumps(message, ensure_ascii=False)
     return LogLine(time, source, level, text, fields, stream=stream)
 
@@ -139,7 +139,7 @@ def _of_text(text: str, time: datetime, source: str, stream: str) -> LogLine:
 
 
 def moment(text: str, now: datetime) -> datetime:
-    """The time that `--since` means: `90m` ago, or an ISO date or time, in UTC unless it says so. Raises ValueError."""
+    """The time that `--since` means: `90m` ago, or an ISO date or time, in UTC if it has no zone. Raises ValueError."""
     ago = _AGO.fullmatch(text.strip())
     if ago:
         try:
@@ -151,16 +151,11 @@ def moment(text: str, now: datetime) -> datetime:
 
 
 def _printable(text: str) -> str:
-    """The text without what would act on a terminal."""
+    """The text with � in place of control characters."""
     return _CONTROL.sub("�", text)
 
 
 def _short(value: object) -> str:
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
-    return (
-        text
-        if re.fullmatch(r"[\w.:/@+-]+", text)
-        else json.dumps(text, ensure_ascii=False)
-        if isinstance(value, str)
-        else text
-    )
+    if isinstance(value, str) and re.fullmatch(r"[\w.:/@+-]+", value):
+        return value
+    return json.dumps(value, ensure_ascii=False, default=str)

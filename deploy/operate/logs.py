@@ -1,4 +1,4 @@
-"""`deploy logs`: what functions and servers have logged, in the order of time."""
+"""`deploy logs`: shows what functions and servers have logged, in the order of time."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from deploy.core import options, participants
 from deploy.core.server_records import Records
 from deploy.operate.log_lines import TRIAL, LogLine, moment, read
 
-POLL = 5  # seconds between two looks; FilterLogEvents takes 5 requests a second in most regions, for all who ask
-OVERLAP = timedelta(seconds=60)  # events may arrive this late; those seen already are not shown again
+POLL = 5  # seconds between two looks; an account may call FilterLogEvents 5 times a second in most regions
+OVERLAP = timedelta(seconds=60)  # events may arrive this late, so each look goes back so far
 STYLES = {"ERROR": "red", "CRITICAL": "bold red", "WARNING": "yellow", "DEBUG": "dim"}
 
 
 class Reader:
-    """The log groups of an installation, read together."""
+    """Reads the log groups of an installation, merged by time."""
 
     def __init__(self, client: Any, stack: str) -> None:
         self._client = client
         self._stack = stack
 
     def sources(self) -> list[str]:
-        """The names of all log groups: functions, `trial`, and what else the stack logs.
+        """The sources of all log groups: functions, `trial`, and other parts of the stack.
 
-        Who may not list them (researchers: DescribeLogGroups knows no resources) gets those of the template.
+        Credentials that may not list groups (a researcher's) get the functions in the template, and `trial`.
         """
         groups = self._client.get_paginator("describe_log_groups")
         try:
@@ -55,24 +55,30 @@ class Reader:
         return sorted(found)
 
     def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[LogLine]:
-        """Every line since this time, in the order of time. Each log group's events come sorted, a page at once."""
-        streams = [self._events(source, since, project_id) for source in sources]
-        for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
+        """Every line since this time, in the order of time. Reads the groups page by page."""
+        for event, source in self._merged(sources, since, project_id):
             yield read(event, source)
 
     def events(
         self, sources: Iterable[str], since: datetime, project_id: str | None = None
     ) -> list[tuple[str, LogLine]]:
-        """The lines with the events' ids, by which new ones are told from old ones."""
+        """The same lines, each with an id of its event, by which `follow` recognises new events."""
+        merged = self._merged(sources, since, project_id)
+        return [(f"{source}/{_id_of(event)}", read(event, source)) for event, source in merged]
+
+    def _merged(
+        self, sources: Iterable[str], since: datetime, project_id: str | None
+    ) -> Iterator[tuple[Mapping[str, Any], str]]:
+        """The events of all sources, each with its source. FilterLogEvents sorts those of one source."""
         streams = [self._events(source, since, project_id) for source in sources]
-        merged = heapq.merge(*streams, key=lambda one: (one[0], one[1]))
-        return [(f"{source}/{_id_of(event)}", read(event, source)) for _, _, event, source in merged]
+        for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
+            yield event, source
 
     def _events(
         self, source: str, since: datetime, project_id: str | None
     ) -> Iterator[tuple[int, int, Mapping[str, Any], str]]:
-        # `interleaved` is what AWS does anyway since 2019, and what emulators do when asked.
-        # A server's log stream is called by its project (awslogs-stream-prefix).
+        # AWS interleaves streams in any case since 2019, emulators only with `interleaved`.
+        # The name of a server's log stream begins with its project's id (awslogs-stream-prefix).
         narrowed = {"logStreamNamePrefix": f"{project_id}/"} if project_id and source == TRIAL else {}
         pages = self._client.get_paginator("filter_log_events").paginate(
             logGroupName=resource_names.log_group(self._stack, source),
@@ -85,17 +91,17 @@ class Reader:
                 for number, event in enumerate(page["events"]):
                     yield event["timestamp"], number, event, source
         except ClientError as error:
-            if error.response["Error"]["Code"] != "ResourceNotFoundException":  # gone since it was listed
+            if error.response["Error"]["Code"] != "ResourceNotFoundException":  # deleted after it was listed
                 raise
 
 
 def _id_of(event: Mapping[str, Any]) -> str:
-    """What tells an event from others: AWS's id; emulators give none."""
+    """An id of the event: AWS's own, or its time, stream and message, since emulators give no ids."""
     return str(event.get("eventId") or [event.get(key) for key in ("timestamp", "logStreamName", "message")])
 
 
 class LineFilter:
-    """Which lines are shown."""
+    """Decides which lines are shown."""
 
     def __init__(
         self, errors: bool, everything: bool, project_id: str | None, owner: Callable[[str], str | None]
@@ -103,14 +109,14 @@ class LineFilter:
         self._errors = errors
         self._everything = everything
         self._project_id = project_id
-        self._owner = owner  # label → the project of that server
+        self._owner = owner  # server's label → its project's id
         self._last: dict[str, bool] = {}  # log stream → whether its last line with a level was an error
 
     def __call__(self, line: LogLine) -> bool:
         where = f"{line.source}/{line.stream}"
         if line.level:
             self._last[where] = line.is_error
-        # A traceback that a trial writes is one event a line; only the first has a level.
+        # Each line of a traceback of a trial is an event, of which only the first has a level.
         bad = line.is_error or (not line.level and line.source == TRIAL and self._last.get(where, False))
         if self._errors and not bad:
             return False
@@ -131,7 +137,7 @@ def follow(
     sleep: Callable[[float], None] = time.sleep,
     rounds: int | None = None,
 ) -> None:
-    """Print new lines until Ctrl-C, or for so many looks: each event once, late ones when they come."""
+    """Call `show` with new lines until Ctrl-C, or for `rounds` looks: once for each event, also for late ones."""
     seen: dict[str, datetime] = {}
     latest = since
     while rounds is None or rounds > 0:
@@ -156,7 +162,7 @@ def command(
     *,
     project: options.OneProject = None,
     since: Annotated[str, typer.Option("--since", help="How far back: 90s, 30m, 1h, 2d, or a time (UTC).")] = "1h",
-    following: Annotated[bool, typer.Option("--follow", "-f", help="Go on showing what comes, until Ctrl-C.")] = False,
+    following: Annotated[bool, typer.Option("--follow", "-f", help="Go on and show new lines until Ctrl-C.")] = False,
     errors: Annotated[bool, typer.Option("--errors", help="Only errors.")] = False,
     everything: Annotated[
         bool, typer.Option("--all", help="Also Lambda's START, END and REPORT, and metrics.")
@@ -166,10 +172,10 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """What functions and servers have logged, in the order of time.
+    """Show what functions and servers have logged, in the order of time.
 
-    No line holds an id or an answer; servers are called by their names, which are hashes. With --project, only what
-    its servers said, and what functions said about them.
+    No line has a participant's id or an answer; servers have their names, which are hashes. With --project, only lines
+    of its servers, and of functions about its servers.
     """
     try:
         start = moment(since, datetime.now(UTC))

@@ -1,4 +1,4 @@
-"""The receipt of an erasure: what was deleted, when and by whom; it names the participant by a salted hash only."""
+"""The receipt of an erasure: what was deleted, when and by whom. It names the participant by a salted hash only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOT_COVERED = (
 
 @dataclass
 class ProjectReceipt:
-    """One project's part: counts of what was deleted and removed, and what the last look found."""
+    """One project's part of a receipt: counts of what was deleted and removed, and of what the last look found."""
 
     project: str
     user: str
@@ -37,12 +37,12 @@ class ProjectReceipt:
     keys: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=lambda: {"tasks": 0, "timers": 0, "names": 0, "clusters": 0})
     rounds: int = 0
-    rewritten: int = 0  # recordings of sessions, which stay for the others
+    rewritten: int = 0  # recordings of sessions, which stay for the other members
     remains: Mapping[str, int] | None = None
     looked: datetime | None = None
 
     def note(self, versions: Iterable[Version]) -> None:
-        """Count versions that were deleted."""
+        """Count these deleted versions."""
         for version in versions:
             kind = self._kind(version.key)
             counts = self.deleted.setdefault(kind, {"versions": 0, "deleteMarkers": 0, "uploads": 0, "bytes": 0})
@@ -77,9 +77,9 @@ class ProjectReceipt:
         return kinds.get(rest.partition("/")[0], "other")
 
     def _nameless(self, key: str) -> str:
-        """The key without the id and without the server's label, which can be computed from it."""
+        """The key without the participant's id and without the server's label, which can be computed from the id."""
         rest = key.removeprefix(participant_folder(self.project, self.user))
-        if key.startswith(sessions_folder(self.project)):  # its names say nothing of the members
+        if key.startswith(sessions_folder(self.project)):  # a session's id does not depend on its members
             return "/".join("{userId}" if self.user in part else part for part in key.split("/"))
         if key.startswith(entries.FOLDER):
             return f"{entries.folder(self.project)}{{participant}}"
@@ -102,7 +102,7 @@ def receipt(
     whole: bool,
     with_id: bool,
 ) -> dict[str, Any]:
-    """The receipt as JSON data. `whole`: whether the last look found nothing; `with_id`: put the id itself in, too."""
+    """The receipt as JSON data. `whole`: whether the last look found nothing. `with_id`: include the id itself."""
     salt = secrets.token_hex(16)
     person = {
         "salt": salt,
@@ -126,7 +126,7 @@ def receipt(
 
 
 def write(target: Path, made: Mapping[str, Any]) -> None:
-    """Write the receipt into a new file. Raises `Problem`."""
+    """Write the receipt into a new file. Raises `Problem` if that fails."""
     try:
         with target.open("x", encoding="utf-8") as file:
             json.dump(made, file, indent=1)

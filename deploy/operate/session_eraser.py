@@ -1,9 +1,10 @@
 """Takes one participant out of the sessions in which they played with others.
 
-A session's documents are those of all its members. So each recording is written anew without what this participant
-alone has sent (`export/without_member.py`), and its older versions are deleted. Then the session's document is written
-anew, with an empty id at their seat. It leads to the recordings, so it changes last: a run that was cut off anywhere
-finds the session again. When all members are erased, everything of the session is deleted.
+A session's documents belong to all its members. So each recording is written anew without the lines and values that
+are this participant's alone (`export/without_member.py`), and its older versions are deleted. Then the session's
+document is written anew, with an empty id at the participant's seat. The document leads to the recordings, so it is
+written last: a run after an interruption finds the session again. When all members are erased, all documents of the
+session are deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _RECORDING = ".jsonl.gz"
 
 @dataclass(frozen=True)
 class FoundSession:
-    """A session whose document names the participant, in any version. `others`: whether other members stay in it."""
+    """A session whose document names the participant, in any version. `others`: whether it keeps other members."""
 
     id: str
     seat: int
@@ -49,12 +50,12 @@ class SessionEraser:
     def sessions(self) -> list[FoundSession]:
         """The sessions whose documents name the participant."""
         documents: dict[str, list[Version]] = {}
-        there = set()
+        existing = set()
         folder = sessions_folder(self._project)
         for version in self._storage.versions(folder):
             session, _, name = version.key.removeprefix(folder).partition("/")
             if is_session_id(session):
-                there.add(session)
+                existing.add(session)
                 if name == "session.json" and not version.marker:
                     documents.setdefault(session, []).append(version)
         self.unreadable = []
@@ -63,8 +64,8 @@ class SessionEraser:
         found: dict[str, FoundSession] = {}
         for (session, version), body in zip(every, bodies, strict=True):
             self._look(session, version.key, body, found)
-        theirs = self._membership() if there else None
-        if theirs is not None and theirs.id in there and theirs.id not in found and theirs.id not in documents:
+        theirs = self._membership() if existing else None
+        if theirs is not None and theirs.id in existing and theirs.id not in found and theirs.id not in documents:
             found[theirs.id] = theirs
         return sorted(found.values(), key=lambda each: each.id)
 
@@ -82,7 +83,7 @@ class SessionEraser:
             found[session] = FoundSession(session, member.seat, others and (before is None or before.others))
 
     def _membership(self) -> FoundSession | None:
-        """What the participant's own document says, where the session's is lost."""
+        """The session in the participant's membership document, for a session whose own document is lost."""
         try:
             for version in self._storage.versions_of(membership_key(self._project, self._user)):
                 if not version.marker:
@@ -95,12 +96,12 @@ class SessionEraser:
     # -- erasing
 
     def leave_sessions(self, note: Note = lambda _: None) -> None:
-        """Take the participant out of all their sessions, none of which may be playing."""
+        """Take the participant out of all their sessions. No server of these sessions may run."""
         for found in self.sessions():
             self.leave(found, note)
 
     def leave(self, found: FoundSession, note: Note) -> None:
-        """Take the participant out of one session, which may not be playing."""
+        """Take the participant out of one session, whose server must not run."""
         if found.others:
             self.take_out(found, note)
             self.take_name(found, note)
@@ -136,7 +137,7 @@ class SessionEraser:
         return replace(parsed, members=tuple(members)).to_json()
 
     def delete_session(self, found: FoundSession, note: Note) -> None:
-        """Delete everything of a session of which no member is left; its own document is the last."""
+        """Delete all documents of a session without other members; the session's own document comes last."""
         folder, last = session_folder(self._project, found.id), session_key(self._project, found.id)
         self._storage.delete([*self._storage.uploads(folder)], note)
         self._storage.delete([each for each in self._storage.versions(folder) if each.key != last], note)

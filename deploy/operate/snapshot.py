@@ -1,6 +1,6 @@
-"""A snapshot of an installation: projects, servers, queues, certificate, alarms, each read by itself.
+"""Takes snapshots of an installation: projects, servers, queues, certificate and alarms, each read by itself.
 
-A look that fails (a permission that is missing, AWS busy) leaves its part empty and says why; the others go on.
+If a part cannot be read (a missing permission, AWS is busy), it stays empty, and `problems` says why.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from hippodrome.storage.repository import Repository
 
 T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"
-DAY = timedelta(days=1)  # how far back failures are told
-DAILY = timedelta(days=1)  # how often the function renew_certificate looks
+DAY = timedelta(days=1)  # the age up to which failures are shown
+DAILY = timedelta(days=1)  # the interval of the function renew_certificate
 
 
 @dataclass(frozen=True)
@@ -49,26 +49,25 @@ class StackQueue:
 
 @dataclass(frozen=True)
 class CertificateState:
-    """The servers' certificate in the bucket. `renewal`: when the function begins to order the next one."""
+    """The servers' certificate in the bucket. `renewal`: the time from which the function orders the next one."""
 
     names: tuple[str, ...]
     renewal: datetime
     expires: datetime
     days_left: int
-    issuer: str
-    staging: bool  # of an authority that browsers do not know
+    staging: bool  # from an authority for tests, which browsers do not trust
 
     def overdue(self, now: datetime) -> bool:
         """Whether the next one should be there by now."""
         return now > self.renewal + DAILY
 
     def urgent(self, now: datetime) -> bool:
-        """Whether most of the time for renewing it is over: a week is left of 90 days, four days of 45."""
+        """Whether less than a quarter of the time for renewing is left: about a week of 90 days, four days of 45."""
         return self.expires - now < (self.expires - self.renewal) / 4
 
 
 class WarmServers(NamedTuple):
-    """Warm servers for participants: how many are ready, how many there are, how many were taken today."""
+    """Warm servers of a project: how many are ready, how many exist, and how many were assigned today."""
 
     ready: int
     there: int
@@ -76,7 +75,7 @@ class WarmServers(NamedTuple):
 
 
 class ServerFailure(NamedTuple):
-    """Servers of a project that failed for the same cause in the last 24 hours, and the name of the last one."""
+    """Servers of a project that failed for one cause in the last 24 hours: how many, and the last one's time, name."""
 
     project: str
     cause: Cause
@@ -92,14 +91,14 @@ class ServerFailure(NamedTuple):
 
 @dataclass
 class Snapshot:
-    """What one look at an installation found. `problems`: why a part is missing."""
+    """What one look at an installation found. `problems`: part → why it is missing."""
 
     at: datetime
     projects: list[tuple[Project, ParticipantCounts]] = field(default_factory=list)
     servers: list[Server] = field(default_factory=list)  # open ones
-    members: dict[str, int] = field(default_factory=dict)  # of formed sessions with an open server, by its name
-    recent: list[Server] = field(default_factory=list)  # records written today, or no longer than a day ago
-    tasks: int | None = None  # that ECS says are running
+    members: dict[str, int] = field(default_factory=dict)  # server's name → number of its session's members
+    recent: list[Server] = field(default_factory=list)  # records written in the last day, or server's life
+    tasks: int | None = None  # the number of tasks that run on ECS
     spent: Spent = field(default_factory=Spent)
     queues: list[StackQueue] = field(default_factory=list)
     certificate: CertificateState | None = None
@@ -108,12 +107,12 @@ class Snapshot:
 
     @property
     def closed_today(self) -> Counter[str]:
-        """Servers closed today, by reason; not the warm ones that were assigned."""
+        """How many servers were closed today, by reason. Warm servers that were assigned do not count."""
         return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.ASSIGNED)
 
     @property
     def failures(self) -> list[ServerFailure]:
-        """Why servers have failed since a day ago: those that can be prevented first, then by number."""
+        """Why servers failed in the last 24 hours: causes that can be prevented first, then by number of servers."""
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
             for one in attempts_of(record):
@@ -136,7 +135,7 @@ class Snapshot:
 
 
 class InstallationMonitor:
-    """Looks at an installation again and again. It keeps what need not be read twice."""
+    """Takes snapshots of one installation again and again. It keeps records and sessions that need no second read."""
 
     def __init__(self, account: Account, installation: Installation, project_id: str | None = None) -> None:
         self._account = account
@@ -145,10 +144,10 @@ class InstallationMonitor:
         self._platform = account.platform(installation)
         self._records = Records(self._platform.documents)
         self._repository = Repository(self._platform.documents)
-        self._formed: dict[str, int] = {}  # by session, its members: they never change
+        self._formed: dict[str, int] = {}  # session → number of its members, which never changes
 
-    def look(self, told: Callable[[str], None] = lambda _: None) -> Snapshot:
-        """Look once. `told` is called with the progress of a long listing."""
+    def look(self, progress: Callable[[str], None] = lambda _: None) -> Snapshot:
+        """Take a snapshot. `progress` gets a text on the progress of a long listing."""
         look = Snapshot(at=datetime.now(UTC))
         with ThreadPoolExecutor(4) as pool:
             servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
@@ -158,7 +157,7 @@ class InstallationMonitor:
                 pool.submit(self._try, look, "certificate", lambda: self._certificate(look)),
                 pool.submit(self._try, look, "alarms", lambda: self._alarms(look)),
             ]
-            projects = self._try(look, "projects", lambda: self._projects(look, told)) or []
+            projects = self._try(look, "projects", lambda: self._projects(look, progress)) or []
             servers.result()
             for one in others:
                 one.result()
@@ -176,7 +175,7 @@ class InstallationMonitor:
             look.problems[part] = str(problem)
             return None
 
-    def _projects(self, look: Snapshot, told: Callable[[str], None]) -> Sequence[Project]:
+    def _projects(self, look: Snapshot, progress: Callable[[str], None]) -> Sequence[Project]:
         documents = self._platform.documents
         unread: list[UnreadableEntry] = []
         projects = participants.choose(participants.registered_projects(documents, unread), self._project_id)
@@ -186,7 +185,7 @@ class InstallationMonitor:
 
             def advance(count: int, name: str = project.id) -> None:
                 if count % 100 == 0:
-                    told(f"{name}: {count:,} participants")
+                    progress(f"{name}: {count:,} participants")
 
             look.projects.append(
                 (project, participants.count_participants(documents, project, midnight(look.at), advance))
@@ -194,8 +193,8 @@ class InstallationMonitor:
         return projects
 
     def _servers(self, look: Snapshot) -> None:
-        # Records that may be open, have failed or have cost something today: those that were written no longer ago than
-        # a day, or than a server may live.
+        # Servers that may be open, or have failed or cost something today: their records were written within the last
+        # day, or within the longest life of a server.
         since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
         found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
         if self._records.unreadable:
@@ -205,7 +204,7 @@ class InstallationMonitor:
         look.members = dict(self._members([server for server in look.servers if server.is_sessions]))
 
     def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
-        """By server, how many members its session has. A read for each that was not formed at an earlier look."""
+        """The names of sessions' servers, each with the number of members. Reads each formed session only once."""
         for server in servers:
             known = self._formed.get(server.user_id)
             if known is None:
@@ -229,12 +228,12 @@ class InstallationMonitor:
 
 
 def midnight(now: datetime) -> datetime:
-    """When today began, in UTC, by which AWS bills."""
+    """The beginning of the day in UTC, by which AWS bills."""
     return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
 
 
 def queues(account: Account, stack: str) -> list[StackQueue]:
-    """The stack's queues; those that others send their dead letters to are the dead-letter queues."""
+    """The stack's queues. A queue that another one names in its RedrivePolicy is a dead-letter queue."""
     client = account.client("sqs")
     urls = [
         one["PhysicalResourceId"]
@@ -258,9 +257,9 @@ def queues(account: Account, stack: str) -> list[StackQueue]:
 
 
 def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateState | None:
-    """The certificate that servers fetch; None if there is none. The private key is not read for it.
+    """The certificate that servers fetch; None if there is none. Does not read the private key.
 
-    Raises `Problem` if what is there is no certificate.
+    Raises `Problem` if the document is no certificate.
     """
     from cryptography import x509  # noqa: PLC0415 - takes its time to import
 
@@ -276,7 +275,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
         raise Problem(f"{key} in the bucket is no certificate.", "Order one: `python -m deploy certificate`.") from None
     except x509.ExtensionNotFound:
         dns = ()
-    # Let's Encrypt's staging calls itself "(STAGING) …" in its issuers' names.
+    # The issuers of Let's Encrypt's staging have names such as "(STAGING) …".
     issuer = leaf.issuer.rfc4514_string()
     begins, expires = leaf.not_valid_before_utc, leaf.not_valid_after_utc
     return CertificateState(
@@ -284,13 +283,12 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
         renewal=renew_at(begins, expires),
         expires=expires,
         days_left=(expires - now) // timedelta(days=1),
-        issuer=issuer,
         staging="STAGING" in issuer.upper() or "Fake LE" in issuer,
     )
 
 
 def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
-    """The installation's alarms: those that send to its topic."""
+    """The installation's alarms, which are those that send to its topic."""
     pages = account.client("cloudwatch").get_paginator("describe_alarms")
     for page in pages.paginate(ActionPrefix=installation["Alarms"]):
         yield from page.get("MetricAlarms", ())

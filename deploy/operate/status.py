@@ -1,4 +1,4 @@
-"""`deploy status`: who is where, what runs, and what it costs."""
+"""`deploy status`: shows participants by step, what runs, and what it costs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 
 EVERY = 5.0  # seconds between two looks
-MAX_SERVERS = 20  # shown one by one, the oldest first
+MAX_SERVERS = 20  # servers that are shown one by one, the oldest first
 
 
 def command(
@@ -41,10 +41,10 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Who is where and what runs: participants by step, servers by state, queues, certificate, alarms, today's cost.
+    """Show participants by step, servers by state, queues, certificate, alarms, and today's cost.
 
-    Counts only, no ids; servers are called by their names, which are hashes. Reads listings, the servers' records and
-    how many members a session has, never a participant's documents.
+    It shows counts and no ids; servers have their names, which are hashes. It reads listings, the servers' records and
+    the number of a session's members, never a participant's documents.
     """
     if watch and as_json:
         raise Problem("--watch and --json do not go together.", "For scripts, ask again: `status --json`.")
@@ -70,7 +70,7 @@ def command(
 
 
 def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
-    """Until Ctrl-C. A look takes its time: the next one begins no sooner than that again."""
+    """Look and show until Ctrl-C. The pause between two looks is `EVERY`, or a look's own time if that is longer."""
     console = Console(highlight=False)  # unlike `screen.out` it breaks lines, which Live would cut off
     try:
         with contextlib.ExitStack() as stack:
@@ -93,7 +93,7 @@ def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
 
 
 def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
-    """This month's bill; None if there is none to be had, which is then among the look's problems."""
+    """This month's bill; None if Cost Explorer gives none. Then the reason is added to the look's problems."""
     today = datetime.now(UTC).date()
     bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
     if why:
@@ -192,13 +192,13 @@ def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
 
 
 def picture(look: Snapshot, installation: Installation) -> RenderableType:
-    """The snapshot as tables."""
+    """The snapshot as tables and lines."""
     parts: list[RenderableType] = [
         Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
     ]
     if installation.status not in ("CREATE_COMPLETE", "UPDATE_COMPLETE"):
         parts.append(Text(f"! The stack is in {installation.status}.", style="yellow"))
-    parts += [Text(""), *_projects(look), Text(""), *_servers(look), *_failures(look), Text(""), *_things(look)]
+    parts += [Text(""), *_projects(look), Text(""), *_servers(look), *_failures(look), Text(""), *_parts(look)]
     parts += [Text(f"! No {part}: {why}", style="yellow") for part, why in look.problems.items()]
     return Group(*parts)
 
@@ -274,22 +274,22 @@ def _servers(look: Snapshot) -> list[RenderableType]:
 
 
 def _failures(look: Snapshot) -> list[RenderableType]:
-    """Why servers have failed in the last 24 hours. Those that the study cannot prevent are told in one line."""
+    """Why servers have failed in the last 24 hours. All failures that only AWS can prevent are in one line."""
     lines: list[RenderableType] = []
-    passing = [failure for failure in look.failures if not failure.matters]
+    of_aws = [failure for failure in look.failures if not failure.matters]
     for failure in look.failures:
         if failure.matters:
             number = count(failure.servers, "server")
             text = f"! {failure.project}: {number} failed, the last {failure.last:%H:%M} UTC ({failure.server}). "
             lines.append(Text(text + failure.cause.sentence, style="red"))
-    if passing:
-        told = ", ".join(f"{failure.servers:,} {failure.cause} ({failure.project})" for failure in passing)
-        lines.append(Text(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {told}."))
+    if of_aws:
+        counts = ", ".join(f"{failure.servers:,} {failure.cause} ({failure.project})" for failure in of_aws)
+        lines.append(Text(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {counts}."))
     return [Text(""), *lines] if lines else []
 
 
 def _warm_lines(look: Snapshot) -> list[RenderableType]:
-    """How many servers wait, for each project that keeps some warm or still has some."""
+    """How many warm servers are ready, for each project that keeps warm servers or still has some."""
     lines: list[RenderableType] = []
     for project, _ in look.projects:
         warm = _warm(look, project)
@@ -310,16 +310,17 @@ def _kind(server: Server, members: int | None) -> str:
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 
-def _things(look: Snapshot) -> list[RenderableType]:
+def _parts(look: Snapshot) -> list[RenderableType]:
+    """Queues, certificate and alarms."""
     parts: list[RenderableType] = []
     dead = sum(queue.waiting for queue in look.queues if queue.dead)
     waiting = [f"{q.name} {q.waiting + q.in_flight:,}" for q in look.queues if not q.dead and q.waiting + q.in_flight]
     if "queues" not in look.problems:
         parts.append(Text(f"Queues: {', '.join(waiting) or 'empty'}."))
     if dead:
-        what = "message could" if dead == 1 else "messages could"
+        messages = "message could" if dead == 1 else "messages could"
         parts.append(
-            Text(f"! {dead:,} {what} not be dealt with: `python -m deploy logs --errors` says why.", style="red")
+            Text(f"! {dead:,} {messages} not be dealt with: `python -m deploy logs --errors` says why.", style="red")
         )
     certificate = look.certificate
     if certificate is not None:

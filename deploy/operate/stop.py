@@ -1,4 +1,4 @@
-"""`deploy stop`: every server, now."""
+"""`deploy stop`: stops every server, now."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from hippodrome.servers import resources
 from hippodrome.servers.leftovers import Scope, leftovers
 from hippodrome.servers.resources import Resources
 
-WAIT = 180  # seconds: a task may take its stopTimeout of 120 to save what it has
+WAIT = 180  # seconds: a task may take its stopTimeout of 120 to store its recordings
 TOGETHER = 25  # servers stopped by one call: their DNS records go in one change of the zone
-AT_ONCE = 4  # such calls; Route 53 takes 10 requests a second
+AT_ONCE = 4  # such calls at the same time; Route 53 takes 10 requests a second
 
 
 @dataclass
 class FoundServers:
-    """What one look found: open servers, and resources that no open server owns."""
+    """What one look found: open servers, resources that no open server owns, and tasks that are stopping."""
 
     servers: list[Server] = field(default_factory=list)
     leftovers: Resources = field(default_factory=Resources)
-    draining: list[RunningTask] = field(default_factory=list)  # told to stop, saving what they have
+    draining: list[RunningTask] = field(default_factory=list)  # tasks that were told to stop and store their recordings
 
     @property
     def to_do(self) -> bool:
-        """Whether anything was found that was not told to stop yet."""
+        """Whether a server or a resource was found that has to be stopped or removed."""
         return bool(self.servers or self.leftovers)
 
     def __bool__(self) -> bool:
@@ -56,8 +56,8 @@ class FoundServers:
 class Stopper:
     """Stops all servers, or those of one project, and looks until nothing of them is left.
 
-    It does what the function `stop_server` does, from here, so that it works where queues or functions do not. Any
-    number may run at once, beside the functions too.
+    It does the work of the function `stop_server` on this machine, so that it works even if queues or functions do not.
+    Several may run at the same time, and together with the functions.
     """
 
     def __init__(self, platform: AwsPlatform, project_id: str | None = None, executor: Executor | None = None) -> None:
@@ -74,17 +74,17 @@ class Stopper:
 
     @property
     def unreadable(self) -> int:
-        """How many records of servers could not be read: what those servers have counts as owned by none."""
+        """How many records of servers cannot be read. The resources of these servers count as owned by no server."""
         return self._records.unreadable
 
     def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> FoundServers:
-        """Look and stop until a look finds nothing, or `wait` seconds are over; return what the last look found."""
+        """Stop servers until a look finds nothing, or `wait` seconds are over; return what the last look found."""
         return self._executor.converge(
             self.look, lambda found: self.plan(found, advance), note=self._note, seconds=wait
         )
 
     def look(self) -> FoundServers:
-        """Return what there is. Resources first and records afterwards, as the sweep does."""
+        """Find servers and resources; change nothing. Read resources first and then the records, as the sweep does."""
         platform = self._platform
         found = resources.list_resources(platform)
         draining = list(platform.tasks.draining(found.cluster))
@@ -102,13 +102,13 @@ class Stopper:
         )
 
     def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
-        """The steps that stop what was found; none if it only has to be waited for."""
+        """The steps that stop and remove what was found; empty if only stopping tasks are left."""
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
         steps += removal_steps(self._platform, found.leftovers)
         return steps + cluster_steps(self._platform, found.leftovers)
 
     def _stop_servers(self, servers: Sequence[Server], advance: Callable[[int], None]) -> None:
-        """The control plane's stop reads each record again and goes by what it finds then."""
+        """Stop the servers in chunks. `Termination` reads each record again and decides by what it finds then."""
         with functions_log() as failures, ThreadPoolExecutor(AT_ONCE) as pool:
             chunks = [servers[at : at + TOGETHER] for at in range(0, len(servers), TOGETHER)]
             for future in as_completed([pool.submit(self._stop_chunk, chunk) for chunk in chunks]):
@@ -145,9 +145,9 @@ def command(
 ) -> int:
     """Stop every server now, and make sure that nothing of them is left.
 
-    Whoever plays loses the game that is on; what they have answered and the recordings up to now are kept. Their page
-    says that those who hold the study have switched the server off. While the project is live they can start another,
-    and the servers that it keeps warm are started again: first close it with
+    A participant who plays loses the present game; all answers, and the recordings up to now, are kept. Their page
+    says that those who hold the study have switched the server off. While the project is live, participants can start
+    another server, and warm servers are started again: close the project first, with
     `python -m deploy register FOLDER --no-live`.
     """
     account = open_account(profile, region)
@@ -190,10 +190,10 @@ def command(
 
 
 def _again(live: Sequence[Project]) -> str:
-    """What becomes of live projects after a stop."""
+    """A sentence on live projects, whose servers can start again after a stop."""
     warm = [project.id for project in live if project.warm_servers]
-    said = f"Live: {', '.join(project.id for project in live)}. Participants can start a server again"
-    return said + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
+    text = f"Live: {', '.join(project.id for project in live)}. Participants can start a server again"
+    return text + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
 
 
 def _show(found: FoundServers, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""Where documents lie that are erased: a bucket with versions (`deploy/aws/versions.py`), or a data folder."""
+"""The interface of a storage from which documents are erased: a versioned bucket, or a data folder."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Protocol
 
 from deploy.aws.versions import Version
 
-AT_ONCE = 10  # documents that are read at once
+AT_ONCE = 10  # documents that are read at the same time
 Note = Callable[[Sequence[Version]], None]
-"""Is told what was deleted."""
+"""Gets the versions that were deleted."""
 
 
 class Storage(Protocol):
-    """All methods may be called from several threads."""
+    """`VersionedBucket` or `DataFolder`. All methods may be called from several threads."""
 
     def versions(self, prefix: str) -> Iterator[Version]:
-        """Every version and delete marker below a prefix."""
+        """Every version and delete marker whose key has this prefix."""
 
     def versions_of(self, key: str) -> Iterator[Version]:
         """Every version and delete marker of one document."""
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """Every unfinished upload below a prefix."""
+        """Every unfinished upload whose key has this prefix."""
 
     def read(self, version: Version) -> bytes:
         """The content of a version; empty if it is gone or is a delete marker."""
@@ -36,25 +36,25 @@ class Storage(Protocol):
         """Store a file's content as the newest version, whole or not at all."""
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Store a small document if its newest version still is `before`; return whether it was."""
+        """Store a small document if its newest version is still `before`; return whether it was so."""
 
     def delete(self, versions: Iterable[Version], note: Note) -> object:
         """Delete these versions for good."""
 
 
 def read_all(storage: Storage, versions: Sequence[Version]) -> list[bytes]:
-    """The contents of these versions, several read at once."""
+    """The contents of these versions, in their order. Reads several at the same time."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
         return list(pool.map(storage.read, versions))
 
 
 def newest(storage: Storage, key: str) -> Version | None:
-    """The newest version of a document; None if there is none, or it was deleted."""
+    """The newest version of a document; None if the document does not exist or was deleted."""
     return next((each for each in storage.versions_of(key) if each.latest and not each.marker), None)
 
 
 def older(storage: Storage, key: str) -> list[Version]:
-    """All versions but the newest; all of them if that one is a delete marker."""
-    there = [*storage.versions_of(key)]
-    deleted = any(each.latest and each.marker for each in there)
-    return [each for each in there if deleted or not each.latest]
+    """All versions of a document but the newest; if the newest is a delete marker, all of them."""
+    versions = [*storage.versions_of(key)]
+    deleted = any(each.latest and each.marker for each in versions)
+    return [each for each in versions if deleted or not each.latest]

@@ -78,8 +78,8 @@ class CodeBucket:
     def upload(self, functions: Sequence[Function]) -> int:
         """Upload the zips that the bucket does not have; return how many."""
         with ThreadPoolExecutor(_AT_ONCE) as pool:
-            there = list(pool.map(lambda function: self._has(function.key), functions))
-        missing = [function for function, found in zip(functions, there, strict=True) if not found]
+            present = list(pool.map(lambda function: self._has(function.key), functions))
+        missing = [function for function, found in zip(functions, present, strict=True) if not found]
         if not missing:
             return 0
         with screen.progress() as bar:

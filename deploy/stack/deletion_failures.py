@@ -23,7 +23,7 @@ class Recovery(Enum):
     CERTIFICATE = "nothing uses the certificate any more"
     POLICY = "the policy is detached"
     ROLE = "foreign policies are taken from the role"
-    PAUSE = "AWS is done with what it is at"
+    PAUSE = "AWS has ended another operation"
     GONE = "the records of the hosted zone, which is gone, are left out"
 
 

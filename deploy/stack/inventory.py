@@ -111,10 +111,10 @@ def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedReso
     for type_, ids in sorted(by_type.items()):
         if type_ in LISTINGS:
             listing = LISTINGS[type_]
-            there = set(_list(account, listing))
+            listed = set(_list(account, listing))
             if type_ == "AWS::ECS::Cluster":
-                there = {_last(one) for one in there}
-            found += [ListedResource(listing.kind, one) for one in sorted(ids & there)]
+                listed = {_last(one) for one in listed}
+            found += [ListedResource(listing.kind, one) for one in sorted(ids & listed)]
     return found
 
 

@@ -28,16 +28,16 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
     If the list of projects is missing, this only warns: the answers can be read without it.
     """
     _must_be_ours(account, name)
-    source, there = Bucket(account.client("s3"), name, account.id), projects(account, name)
+    source, present = Bucket(account.client("s3"), name, account.id), projects(account, name)
     listed = _holds(account, name, MASTER_LIST)
-    if not there and not listed:
+    if not present and not listed:
         raise Problem(
             f"The bucket {name} holds no installation's data: neither {MASTER_LIST} nor participants' answers.", _WHICH
         )
-    if project not in there:
+    if project not in present:
         raise Problem(
             f"The bucket {name} holds nothing of participants of {project}.",
-            f"It holds those of {', '.join(there)}: name one with --project." if there else "It holds no participants.",
+            f"It holds those of {', '.join(present)}: name one with --project." if present else "It holds none at all.",
         )
     if not listed:
         screen.warning(
@@ -77,7 +77,7 @@ def _must_be_ours(account: Account, name: str) -> None:
         raise Problem(f"{name!r} is no bucket's name.", "Give its name alone, without s3:// and without a path.")
     owner = account.id  # asked first: S3's 403 does not say whether the credentials have expired
     try:
-        there = inventory.bucket_exists(account, name)
+        exists = inventory.bucket_exists(account, name)
     except ClientError as error:
         if errors.status(error) != 403:
             raise
@@ -86,5 +86,5 @@ def _must_be_ours(account: Account, name: str) -> None:
             "Check its name and --profile. The policy for researchers goes with the stack: an administrator's "
             "credentials can.",
         ) from None
-    if not there:
+    if not exists:
         raise Problem(f"There is no bucket {name}.", _WHICH)

@@ -275,7 +275,7 @@ class Stack:
                 f"--no-enable-termination-protection --stack-name {self.name} --region {self._account.region}",
             )
 
-    def problem(self, what: str, stack_id: str, status: str) -> Problem:
+    def problem(self, summary: str, stack_id: str, status: str) -> Problem:
         """The problem of the latest operation: its first three failures with reasons, and the names of the others."""
         failures = self.operation(stack_id).failures
         details: list[str] = []
@@ -287,16 +287,16 @@ class Stack:
         if not failures:
             reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
             details = [str(reason)] if reason else []
-        return Problem(f"{what} (now {status}).", advice(failures, details), details)
+        return Problem(f"{summary} (now {status}).", advice(failures, details), details)
 
 
 def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
     """The physical ids of the resources that have this type and exist."""
-    gone = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
+    deleted = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
     return [
         str(one["PhysicalResourceId"])
         for one in resources
-        if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in gone
+        if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in deleted
     ]
 
 

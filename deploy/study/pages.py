@@ -35,9 +35,9 @@ def compare(account: Account, bucket: str, project_id: str, folder: Path, more: 
     """Compare folder and bucket; change nothing. `more` are pages outside of the folder. Raises `Problem`."""
     prefix = f"{project_id}/steps/"
     files = {prefix + file.name: file for file in [*_files(folder), *more]}
-    there = _listing(account, bucket, prefix)
-    put = {key: file for key, file in files.items() if not _same(account, bucket, key, file, there.get(key))}
-    return Changes(put, sorted(there.keys() - files.keys()), len(files) - len(put))
+    stored = _listing(account, bucket, prefix)
+    put = {key: file for key, file in files.items() if not _same(account, bucket, key, file, stored.get(key))}
+    return Changes(put, sorted(stored.keys() - files.keys()), len(files) - len(put))
 
 
 def upload(account: Account, bucket: str, changes: Changes) -> None:
@@ -65,7 +65,7 @@ def _files(folder: Path) -> list[Path]:
         if not inside(folder, file):
             raise Problem(
                 f"{name} is a link out of the project folder.",
-                "Whatever lies there can be read by everybody: put the file itself there, or remove the link.",
+                "Everyone can read the files in this folder: put the file itself there, or remove the link.",
             )
         if not file.is_file():
             continue
@@ -83,18 +83,18 @@ def _listing(account: Account, bucket: str, prefix: str) -> dict[str, Mapping[st
     return {line["Key"]: line for page in pages for line in page.get("Contents", ())}
 
 
-def _same(account: Account, bucket: str, key: str, file: Path, there: Mapping[str, Any] | None) -> bool:
-    """Whether the object `there`, from a listing, has the file's content.
+def _same(account: Account, bucket: str, key: str, file: Path, stored: Mapping[str, Any] | None) -> bool:
+    """Whether the object `stored`, from a listing, has the file's content.
 
     The ETag of an object from one PUT is its MD5, unless it is encrypted with a KMS key (S3 API Reference, Object). The
     object is read only if its ETag is another value.
     """
-    if there is None:
+    if stored is None:
         return False
     body = file.read_bytes()
-    if there["Size"] != len(body):
+    if stored["Size"] != len(body):
         return False
-    if there["ETag"].strip('"') == hashlib.md5(body, usedforsecurity=False).hexdigest():
+    if stored["ETag"].strip('"') == hashlib.md5(body, usedforsecurity=False).hexdigest():
         return True
     document = _documents(account, bucket).get(key)
     return document is not None and document.body == body

@@ -46,7 +46,7 @@ Base = Annotated[
 
 @dataclass(frozen=True)
 class RegisterRequest:
-    """How to register. `live`: instead of config.yml's value, unless None. `again`: build an image even if one exists."""
+    """How to register. `live`: replaces config.yml's value, unless None. `again`: build an image even if one exists."""
 
     live: bool | None = None
     again: bool = False

@@ -1,4 +1,4 @@
-"""`deploy doctor`: whether a study can be held, each thing a line with what to do about it."""
+"""`deploy doctor`: checks whether a study can be held. Each check is a line, with advice if something is wrong."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def command(
             "--project", help="Look at this project: its id, or its folder; else at all live ones.", show_default=False
         ),
     ] = None,
-    at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need at once.")] = 20,
+    at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need together.")] = 20,
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="Also start and stop one real server; costs less than a cent.")
     ] = False,
@@ -82,17 +82,17 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Look whether a study can be held: a line for each thing, with what to do about it.
+    """Check whether a study can be held: a line for each check, with advice if something is wrong.
 
-    ✓ good, ! worth a look, ✗ participants would meet it. Ends with 1 if there is a ✗. Changes nothing, but for
-    --rehearse, which starts a server without a participant and removes it again; then only a ✗ of the rehearsal counts.
+    ✓ good, ! worth a look, ✗ participants would be affected. The exit code is 1 if there is a ✗. Nothing is changed,
+    except with --rehearse, which starts a server without a participant and removes it; then only its ✗ count.
     --rehearse --play 2 sends simulated participants through a copy of a live study, and removes the copy again.
     """
     if play and not rehearse:
         raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
     findings: list[Finding] = []
     rehearsal: list[Finding] = []
-    told: dict[str, Any] = {}
+    document: dict[str, Any] = {}
     account = open_account(profile, region)
     findings += credentials(account)
     installation, found = installation_state(account, stack)
@@ -111,7 +111,7 @@ def command(
             if play:
                 from deploy.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
 
-                rehearsal, told = played(context, play, minutes=within, yes=yes, file=transcript)
+                rehearsal, document = played(context, play, minutes=within, yes=yes, file=transcript)
             else:
                 rehearsal = _rehearse(context)
             findings += rehearsal
@@ -120,7 +120,7 @@ def command(
         show(findings, screen.out)
     failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
     if as_json:
-        more = {"transcript": told} if told else {}
+        more = {"transcript": document} if document else {}
         screen.result_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
     else:
         _conclude(findings, rehearsal)
@@ -128,7 +128,7 @@ def command(
 
 
 def credentials(account: Account) -> Iterator[Finding]:
-    """Whose credentials these are, and the region. Raises botocore's errors if AWS does not accept them."""
+    """To whom the credentials belong, and the region. Raises botocore's errors if AWS does not accept them."""
     identity = account.identity
     name = identity["Arn"].rpartition(":")[2]
     if name == "root":
@@ -141,7 +141,7 @@ def credentials(account: Account) -> Iterator[Finding]:
 
 
 def installation_state(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
-    """The installation (None if it is missing), and whether it is whole and of this version."""
+    """The installation (None if there is none), and findings on its state and version."""
     try:
         installation = find_installation(account, stack)
     except Problem as problem:
@@ -167,19 +167,19 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
         )
     try:
         found += _version(account, stack)
-    except Exception as error:  # noqa: BLE001 - said, and the other checks go on
+    except Exception as error:  # noqa: BLE001 - it becomes a finding, and the other checks go on
         why = explain.problem_from(error) or Problem(f"{type(error).__name__}.")
         found.append(look("version", f"could not be checked: {why}", why.advice))
     return installation, found
 
 
 def _version(account: Account, stack: str) -> Iterator[Finding]:
-    """Whether the template that stands is this version's; of the code only its presence is known here."""
+    """Whether the stack's template is that of this version, apart from the code of the functions."""
     from deploy.code.template import Template  # noqa: PLC0415
     from deploy.stack.stack import Stack  # noqa: PLC0415
 
-    there = Stack(account, stack).template()
-    if there and _plain(there) != _plain(Template.read().text):
+    present = Stack(account, stack).template()
+    if present and _plain(present) != _plain(Template.read().text):
         yield look(
             "version",
             "The stack was made by another version of this command.",
@@ -195,18 +195,18 @@ def _plain(template: str) -> str:
 
 
 def _wanted(context: CheckContext, given: str | None) -> Project | None:
-    """The registered project of that id, or of that folder. Raises `Problem` if it is not registered."""
+    """The registered project with the id or folder `given`. Raises `Problem` if it is not registered."""
     if given is None:
         return None
-    wanted = given
+    project_id = given
     if options.is_folder(given):
         from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
 
-        wanted = project_folder.read(Path(given)).id
+        project_id = project_folder.read(Path(given)).id
     registered = participants.registered_projects(context.platform.documents, [])
-    if options.is_folder(given) and not any(one.id == wanted for one in registered):
-        raise Problem(f"The project {wanted} is not registered.", f"Run `python -m deploy register {given}`.")
-    return participants.choose(registered, wanted)[0]
+    if options.is_folder(given) and not any(one.id == project_id for one in registered):
+        raise Problem(f"The project {project_id} is not registered.", f"Run `python -m deploy register {given}`.")
+    return participants.choose(registered, project_id)[0]
 
 
 def _rehearse(context: CheckContext) -> list[Finding]:

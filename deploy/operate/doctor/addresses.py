@@ -1,4 +1,4 @@
-"""Names and certificates: whether participants find the site and the servers."""
+"""Checks names and certificates: whether participants reach the site and the servers."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from deploy.operate import snapshot
 from deploy.operate.doctor.check_context import CheckContext
 from hippodrome.certificates.rules import names_of
 
-PATIENCE = 10  # seconds for the site
+PATIENCE = 10  # seconds to wait for the site
 
 
 def zone(context: CheckContext) -> Iterator[Finding]:
-    """The hosted zone exists, holds the domain, and the Internet's DNS leads to it."""
+    """Whether the hosted zone exists, is for the domain, and is delegated."""
     domain = context.installation["RootDomain"]
     try:
         found = read_zone(context.account, context.installation["HostedZoneId"])
@@ -53,7 +53,7 @@ def zone(context: CheckContext) -> Iterator[Finding]:
 
 
 def site_certificate(context: CheckContext) -> Iterator[Finding]:
-    """The site's certificate (ACM renews it by itself as long as DNS is right)."""
+    """The state of the site's certificate, which ACM renews by itself if DNS is right."""
     arns = context.of_type("AWS::CertificateManager::Certificate")
     if not arns:
         yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
@@ -77,7 +77,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
 
 
 def site(context: CheckContext) -> Iterator[Finding]:
-    """The site answers at the participants' address."""
+    """Whether the site answers at the participants' address."""
     if context.fetch is None:
         return
     address = context.installation["Site"]
@@ -97,7 +97,7 @@ def site(context: CheckContext) -> Iterator[Finding]:
 
 
 def fetch(address: str) -> int:
-    """The status of the answer to an HTTPS request; 4xx and 5xx count as answers. Raises OSError or ValueError."""
+    """Send a GET request over https; return the status, also 4xx and 5xx. Raises OSError without an answer."""
     if not address.startswith("https://"):
         raise ValueError(address)
     try:
@@ -110,10 +110,10 @@ def fetch(address: str) -> int:
 
 
 def authorities() -> ssl.SSLContext:
-    """The trusted authorities: those that Mozilla trusts, as certifi has them, and this machine's own.
+    """A TLS context that trusts this machine's authorities and Mozilla's, which certifi has.
 
-    Python from python.org has none of its own on macOS (its `Install Certificates.command` adds certifi's); a network
-    that looks into TLS has one that only the machine knows.
+    Python from python.org has no authorities on macOS (its `Install Certificates.command` adds certifi's). A network
+    that inspects TLS has an authority that only its machines know.
     """
     context = ssl.create_default_context()
     context.load_verify_locations(certifi.where())
@@ -121,7 +121,7 @@ def authorities() -> ssl.SSLContext:
 
 
 def certificate(context: CheckContext) -> Iterator[Finding]:
-    """The servers' wildcard certificate."""
+    """Whether the servers' wildcard certificate is in place, valid, and renewed in time."""
     order = "Order one: `python -m deploy certificate --production`."
     try:
         found = snapshot.certificate(context.installation, context.platform.documents, context.now)

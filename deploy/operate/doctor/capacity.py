@@ -1,6 +1,6 @@
-"""Quotas: whether AWS will let as many servers run as a study needs.
+"""Checks the quotas: whether AWS lets as many servers run as a study needs.
 
-Room for fewer servers than are wanted at once is worth a remark. It is bad only if no server at all could run.
+A quota for too few servers is worth a look. It is bad only if no server at all could run.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from deploy.aws import concurrency, quotas
 from deploy.core.finding import Finding, bad, good, look
 from deploy.operate.doctor.check_context import CheckContext
 
-USUAL = 1.0  # vCPU of a server, while no project says
-REQUESTS = 0.1  # executions of next_step for each participant who waits: a look every two seconds, 0.12 s each
-IN_LOBBY = 0.15  # of one who waits in a lobby: a look takes four calls of S3 more, one after the other
-HEADROOM = 4  # standard deviations above the mean: requests come at random, and none should find no room
+USUAL = 1.0  # vCPU of a server, if there is no project
+REQUESTS = 0.1  # executions of next_step for each waiting participant: a request every two seconds, 0.12 s each
+IN_LOBBY = 0.15  # the same in a lobby, where a request makes four more calls of S3, one after the other
+HEADROOM = 4  # standard deviations above the mean: requests come at random, and all should find room
 
 
 def fargate(context: CheckContext) -> Iterator[Finding]:
-    """vCPU quotas, Spot and on demand, compared with what all servers at once need, warm ones included."""
+    """The vCPU quotas, on Spot and on demand, compared with what all servers need together, warm ones included."""
     cpu = context.cpu or (0 if context.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
@@ -49,7 +49,7 @@ def fargate(context: CheckContext) -> Iterator[Finding]:
 
 
 def functions(context: CheckContext) -> Iterator[Finding]:
-    """Concurrent executions of Lambda, which the whole account shares."""
+    """Lambda's concurrent executions, which the whole account shares."""
     free = concurrency.unreserved(context.account)
     workers = concurrency.workers(free)
     waiting = context.at_once * context.players

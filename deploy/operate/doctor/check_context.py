@@ -1,4 +1,4 @@
-"""What the checks of `doctor` are given."""
+"""The input of the checks of `doctor`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hippodrome.model.project import Project
 
 @dataclass
 class CheckContext:
-    """The installation to check. `delegation` and `fetch` query DNS and the site; if None, these are not queried."""
+    """The installation to check. `delegation` asks DNS, `fetch` the site; if one is None, that is not asked."""
 
     account: Account
     installation: Installation
@@ -51,7 +51,7 @@ class CheckContext:
 
     @cached_property
     def cpu(self) -> float:
-        """vCPUs of the largest server that these projects start."""
+        """vCPUs of the largest server of these projects; 0 if none has a game."""
         return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
 
     @cached_property
@@ -71,7 +71,7 @@ class CheckContext:
 
 
 class CheckFailed(Exception):
-    """A part of a rehearsal failed. `advice` says what to do."""
+    """A part of a rehearsal has failed. `advice` says what to do."""
 
     def __init__(self, text: str, advice: str) -> None:
         super().__init__(text)

@@ -1,6 +1,6 @@
-"""Documents that cannot be read, and pages that do not render: of which project, what they prevent, what to do.
+"""Finds documents that cannot be read and pages that cannot be rendered: their project, the consequence, the advice.
 
-None of them stops anything else: every reader leaves it out. Participants are counted, never named.
+Such a document harms nothing else, since every reader skips it. Participants are counted, never named.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from hippodrome.storage import secret
 from protocol.keys import sessions_folder
 from protocol.session import parse
 
-LATEST = 500  # participants, and sessions, of a project whose documents are read
-SHOWN = 3  # servers that are named
+LATEST = 500  # participants of a project, and sessions, whose documents are read, the latest first
+SHOWN = 3  # records that are named
 OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 
 def documents(context: CheckContext) -> Iterator[Finding]:
-    """The list of projects, documents of servers and slots, participants' records: those that cannot be read."""
+    """The documents that cannot be read: list of projects, servers' records, slots, sessions, participants' records."""
     found = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
         found += [*_shared(context.platform.documents, project), *_participants(context.platform.documents, project)]
@@ -56,7 +56,7 @@ def _projects(context: CheckContext) -> Iterator[Finding]:
 
 
 def _secret(context: CheckContext) -> Iterator[Finding]:
-    """What all tickets and links are derived from. Only functions may read it, so it is looked for alone."""
+    """The installation's secret. Only functions may read it, so this only checks that it exists."""
     needed = any(project.salt for project in context.projects)
     if needed and not any(entry.key == secret.KEY for entry in context.platform.documents.list(secret.KEY)):
         yield bad(
@@ -81,24 +81,24 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
     )
 
 
-def _shared(there: Documents, project: Project) -> Iterator[Finding]:
-    """What holds the slots of a project, and the warm servers."""
+def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
+    """The documents with a project's slots and its pool of warm servers."""
     check = f"project {project.id}"
-    if project.limits_servers and not _is(there, limits.server_slots_key(project.id), ServerSlots):
+    if project.limits_servers and not _is_readable(documents, limits.server_slots_key(project.id), ServerSlots):
         yield bad(
             check,
             f"{limits.server_slots_key(project.id)} cannot be read, so no server of it starts.",
             f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
             "the count begins anew, and with it the hours of maxServerHours.",
         )
-    for key in sorted(entry.key for entry in there.list(limits.participant_slots_folder(project.id))):
-        if project.max_participants is not None and not _is(there, key, ParticipantSlots):
+    for key in sorted(entry.key for entry in documents.list(limits.participant_slots_folder(project.id))):
+        if project.max_participants is not None and not _is_readable(documents, key, ParticipantSlots):
             yield bad(
                 check,
                 f"{key} cannot be read: some newcomers are not let in.",
                 f"{OLDER}; or delete it and register the project again, which counts those who are there.",
             )
-    if project.warm_servers and not _is(there, warm_pool.pool_key(project.id), Pool):
+    if project.warm_servers and not _is_readable(documents, warm_pool.pool_key(project.id), Pool):
         yield look(
             check,
             f"{warm_pool.pool_key(project.id)} cannot be read: it is made anew, and its warm servers are replaced.",
@@ -106,17 +106,17 @@ def _shared(there: Documents, project: Project) -> Iterator[Finding]:
         )
 
 
-def _sessions(there: Documents, project: Project) -> Iterator[Finding]:
-    """What is decided in the lobby, and the documents of the latest sessions."""
+def _sessions(documents: Documents, project: Project) -> Iterator[Finding]:
+    """The lobby's decisions, and the documents of the latest sessions."""
     check, key = f"project {project.id}", decisions.key(project.id)
-    if not _is(there, key, Decisions):
+    if not _is_readable(documents, key, Decisions):
         yield look(
             check,
             f"{key} cannot be read: it is made anew, and servers that were started ahead are replaced.",
             "Nothing needs to be done; if it comes back, see `python -m deploy logs sweep`.",
         )
-    entries = (entry for entry in there.list(sessions_folder(project.id)) if entry.key.endswith("/session.json"))
-    read = _read_latest(there, entries, parse)
+    entries = (entry for entry in documents.list(sessions_folder(project.id)) if entry.key.endswith("/session.json"))
+    read = _read_latest(documents, entries, parse)
     if wrong := read.count(False):
         yield bad(
             check,
@@ -126,14 +126,14 @@ def _sessions(there: Documents, project: Project) -> Iterator[Finding]:
         )
 
 
-def _participants(there: Documents, project: Project) -> Iterator[Finding]:
+def _participants(documents: Documents, project: Project) -> Iterator[Finding]:
     entries = (
         entry
-        for user, those in participants.folders(there, project.id)
+        for user, those in participants.folders(documents, project.id)
         for entry in those
         if entry.key == participant_key(project.id, user)
     )
-    read = _read_latest(there, entries, partial(from_json, kind=Participant))
+    read = _read_latest(documents, entries, partial(from_json, kind=Participant))
     if wrong := read.count(False):
         yield look(
             f"project {project.id}",
@@ -143,21 +143,21 @@ def _participants(there: Documents, project: Project) -> Iterator[Finding]:
         )
 
 
-def _read_latest(there: Documents, entries: Iterable[Entry], read: Callable[[bytes], object]) -> list[bool]:
-    """Of each of the latest of these documents, whether it can be read."""
+def _read_latest(documents: Documents, entries: Iterable[Entry], read: Callable[[bytes], object]) -> list[bool]:
+    """Whether each of the `LATEST` newest of these documents can be read."""
     latest = sorted(entries, key=lambda entry: entry.modified, reverse=True)[:LATEST]
     with ThreadPoolExecutor(READERS) as pool:
-        return list(pool.map(lambda entry: _can_be_read(there, entry.key, read), latest))
+        return list(pool.map(lambda entry: _can_be_read(documents, entry.key, read), latest))
 
 
-def _is(there: Documents, key: str, kind: type[Any]) -> bool:
-    """Whether a document is a record of this kind, or is not there at all."""
-    return _can_be_read(there, key, partial(from_json, kind=kind))
+def _is_readable(documents: Documents, key: str, kind: type[Any]) -> bool:
+    """Whether a document can be read as a record of this kind, or does not exist."""
+    return _can_be_read(documents, key, partial(from_json, kind=kind))
 
 
-def _can_be_read(there: Documents, key: str, read: Callable[[bytes], object]) -> bool:
-    """Whether `read`, which raises ValueError or RecursionError, can read a document, or it is not there at all."""
-    found = there.get(key)
+def _can_be_read(documents: Documents, key: str, read: Callable[[bytes], object]) -> bool:
+    """Whether `read`, which raises ValueError or RecursionError, accepts a document, or there is none."""
+    found = documents.get(key)
     try:
         if found:
             read(found.body)
@@ -167,15 +167,15 @@ def _can_be_read(there: Documents, key: str, read: Callable[[bytes], object]) ->
 
 
 def step_pages(context: CheckContext) -> Iterator[Finding]:
-    """The pages of the projects that are missing, or do not render for a participant without any data."""
+    """The projects' pages that are missing, or cannot be rendered for a participant without data."""
     wrong = [finding for project in context.projects for finding in _pages(context.platform.documents, project)]
     yield from wrong or [good("pages", "All are there and can be shown.")]
 
 
-def _pages(there: Documents, project: Project) -> Iterator[Finding]:
+def _pages(documents: Documents, project: Project) -> Iterator[Finding]:
     for step in project.steps:
         for file in step.files:
-            found = there.get(project.page_key(file))
+            found = documents.get(project.page_key(file))
             if found is None:
                 yield bad(f"project {project.id}", f"Step {step.key}: {file}.html is missing.", _again(project))
             else:
@@ -197,7 +197,7 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
         line = f" (line {error.line})" if error.line else ""
         if records_mentioned(source):
             text = f"Step {step.key}: {file}.html{line} fails for a participant without answers: {error.message}"
-            yield look(f"project {project.id}", text, "See that it can be shown to everybody who may come there.")
+            yield look(f"project {project.id}", text, "Make sure that every participant who may come there can see it.")
         else:
             text = f"Step {step.key}: {file}.html{line} cannot be shown: {error.message}"
             yield bad(f"project {project.id}", text, _again(project))

@@ -1,4 +1,4 @@
-"""What each project's servers run: the task definition, and the image that it names."""
+"""Checks what each project's servers run: the task definition, and the image that it names."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model import warm_pool
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
-OLD = 120  # days; its packages will want mending
-LONGEST_RUNTIME = 1440  # minutes that `apply --max-runtime` takes at most
+OLD = 120  # days after which an image's packages probably need updates
+LONGEST_RUNTIME = 1440  # minutes, the most that `apply --max-runtime` takes
 AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
 def projects(context: CheckContext) -> Iterator[Finding]:
-    """For each live project with a game, or the one that is asked about: can its servers start?"""
+    """Whether the servers of each live project, or of the wanted one, can start."""
     if not context.projects:
         yield look(
             "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."
@@ -76,17 +76,17 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
 
 
 def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Finding]:
-    """Whether warm servers have time to wait. Registering sees to it; the installation may be changed afterwards."""
+    """Whether warm servers have time to wait. `register` checks that, but the installation may change afterwards."""
     settings = context.platform.settings
     needed = project.max_runtime + MIN_RUNTIME_MARGIN
     if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
         return
     minutes = warm_pool.longest_wait(project, settings).total_seconds() / 60
-    kept = minutes >= warm_pool.MIN_LONGEST_WAIT.total_seconds() / 60
-    what = f"its warm servers are replaced every {minutes:.0f} minutes" if kept else "no warm servers are kept"
+    are_kept = minutes >= warm_pool.MIN_LONGEST_WAIT.total_seconds() / 60
+    effect = f"its warm servers are replaced every {minutes:.0f} minutes" if are_kept else "no warm servers are kept"
     yield look(
         check,
-        f"{what}: the installation stops servers after {settings.max_runtime} minutes, and maxRuntime is "
+        f"{effect}: the installation stops servers after {settings.max_runtime} minutes, and maxRuntime is "
         f"{project.max_runtime} of them.",
         f"Give `python -m deploy apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
         "or warmServers: 0."
@@ -96,7 +96,7 @@ def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Findi
 
 
 def _wrong(definition: Mapping[str, Any]) -> Iterator[str]:
-    """What would keep a server from starting."""
+    """What in the task definition would keep a server from starting."""
     if definition.get("status", "ACTIVE") != "ACTIVE":
         yield "was taken out of use"
     if _container(definition) is None:
@@ -112,7 +112,7 @@ def _container(definition: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
-    """The image is in the repository, whole, not too old, and without known holes."""
+    """Whether the image is in the repository, how old it is, and whether it has known vulnerabilities."""
     repository = context.installation["Repository"]
     name, _, digest = image.partition("@")
     if not name.startswith(repository) or name[len(repository) : len(repository) + 1] not in ("", ":"):
@@ -122,28 +122,28 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
     if not digest:
         yield look(check, f"names its image by a tag ({tag or 'latest'}), which may come to mean another one.", AGAIN)
     wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
-    client, called = context.account.client("ecr"), repository.partition("/")[2]
+    client, name_there = context.account.client("ecr"), repository.partition("/")[2]
     try:
-        there = client.describe_images(repositoryName=called, imageIds=[wanted])["imageDetails"]
+        details = client.describe_images(repositoryName=name_there, imageIds=[wanted])["imageDetails"]
     except (client.exceptions.ImageNotFoundException, client.exceptions.RepositoryNotFoundException):
-        there = []
-    if not there:
+        details = []
+    if not details:
         yield bad(check, "its image is not in the repository: pushed half-way, or deleted.", AGAIN)
         return
-    found = there[0]
+    found = details[0]
     age = (context.now - found["imagePushedAt"]).days
     size = found.get("imageSizeInBytes", 0) / 1e6
-    holes = _holes(client, called, found["imageDigest"])
-    if holes:
-        told = ", ".join(f"{count} {severity.lower()}" for severity, count in holes.items())
-        yield look(check, f"its image has known vulnerabilities: {told}.", f"{AGAIN} `--rebuild` takes newer packages.")
+    vulnerabilities = _vulnerabilities(client, name_there, found["imageDigest"])
+    if vulnerabilities:
+        text = ", ".join(f"{count} {severity.lower()}" for severity, count in vulnerabilities.items())
+        yield look(check, f"its image has known vulnerabilities: {text}.", f"{AGAIN} `--rebuild` takes newer packages.")
     if age > OLD:
         yield look(check, f"its image is {age} days old.", AGAIN)
     yield good(check, f"image of {size:,.0f} MB, {age} days old.")
 
 
-def _holes(client: Any, repository: str, digest: str) -> dict[str, int]:
-    """Vulnerabilities that matter, by severity; nothing if the image was not scanned."""
+def _vulnerabilities(client: Any, repository: str, digest: str) -> dict[str, int]:
+    """The number of critical and high vulnerabilities, by severity; {} if the image was not scanned."""
     try:
         found = client.describe_image_scan_findings(repositoryName=repository, imageId={"imageDigest": digest})
     except client.exceptions.ScanNotFoundException:

@@ -1,4 +1,4 @@
-"""A start and a stop of one real server, through the installation's own topics, queues and functions."""
+"""Starts and stops one real server through the installation's own topics, queues and functions."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from protocol.keys import session_key
 from protocol.session import Member, SessionDocument, owner_folder
 
 WAIT = 300.0  # seconds until a server should be ready; 45 to 90 are usual
-CLAIM = 60.0  # seconds until start_server should have acted
-LEAVE = 150.0  # seconds until nothing should be left
-PAUSE = 2.0
+CLAIM = 60.0  # seconds until start_server should have written the record
+LEAVE = 150.0  # seconds until nothing of the server should be left
+PAUSE = 2.0  # seconds between two looks
 CHECK = "rehearsal"
 
-Reach = Callable[[str], object]  # asks an https address; raises OSError without an answer
+Reach = Callable[[str], object]  # sends a request to an https address; raises OSError without an answer
 
 STAGES = {
     None: "the start message is on its way",
@@ -51,17 +51,17 @@ class SecondsToStates:
 
 
 class Rehearsal:
-    """Starts and stops one server without a participant. `told` is called with each thing that happens.
+    """Starts and stops one server without a participant. `progress` gets a text on each thing that happens.
 
-    In a project with sessions it is a session's server. Its session has a document, so that the sweep does not take it
-    for one that was started ahead in vain.
+    In a project with sessions it is a session's server. The session has a document, since the sweep stops servers that
+    were started ahead and got no session.
     """
 
     def __init__(
         self,
         platform: Platform,
         project: Project,
-        told: Callable[[str], None] = lambda _: None,
+        progress: Callable[[str], None] = lambda _: None,
         *,
         reach: Reach | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -70,20 +70,20 @@ class Rehearsal:
         self._reach = reach
         self._platform = platform
         self._project = project
-        self._told = told
+        self._progress = progress
         self._clock = clock
         self._sleep = sleep
         self._repository = Repository(platform.documents)
         self._name = f"rehearsal-{secrets.token_hex(6)}"
         self.user_id = ids.new_session_id() if project.has_sessions else self._name
         self.took = SecondsToStates()
-        self.left: list[Finding] = []  # what was found after an interruption
+        self.left: list[Finding] = []  # findings on what is left after an interruption
         self._record: Server | None = None
 
     def run(self) -> list[Finding]:
         """Start the server, wait until it is ready, stop it, and check that nothing is left.
 
-        If Ctrl-C interrupts it, it cleans up as well; then `left` says what was found, and the exception goes on.
+        After Ctrl-C it cleans up as well; then `left` has the findings, and the exception is raised again.
         """
         found: list[Finding] = []
         try:
@@ -94,8 +94,8 @@ class Rehearsal:
             self._platform.bus.publish(Topic.START, to_message(StartServer(self._project.id, self.user_id)))
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
-            what = "A warm server" if self._record and self._record.warm_server_name else "A server"
-            found.append(good(CHECK, f"{what} of {self._project.id}, {kind}: {self.took}."))
+            subject = "A warm server" if self._record and self._record.warm_server_name else "A server"
+            found.append(good(CHECK, f"{subject} of {self._project.id}, {kind}: {self.took}."))
             found += self._visit()
         except CheckFailed as failure:
             found.append(bad(CHECK, str(failure), failure.advice))
@@ -110,7 +110,7 @@ class Rehearsal:
             record = self._repository.server_of(self._project.id, self.user_id)
             self._record = record or self._record
             state = record.state if record else None
-            self._told(f"{seconds:3.0f} s  {STAGES[state]}")
+            self._progress(f"{seconds:3.0f} s  {STAGES[state]}")
             if record and state is not ServerState.CLOSED:
                 self.took.seconds.setdefault(record.state, seconds)
             if state is ServerState.READY:
@@ -127,7 +127,7 @@ class Rehearsal:
             self._sleep(PAUSE)
 
     def _late(self, record: Server | None) -> CheckFailed:
-        """Why it may have taken too long: the state, and whether ECS knows the task."""
+        """Why the server may be late, by its state and by whether ECS knows its task."""
         if record is not None and record.state is ServerState.STARTING:
             if self._platform.tasks.find(record.name, record.cluster):
                 return CheckFailed(
@@ -147,12 +147,12 @@ class Rehearsal:
         return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
 
     def _visit(self) -> list[Finding]:
-        """Knock at the game port by its name, as a browser does: DNS, the port, TLS and its certificate."""
+        """Connect to the server by its name, as a browser does: this needs DNS, the port, TLS and the certificate."""
         record = self._record
         if self._reach is None or record is None or record.dns_record is None:
             return []
         host = self._platform.dns.browser_host(record.dns_record)
-        self._told(f"knocking at {host}")
+        self._progress(f"connecting to {host}")
         try:
             self._reach(f"https://{host}:{record.port}/")
         except OSError as error:
@@ -172,18 +172,18 @@ class Rehearsal:
     # Afterwards
 
     def _leave(self) -> list[Finding]:
-        """Let it go, and look whether anything of it is left."""
+        """Stop the server, and check that nothing of it is left."""
         stop = StopServer(self._project.id, self.user_id)
-        self._told("stopping it")
-        with contextlib.suppress(Exception):  # then it is stopped from here
+        self._progress("stopping it")
+        with contextlib.suppress(Exception):  # then this machine stops it, below
             self._platform.bus.publish(Topic.STOP, to_message(stop))
         end = self._clock() + LEAVE
         helped = False
         while (left := self._left()) and self._clock() < end:
-            if self._clock() > end - LEAVE / 2 and not helped:  # the functions do not: do it from here
+            if self._clock() > end - LEAVE / 2 and not helped:  # the functions have not stopped it
                 helped = True
                 self._stop_from_here(stop)
-            self._told(f"stopping it: {', '.join(left)}")
+            self._progress(f"stopping it: {', '.join(left)}")
             self._sleep(PAUSE)
         if left:
             return [
@@ -194,7 +194,7 @@ class Rehearsal:
                 )
             ]
         ran = self._record is not None and self._record.running is not None
-        self._tidy(ran)
+        self._delete_documents(ran)
         found = [good(CHECK, "It was stopped, and nothing of it is left.")]
         if helped:
             found.append(
@@ -207,10 +207,11 @@ class Rehearsal:
         return found
 
     def _left(self) -> list[str]:
-        """What is still there."""
+        """What is left of the server, in words."""
         record = self._repository.server_of(self._project.id, self.user_id)
         if record is None:
-            return ["the start message"]  # it may still be acted upon: the stop leaves a record for it to find
+            # A function may still start the server. The stop message makes a closed record, which prevents that.
+            return ["the start message"]
         self._record = record
         if not record.is_closed:
             return ["its record"]
@@ -224,8 +225,8 @@ class Rehearsal:
         with functions_log():
             Termination(ServerServices(self._platform)).stop([stop])
 
-    def _tidy(self, ran: bool) -> None:
-        """Forget the rehearsal. The closed record of a server that never ran stays: a late start has to find it."""
+    def _delete_documents(self, ran: bool) -> None:
+        """Delete the rehearsal's documents. The record of a server that never ran stays, to prevent a late start."""
         documents, project_id = self._platform.documents, self._project.id
         for entry in list(documents.list(owner_folder(project_id, self.user_id))):
             documents.delete(entry.key)
@@ -235,7 +236,7 @@ class Rehearsal:
 
 
 def write_session(documents: Documents, project_id: str, session: SessionDocument) -> None:
-    """Write the document of a session that is to have a server, which the sweep would stop without it."""
+    """Write the document of a session. Without it, the sweep would stop the session's server."""
     documents.create(session_key(project_id, session.id), session.to_json())
 
 
@@ -245,5 +246,5 @@ def _why(record: Server) -> str:
 
 
 def project_for(context: CheckContext) -> Project | None:
-    """The project whose server is rehearsed: a live one with a game; None if there is none."""
+    """The first live project with a game, whose server is started; None if there is none."""
     return next((p for p in context.projects if p.live and p.game_steps and p.task_definition), None)

@@ -1,4 +1,4 @@
-"""The bucket, the queues, the alarms, and who gets the alarms' mails."""
+"""Checks the bucket, the queues, the alarms, and who gets the alarms' mails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ APPLY = "Run `python -m deploy apply`: it puts this right."
 
 
 def bucket(context: CheckContext) -> Iterator[Finding]:
-    """The bucket belongs to this account, is closed to the public, keeps versions, and answers over TLS alone."""
+    """Whether the bucket belongs to this account, is closed to the public, keeps versions, and requires TLS."""
     name, client = context.installation["Bucket"], context.account.client("s3")
     try:
         client.head_bucket(Bucket=name, ExpectedBucketOwner=context.account.id)
@@ -31,13 +31,13 @@ def bucket(context: CheckContext) -> Iterator[Finding]:
         else:
             raise
         return
-    wrong = [*_open(context, name), *_unsafe(context, name)]
+    wrong = [*_public_access(context, name), *_versions_and_policy(context, name)]
     yield from wrong
     if not wrong:
         yield good("bucket", f"{name}: private, versioned, TLS only.")
 
 
-def _open(context: CheckContext, name: str) -> Iterator[Finding]:
+def _public_access(context: CheckContext, name: str) -> Iterator[Finding]:
     client = context.account.client("s3")
     try:
         block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
@@ -45,13 +45,13 @@ def _open(context: CheckContext, name: str) -> Iterator[Finding]:
         if errors.code(error) != "NoSuchPublicAccessBlockConfiguration":
             raise
         block = {}
-    names = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
-    off = [one for one in names if not block.get(one)]
+    settings = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
+    off = [one for one in settings if not block.get(one)]
     if off:
         yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
 
 
-def _unsafe(context: CheckContext, name: str) -> Iterator[Finding]:
+def _versions_and_policy(context: CheckContext, name: str) -> Iterator[Finding]:
     client = context.account.client("s3")
     if client.get_bucket_versioning(Bucket=name).get("Status") != "Enabled":
         yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
@@ -63,20 +63,20 @@ def _unsafe(context: CheckContext, name: str) -> Iterator[Finding]:
         policy = {}
     statements = policy.get("Statement", [])
     statements = [statements] if isinstance(statements, dict) else statements
-    if not any(_denies_plain(one) for one in statements):
+    if not any(_denies_without_tls(one) for one in statements):
         yield bad("bucket", f"{name} can be read without TLS.", APPLY)
     for one in statements:
         if one.get("Effect") == "Allow" and one.get("Principal") in ("*", {"AWS": "*"}) and not one.get("Condition"):
             yield bad("bucket", f"The policy of {name} lets everybody in.", "Take that statement out of it.")
 
 
-def _denies_plain(statement: dict[str, object]) -> bool:
+def _denies_without_tls(statement: dict[str, object]) -> bool:
     condition = json.dumps(statement.get("Condition", {})).lower().replace(" ", "")
     return statement.get("Effect") == "Deny" and '"aws:securetransport":"false"' in condition
 
 
 def queues(context: CheckContext) -> Iterator[Finding]:
-    """Nothing lies in the dead-letter queues, and nothing waits for long."""
+    """Whether the dead-letter queues are empty, and how many messages wait."""
     found = snapshot.queues(context.account, context.installation.stack)
     dead = [queue for queue in found if queue.dead]
     if not dead:
@@ -95,7 +95,7 @@ def queues(context: CheckContext) -> Iterator[Finding]:
 
 
 def alarms(context: CheckContext) -> Iterator[Finding]:
-    """No alarm fires."""
+    """Whether an alarm fires."""
     found = [*snapshot.alarms(context.account, context.installation)]
     firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
     if not found:
@@ -111,15 +111,15 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
 
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
-    """The alarms' topic has a confirmed subscription."""
+    """Whether the alarms' topic has a confirmed subscription."""
     pages = context.account.client("sns").get_paginator("list_subscriptions_by_topic")
     topic = context.installation["Alarms"]
     found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]
     pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
-    heard = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
+    confirmed = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
     if pending:
         yield look("alarm e-mail", f"{', '.join(pending)} has not confirmed.", "Follow the link in AWS's e-mail.")
-    if heard:
-        yield good("alarm e-mail", f"Alarms go to {', '.join(heard)}.")
+    if confirmed:
+        yield good("alarm e-mail", f"Alarms go to {', '.join(confirmed)}.")
     elif not pending:
         yield look("alarm e-mail", "The alarms have no subscriber.", "Give `python -m deploy apply` an --email.")

@@ -62,14 +62,14 @@ class BuildLog:
                 self._last.append(line)
                 self._show(line)
 
-    def failure(self, what: str, more: Iterable[str] = ()) -> Problem:
-        """The problem to raise, with advice. Its details: the log's lines on errors, else its last lines; then `more`."""
+    def failure(self, summary: str, more: Iterable[str] = ()) -> Problem:
+        """The problem to raise, with advice. Details: the log's lines on errors (else its last lines), and `more`."""
         more, lines = list(more), list(self._last)
         missing = _missing("\n".join(lines))
         if missing:
-            return Problem(f"{what.rstrip('.')}: {missing[0]}", missing[1])
+            return Problem(f"{summary.rstrip('.')}: {missing[0]}", missing[1])
         of_errors = [line for line in lines if re.search(r"\bERROR\b|\b[Ee]rror:", line)]
-        return Problem(what, advice("\n".join([*lines, *more])), [*(of_errors or lines)[-SHOWN:], *more])
+        return Problem(summary, advice("\n".join([*lines, *more])), [*(of_errors or lines)[-SHOWN:], *more])
 
 
 def advice(log: str) -> str:

@@ -1,4 +1,4 @@
-"""How the rehearsal with bots is asked for, watched and kept."""
+"""Runs the rehearsal with bots: asks first, shows its progress, and writes the transcript."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ from deploy.operate.doctor.play.play import Play, expected
 from deploy.operate.doctor.play.transcript import Transcript
 from deploy.operate.doctor.rehearsal import CHECK, project_for
 
-QUIET = 30.0  # seconds between two lines about what is going on, where there is no terminal
+QUIET = 30.0  # seconds between two lines of progress, if there is no terminal
 
 
 def played(
     context: CheckContext, bots: int, *, minutes: int, yes: bool, file: Path | None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Ask, rehearse, write the transcript; return findings and transcript. Raises `Problem` if the answer is no."""
+    """Ask, rehearse, and write the transcript into `file`; return the findings and the transcript as JSON data.
+
+    Raises `Problem` if the answer is no, or the file's folder does not exist.
+    """
     project = project_for(context)
     if project is None:
         return [bad(CHECK, "No live project has a game: there is nothing to play.", "Register one with --live.")], {}
@@ -41,8 +44,8 @@ def played(
     )
     screen.confirm("Begin?", yes)
     began = datetime.now(UTC)
-    with _as_interrupt(), _watched() as told:
-        play = Play(context, project, bots, told, minutes=minutes)
+    with _as_interrupt(), _watched() as progress:
+        play = Play(context, project, bots, progress, minutes=minutes)
         try:
             play.run()
         finally:
@@ -65,23 +68,23 @@ def _write(file: Path, transcript: Transcript, began: datetime, region: str, bot
 
 @contextlib.contextmanager
 def _watched() -> Iterator[Callable[[str], None]]:
-    """What is going on: a line that changes, or on no terminal a line now and then."""
+    """Within the block, show the text of each call: in one line of a terminal, else in a line every `QUIET` seconds."""
     last = time.monotonic() - QUIET
     with screen.err.status("Rehearsing …") as status:
 
-        def told(text: str) -> None:
+        def progress(text: str) -> None:
             nonlocal last
             status.update(f"Rehearsing: {text}")
             if not screen.err.is_terminal and time.monotonic() - last >= QUIET:
                 last = time.monotonic()
                 screen.info(f"  {text}")
 
-        yield told
+        yield progress
 
 
 @contextlib.contextmanager
 def _as_interrupt() -> Iterator[None]:
-    """A closed terminal or a `kill` is a Ctrl-C: nothing may be left over."""
+    """Within the block, SIGTERM and a closed terminal raise KeyboardInterrupt, so that everything is removed."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""Makes a copy of a registered study for bots, and removes it with everything that the bots left.
+"""Makes a copy of a registered study for bots, and removes the copy with all documents of the bots.
 
 The study itself is not touched: the copy is a project with its own id and its own pages, so the bots' answers are never
 stored among the participants'. It runs the study's image, by its task definition.
@@ -33,12 +33,12 @@ from protocol.keys import questions_folder
 ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
 MAX_RUNTIME = 30  # minutes: no server lives longer, even if the rehearsal is killed
 OLD = timedelta(hours=2)  # a rehearsal takes minutes, so a copy of this age is a leftover
-TRIES = 20
+TRIES = 20  # at writing the list of projects
 CONTROLS = ("left", "right", "up", "down", "start", "pause")  # the controls of a game whose `trial` section has no `ui`
 
 
 class Copy:
-    """The copy of one study. `make` sets `project`."""
+    """The copy of a study. `make` registers it; before that, `project` must not be used."""
 
     def __init__(self, account: Account, installation: Installation, platform: Platform) -> None:
         self.id = f"rehearsal-{secrets.token_hex(16)}"
@@ -55,11 +55,11 @@ class Copy:
 
     @property
     def players(self) -> int:
-        """How many participants play together; 1 also before the copy is made."""
+        """How many participants play together; 1 before the copy is made."""
         return self._made.players if self._made else 1
 
     def make(self, of: Project) -> int:
-        """Copy the pages and register the copy; return how many pages there are. Raises `Problem`."""
+        """Copy the pages of the project `of` and register the copy; return the number of pages. Raises `Problem`."""
         documents = self._platform.documents
         for key, name in (pages := page_files(documents, of)).items():
             found = documents.get(key)
@@ -81,9 +81,9 @@ class Copy:
         (signature,) = links.signed(self._account, self._installation, self.id, [user_id]).values()
         return links.link(self._installation["Site"], self.project, user_id, signature)
 
-    def remove(self, told: Callable[[str], None] = lambda _: None) -> int:
+    def remove(self, progress: Callable[[str], None] = lambda _: None) -> int:
         """Remove servers, documents in all versions, and the registration; return how many versions were deleted."""
-        return remove(self._account, self._installation, self._platform, self.id, users=self.users, told=told)
+        return remove(self._account, self._installation, self._platform, self.id, users=self.users, progress=progress)
 
 
 def changed(project: Project, new_id: str) -> Project:
@@ -109,7 +109,7 @@ def changed(project: Project, new_id: str) -> Project:
 
 
 def page_files(documents: Documents, of: Project) -> dict[str, str]:
-    """The names of a project's pages, and of the files beside them, by key."""
+    """Key → file name, for a project's pages and the files beside them."""
     prefix = f"{of.id}/{STEPS_FOLDER}/"
     found = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
     if of.page_folder == STEPS_FOLDER:
@@ -119,7 +119,7 @@ def page_files(documents: Documents, of: Project) -> dict[str, str]:
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:
-    """The ids of copies that killed rehearsals left behind. Copies of rehearsals that may still run are left out."""
+    """The ids of copies that killed rehearsals have left. Copies of rehearsals that may still run are left out."""
     ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
     return [one for one in ids if _age(documents, one, now) > OLD]
 
@@ -136,16 +136,17 @@ def remove(
     project_id: str,
     *,
     users: Iterable[str] | None = None,
-    told: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Remove a copy by its id, with these bots and those that have documents; return how many versions were deleted.
+    """Remove a copy by its id, with all bots in `users` or with documents; return how many versions were deleted.
 
-    Without `users`, search all servers' records, too: a bot may have no other document. Raises `Problem`.
+    Without `users`, this searches the records of all servers, too, since a bot may have no other document. Raises
+    `Problem` if something of a bot is left.
     """
-    told("removing the copy of the study from the list")
+    progress("removing the copy of the study from the list")
     unregister(platform.documents, project_id)
     known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.folders(platform.documents, project_id))])
-    known |= dict.fromkeys(_sessions_ahead(platform.documents, project_id))
+    known |= dict.fromkeys(_lobby_sessions(platform.documents, project_id))
     if users is None:
         records = Records(platform.documents).since()
         known |= dict.fromkeys(record.user_id for record in records if record.project_id == project_id)
@@ -153,26 +154,26 @@ def remove(
     lobby = (entries.folder(project_id), decisions.key(project_id), questions_folder(project_id))
     deleted = sum(bucket.delete(bucket.versions(place)) for place in lobby)
     for number, user in enumerate(known, 1):
-        told(f"removing what is left of bot {number} of {len(known)}")
+        progress(f"removing what is left of bot {number} of {len(known)}")
         eraser = Eraser(account, installation, project_id, user, late=False)
         if eraser.run():
             raise Problem("Something of a bot is still there.", f"`python -m deploy stop --project {project_id}`.")
         deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.receipt.deleted.values())
-    told("removing the pages")
+    progress("removing the pages")
     return deleted + bucket.delete(bucket.versions(f"{project_id}/"))
 
 
-def _sessions_ahead(documents: Documents, project_id: str) -> list[str]:
-    """The ids of sessions that no bot is a member of: their servers were started ahead."""
+def _lobby_sessions(documents: Documents, project_id: str) -> list[str]:
+    """The ids of sessions in the lobby's decisions: some have a server, which was started ahead, but no members."""
     found = documents.get(decisions.key(project_id))
     try:
         return sorted(from_json(found.body, Decisions).session_ids()) if found else []
-    except (ValueError, RecursionError):  # the sweep stops what no lobby lists
+    except (ValueError, RecursionError):  # the sweep stops servers that no lobby lists
         return []
 
 
 def unregister(documents: Documents, project_id: str) -> None:
-    """Remove a project from the list, even while others write the list. Does nothing if the project is not in it."""
+    """Remove a project from the list of projects, if it is there. Raises `Problem` after `TRIES` conflicts."""
     for _ in range(TRIES):
         found = documents.get(MASTER_LIST)
         listed = read_list(found.body) if found else MasterList()

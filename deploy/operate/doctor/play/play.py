@@ -1,7 +1,7 @@
-"""The rehearsal as a whole: its parts, one after the other, and the copy that is removed at its end.
+"""Runs a rehearsal: makes the copy, runs the parts one after the other, and removes the copy.
 
-The parts do not depend on each other: what fails is a line with a remedy, and the others go on. Whatever happens, also
-after Ctrl-C, the copy is removed with everything that came of it.
+If a part fails, the transcript gets a line with advice, and the next part runs. In any case, also after Ctrl-C, the
+copy is removed with all documents and servers of the bots.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 
 
 def expected(project: Project, bots: int) -> Usd:
-    """What the rehearsal will cost."""
+    """What a rehearsal of this project will cost."""
     return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
 
 
 def site(context: CheckContext, project_id: str) -> OneSite:
-    """The addresses that bots may open: this installation's site, and its servers by their names."""
+    """The addresses that bots may open: the installation's site, and its servers."""
     servers = context.platform.settings.game_sources.split()
     return OneSite(context.installation["Site"], servers, project_id, tls=addresses.authorities())
 
 
 class Play:
-    """One rehearsal. `told` is called with each thing that happens; `transcript` says what was proven."""
+    """One rehearsal. `progress` gets a text on each thing that happens; `transcript` has the results."""
 
     def __init__(
         self,
         context: CheckContext,
         project: Project,
         bots: int,
-        told: Callable[[str], None] = lambda _: None,
+        progress: Callable[[str], None] = lambda _: None,
         *,
         minutes: float = WITHIN,
     ) -> None:
-        self._patient, self._of, self._bots, self._told = context, project, bots, told
+        self._context, self._project, self._bots, self._progress = context, project, bots, progress
         self._copy = Copy(context.account, context.installation, context.platform)
         self.transcript = Transcript()
         installation = context.installation
@@ -68,15 +68,13 @@ class Play:
             self._copy,
             site(context, self._copy.id),
             self.transcript,
-            told,
+            progress,
             until=time.monotonic() + minutes * 60,
         )
-        self._walk: Walk | None = None
-        self._timer: upkeep.Timer | None = None
 
     def run(self) -> Transcript:
-        """Run all parts, then remove everything. After Ctrl-C too: then KeyboardInterrupt goes on."""
-        self._part("erased", self._tidy_up)
+        """Run all parts, then remove everything. After Ctrl-C, remove everything and raise KeyboardInterrupt."""
+        self._part("erased", self._remove_old_copies)
         try:
             if self._part("study", self._make):
                 self._parts()
@@ -89,9 +87,9 @@ class Play:
         return self.transcript
 
     def _parts(self) -> None:
-        timer = self._timer = upkeep.Timer(self._scene)
+        timer = upkeep.Timer(self._scene)
         began = self._part("timer", timer.begin)
-        walk = self._walk = Walk(self._scene, self._bots)
+        walk = Walk(self._scene, self._bots)
         for key, part in (
             ("site", walk.site),
             ("links", walk.links),
@@ -111,7 +109,7 @@ class Play:
         self._part("times", lambda: upkeep.times(self._scene, self._records()))
 
     def _part(self, key: str, part: Callable[[], None]) -> bool:
-        """Run one part; return whether it came to its end. If not, a line says why, and what to do."""
+        """Run one part; return whether it succeeded. If not, add a line that says why, and what to do."""
         try:
             part()
         except CheckFailed as failed:
@@ -124,24 +122,24 @@ class Play:
         return False
 
     def _records(self) -> list[Server]:
-        """The records of every server of the rehearsal, each once, as they are now."""
+        """The present records of all servers of the rehearsal, each once."""
         return each_once(record for user in self._copy.users if (record := self._scene.server(user)))
 
     def _make(self) -> None:
-        self._told("registering a copy of the study")
-        pages = self._copy.make(self._of)
+        self._progress("registering a copy of the study")
+        pages = self._copy.make(self._project)
         self.transcript.hide(self._copy.project.salt)
-        self._told("waiting until every function knows the copy")
+        self._progress("waiting until every function knows the copy")
         self._scene.sleep((FRESH + timedelta(seconds=1)).total_seconds())
         self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")
 
-    def _tidy_up(self) -> None:
-        """Remove what a rehearsal has left that was killed."""
-        context = self._patient
+    def _remove_old_copies(self) -> None:
+        """Remove the copies that killed rehearsals have left."""
+        context = self._context
         for project_id in left_behind(context.platform.documents, datetime.now(UTC)):
-            self._told("removing what an earlier rehearsal has left")
-            remove(context.account, context.installation, context.platform, project_id, told=self._told)
+            self._progress("removing what an earlier rehearsal has left")
+            remove(context.account, context.installation, context.platform, project_id, progress=self._progress)
 
     def _remove(self) -> None:
-        deleted = self._copy.remove(self._told)
+        deleted = self._copy.remove(self._progress)
         self.transcript.good("erased", f"The copy and the bots' data are gone, {deleted} versions of documents in all.")

@@ -1,4 +1,4 @@
-"""What the parts of a rehearsal share: the copy of the study, where bots may go, waiting with a word about it."""
+"""What the parts of a rehearsal share: the copy of the study, the bots' addresses, and waiting with progress texts."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from hippodrome.ports import Platform
 from hippodrome.storage.repository import Repository
 
 PAUSE = 2.0  # seconds between two looks
-BOT_PATIENCE = 420.0  # seconds that a bot waits for any one thing: three attempts of a server take so long at worst
+BOT_PATIENCE = 420.0  # seconds that a bot waits for one event: the longest time of three attempts of a server
 T = TypeVar("T")
 
 
 @dataclass
 class RehearsalContext:
-    """What every part needs. By the time `until` of `clock`, all must be over."""
+    """The input of every part. When `clock` says `until`, the rehearsal must end."""
 
     context: CheckContext
     copy: Copy
     where: OneSite
     transcript: Transcript
-    told: Callable[[str], None]
+    progress: Callable[[str], None]
     until: float
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
@@ -44,15 +44,15 @@ class RehearsalContext:
         return Repository(self.platform.documents)
 
     def left(self) -> float:
-        """Seconds until all must be over."""
+        """Seconds until the rehearsal must end."""
         return max(self.until - self.clock(), 0.0)
 
     def bot(self, name: str, play: float) -> Bot:
-        """A new bot with its signed link. The transcript hides its id."""
+        """A new bot with its signed link, which plays for `play` seconds. The transcript hides its id."""
         user = self.copy.user(name)
         self.transcript.hide(user)
         patience = min(BOT_PATIENCE, self.left())
-        random = Random(user)  # noqa: S311 - a game's keys
+        random = Random(user)  # noqa: S311 - for the keys that it presses
         return Bot(self.copy.link(user), user, random, play=play, patience=patience, allowed=self.where)
 
     def server(self, user: str) -> Server | None:
@@ -63,13 +63,13 @@ class RehearsalContext:
             self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
         return found
 
-    def wait(self, look: Callable[[], T | None], what: str, seconds: float, failed: CheckFailed) -> T:
-        """Call `look` until it returns something; return that. Raises `failed` after so many seconds, or at `until`."""
+    def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
+        """Call `look` until it returns a value; return that. Raises `failed` after so many seconds, or at `until`."""
         began = self.clock()
         while (found := look()) is None:
             spent = self.clock() - began
             if spent > seconds or not self.left():
                 raise failed
-            self.told(f"{what}, {spent:.0f} s")
+            self.progress(f"{activity}, {spent:.0f} s")
             self.sleep(PAUSE)
         return found

@@ -1,6 +1,7 @@
-"""How long AWS's stages take in the simulation, in seconds. A rehearsal shows its own times beside these.
+"""How many seconds AWS's stages take in the simulation. A rehearsal shows its own times beside these.
 
-The figures are those of `testing/simulation`, which no command imports: `tests/deploy/operate/test_play.py` compares.
+The figures are those of `testing/simulation`, which no command imports: `tests/deploy/operate/test_play.py` compares
+them.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from typing import NamedTuple
 
 
 class SimulatedStage(NamedTuple):
-    """A stage that is measured, and its seconds in the simulation: usually (from, to), and at most."""
+    """A measured stage, and its seconds in the simulation: the usual range (from, to), and the most."""
 
-    what: str
+    what: str  # the stage in words
     usual: tuple[float, float]
     most: float
 

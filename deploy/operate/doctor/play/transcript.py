@@ -1,4 +1,4 @@
-"""What a rehearsal with bots has proven, line by line, fit to be kept and shown: no ids, tokens or addresses."""
+"""The results of a rehearsal with bots, line by line. Without ids, tokens and addresses, they can be published."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LINES: Mapping[str, str] = {
     "erased": "nothing of the rehearsal is left",
     "cost": "what it cost",
 }
-"""The keys of the lines, in the order of a rehearsal, and what each proves. docs/unproven.md names them."""
+"""Key of a line → what it proves, in the order of a rehearsal. docs/unproven.md names the keys."""
 
 _PATTERNS = (
     re.compile(r"arn:[\w:/.*~-]+"),
@@ -41,12 +41,12 @@ _PATTERNS = (
     re.compile(r"\b[0-9a-f]{16,}\b"),
 )
 HIDDEN = "…"
-LONGEST = 1_000  # characters of a line: some are a server's own words, whatever its agent says
+LONGEST = 1_000  # characters of a line: parts of it may be an agent's own output
 
 
 @dataclass(frozen=True)
 class TranscriptLine:
-    """One line: its key, its mark, when it was said (seconds from the beginning), and what was measured."""
+    """One line: its key, mark, text and advice, its time (seconds from the beginning), and what was measured."""
 
     key: str
     mark: Mark
@@ -57,7 +57,7 @@ class TranscriptLine:
 
 
 class Transcript:
-    """The lines until now. Every text goes through `clean` first."""
+    """The lines up to now. `clean` removes secrets from every text first."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.lines: list[TranscriptLine] = []
@@ -66,13 +66,13 @@ class Transcript:
         self._secrets: set[str] = set()
 
     def hide(self, *secrets: str | None) -> None:
-        """Hide these ids, tokens, names and addresses from now on, which no pattern would find."""
+        """Remove these ids, tokens, names and addresses from all later lines. No pattern would find them."""
         self._secrets.update(secret for secret in secrets if secret)
 
     def clean(self, text: str) -> str:
         """The text without ids, tokens, and anything that reveals the account.
 
-        It has no control characters either: a study's agent may have written a part of it.
+        Control characters are removed, too, since a study's agent may have written a part of the text.
         """
         text = "".join(character if character.isprintable() else " " for character in text)
         for secret in sorted(self._secrets, key=len, reverse=True):
@@ -82,7 +82,7 @@ class Transcript:
         return text if len(text) <= LONGEST else f"{text[:LONGEST]} {HIDDEN}"
 
     def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
-        """Add a line. Raises KeyError for one that is not among `LINES`."""
+        """Add a line with the figures `seconds`. Raises KeyError if its key is not among `LINES`."""
         LINES[key]
         at = round(self._clock() - self._began, 1)
         self.lines.append(TranscriptLine(key, mark, self.clean(text), self.clean(advice), at, seconds))
@@ -103,12 +103,12 @@ class Transcript:
 
     @property
     def proven(self) -> list[str]:
-        """The keys of what is proven: nothing bad was said of it."""
+        """The keys of proven results: all their lines are good."""
         bad = {line.key for line in self.lines if line.mark is not Mark.GOOD}
         return [key for key in LINES if self.has(key) and key not in bad]
 
     def document(self, began: datetime, region: str, bots: int) -> dict[str, Any]:
-        """The whole, for a file."""
+        """The transcript as JSON data, for a file."""
         return {
             "schema": SCHEMA,
             "what": "a rehearsal with simulated participants on a real account",
@@ -121,16 +121,16 @@ class Transcript:
 
 
 def _plain(line: TranscriptLine) -> dict[str, Any]:
-    told = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
+    data = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
     return {
-        **told,
+        **data,
         **({"advice": line.advice} if line.advice else {}),
         **({"seconds": line.seconds} if line.seconds else {}),
     }
 
 
 def shown(values: Iterable[float]) -> str:
-    """Seconds, from the least to the most."""
+    """The range of these seconds, in words: `3 s`, or `3 to 8 s`."""
     ordered = sorted(values)
     low, high = ordered[0], ordered[-1]
     return f"{low:.0f} s" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} s"

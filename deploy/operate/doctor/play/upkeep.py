@@ -1,4 +1,4 @@
-"""What happens without participants: the timer of a server, the sweep, an alarm; and what all of it took and cost."""
+"""The parts of a rehearsal without bots: a server's timer, the sweep, an alarm, the times of AWS, and the cost."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from hippodrome.ports import DnsRecord, Topic
 from protocol.session import Member, SessionDocument
 
 READY = 420.0  # seconds until a server must be ready, a lost attempt included
-SOON = timedelta(seconds=75)  # from now: a timer fires within the minute after its time
-FIRED = 330.0  # seconds until its server must be closed
+SOON = timedelta(seconds=75)  # from now until the moved timer; a timer fires within the minute after its time
+FIRED = 330.0  # seconds until the timer's server must be closed
 TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
-LEFTOVERS = 2  # a timer and a name
+LEFTOVERS = 2  # a timer and a name, which the sweep has to remove
 SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
-ACTED = 60.0  # seconds until CloudWatch must have told the topic
-NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737): it leads nowhere
+ACTED = 60.0  # seconds until CloudWatch must have sent to the topic
+NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737), which no host has
 REASON = "Rehearsal: set by hand to see whether this alarm is delivered. Nothing is wrong."
 
 
 class Timer:
     """A server without a participant, which only its timer ends. `begin` starts it, `end` checks that it has ended.
 
-    The rehearsal does not wait for the project's `maxRuntime`: when the server is ready, and its timer is seen to stand
-    at the deadline, the timer is moved to the next minute, under the same name, with the same role, topic and message.
+    The rehearsal does not wait for the project's `maxRuntime`. It checks that the ready server has a timer at its
+    deadline, and moves the timer to the next minute, with the same name, role, topic and message.
     """
 
     def __init__(self, scene: RehearsalContext) -> None:
@@ -114,7 +114,10 @@ class Timer:
 
 
 def sweep(scene: RehearsalContext, closed: Server | None) -> None:
-    """Run the sweep, with a timer and a name that a closed server has left: it removes both. Raises `CheckFailed`."""
+    """Make a timer and a name for a closed server, run the sweep, and check that it removes both.
+
+    Raises `CheckFailed`.
+    """
     if closed is None or not closed.is_closed:
         raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
     platform = scene.platform
@@ -128,13 +131,13 @@ def sweep(scene: RehearsalContext, closed: Server | None) -> None:
         SEEN,
         CheckFailed("A timer and a name were made, and AWS does not list them.", "Run it again."),
     )
-    scene.told("running the sweep")
+    scene.progress("running the sweep")
     answer = scene.context.account.client("lambda").invoke(
         FunctionName=resource_names.function(scene.context.installation.stack, "sweep"), Payload=b"{}"
     )
-    said = answer["Payload"].read()
+    payload = answer["Payload"].read()
     if answer.get("FunctionError"):
-        kind = _type_of(said)
+        kind = _type_of(payload)
         raise CheckFailed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
     scene.wait(
         lambda: None if left(scene, closed.user_id) else True,
@@ -153,26 +156,26 @@ def _type_of(body: bytes) -> str:
 
 
 def alarm(scene: RehearsalContext) -> None:
-    """Set one of the alarms off by hand, see that its topic was told, and set it back. Raises `CheckFailed`.
+    """Set an alarm to ALARM by hand, check that its topic got a message, and set it back. Raises `CheckFailed`.
 
-    CloudWatch takes an alarm back to its actual state by itself, often within seconds; what it has done is in the
-    alarm's history (CloudWatch API Reference, SetAlarmState). What arrives in a mailbox only its owner can see.
+    CloudWatch sets an alarm back to its actual state by itself, often within seconds; its actions are in the alarm's
+    history (CloudWatch API Reference, SetAlarmState). Whether a mail arrives, only the mailbox's owner can see.
     """
     context = scene.context
     cloudwatch, topic = context.account.client("cloudwatch"), context.installation["Alarms"]
-    calm = [
+    quiet = [
         one
         for one in snapshot.alarms(context.account, context.installation)
         if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
     ]
-    if not calm:
+    if not quiet:
         raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `python -m deploy apply`.")
-    chosen = min(calm, key=lambda one: str(one["AlarmName"]))
+    chosen = min(quiet, key=lambda one: str(one["AlarmName"]))
     name, before, began = chosen["AlarmName"], chosen.get("StateValue", "OK"), datetime.now(UTC) - timedelta(seconds=5)
     cloudwatch.set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason=REASON)
     try:
         scene.wait(
-            lambda: True if _told_topic(cloudwatch, name, began) else None,
+            lambda: True if _sent_to_topic(cloudwatch, name, began) else None,
             "waiting until the alarm has reached its topic",
             ACTED,
             CheckFailed(
@@ -183,12 +186,12 @@ def alarm(scene: RehearsalContext) -> None:
         now = cloudwatch.describe_alarms(AlarmNames=[name])["MetricAlarms"]
         if now and now[0].get("StateValue") == "ALARM":
             cloudwatch.set_alarm_state(AlarmName=name, StateValue=before, StateReason=REASON)
-    heard = _subscribed(context.account.client("sns"), topic)
-    if heard:
+    subscribers = _subscribers(context.account.client("sns"), topic)
+    if subscribers:
         scene.transcript.good(
             "alarm",
             "An alarm was set off and reached its topic: a mail is on its way to "
-            + ("1 address." if heard == 1 else f"{heard} addresses."),
+            + ("1 address." if subscribers == 1 else f"{subscribers} addresses."),
         )
     else:
         scene.transcript.say(
@@ -199,44 +202,45 @@ def alarm(scene: RehearsalContext) -> None:
         )
 
 
-def _told_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
+def _sent_to_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
     found = cloudwatch.describe_alarm_history(AlarmName=name, HistoryItemType="Action", StartDate=since)
     return any("success" in one.get("HistorySummary", "").lower() for one in found["AlarmHistoryItems"])
 
 
-def _subscribed(sns: Any, topic: str) -> int:
+def _subscribers(sns: Any, topic: str) -> int:
+    """The number of confirmed subscriptions of a topic."""
     pages = sns.get_paginator("list_subscriptions_by_topic").paginate(TopicArn=topic)
     return sum(one["SubscriptionArn"].startswith("arn:") for page in pages for one in page["Subscriptions"])
 
 
 def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
-    """Say how long AWS took for each stage, beside what the simulation assumes."""
+    """Add the line on how long AWS took for each stage, beside the times of the simulation. Raises `CheckFailed`."""
     tasks = _tasks(scene, records)
     measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
     for record in records:
         task = tasks.get(record.task or "", {})
         started = task.get("startedAt")
-        _note(measured["start"], task.get("createdAt"), started)
-        _note(measured["told"], started, record.running)
-        _note(measured["name"], record.running, record.ready)
-        _note(measured["gone"], task.get("executionStoppedAt"), task.get("stoppedAt"))
-    told, slow = [], []
+        _add_seconds(measured["start"], task.get("createdAt"), started)
+        _add_seconds(measured["told"], started, record.running)
+        _add_seconds(measured["name"], record.running, record.ready)
+        _add_seconds(measured["gone"], task.get("executionStoppedAt"), task.get("stoppedAt"))
+    texts, slow = [], []
     for stage, seconds in measured.items():
         assumed = STAGES[stage]
         usual = f"{assumed.usual[0]:.0f} to {assumed.usual[1]:.0f} s, at most {assumed.most:.0f} s"
         if seconds:
-            told.append(f"{assumed.what}: {shown(seconds)} (simulated: {usual})")
+            texts.append(f"{assumed.what}: {shown(seconds)} (simulated: {usual})")
             slow += [stage] if max(seconds) > assumed.most else []
-    if not told:
+    if not texts:
         raise CheckFailed("No server ran, so nothing was measured.", "See the line `servers`.")
     rounded = {stage: [round(one, 1) for one in seconds] for stage, seconds in measured.items()}
     mark = Mark.LOOK if slow else Mark.GOOD
     advice = f"Slower than the simulation assumes: {', '.join(slow)}. Its figures are too hopeful here." if slow else ""
-    scene.transcript.say("times", mark, "; ".join(told) + ".", advice, **rounded)
+    scene.transcript.say("times", mark, "; ".join(texts) + ".", advice, **rounded)
 
 
 def _tasks(scene: RehearsalContext, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
-    """What ECS still says of the servers' tasks: of stopped ones, for about an hour."""
+    """Task ARN → the servers' tasks by DescribeTasks, which knows a stopped task for about an hour."""
     ecs = scene.context.account.client("ecs")
     found: dict[str, Mapping[str, Any]] = {}
     for record in records:
@@ -246,21 +250,21 @@ def _tasks(scene: RehearsalContext, records: Iterable[Server]) -> dict[str, Mapp
     return found
 
 
-def _note(seconds: list[float], begin: datetime | None, end: datetime | None) -> None:
+def _add_seconds(seconds: list[float], begin: datetime | None, end: datetime | None) -> None:
     if begin and end:
         seconds.append(max((end - begin).total_seconds(), 0.0))
 
 
 def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
-    """What a rehearsal will cost: servers, for so many minutes each. Everything else is less than a cent."""
-    servers = bots + 3  # the one that is killed and the one in its place, and the one that its timer ends
+    """What a rehearsal will cost: its servers run for 2 to 20 minutes each. All else costs less than a cent."""
+    servers = bots + 3  # the killed server, its replacement, and the server that its timer ends
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) for kind in (True, False))
     return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
 
 
 def cost(scene: RehearsalContext, records: Iterable[Server]) -> None:
-    """Say what the servers did cost, by their own records."""
-    sum_ = spent(records, Prices(), datetime.now(UTC), {})
-    minutes = sum_.hours * 60
-    text = f"About ${sum_.usd.likely:.4f} for {sum_.attempts} servers with {minutes:.0f} minutes together"
+    """Add the line on what the servers have cost, by their records."""
+    total = spent(records, Prices(), datetime.now(UTC), {})
+    minutes = total.hours * 60
+    text = f"About ${total.usd.likely:.4f} for {total.attempts} servers with {minutes:.0f} minutes together"
     scene.transcript.good("cost", f"{text}, by list prices of {Prices().region}; the rest is less than a cent.")

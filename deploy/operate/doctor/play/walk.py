@@ -1,4 +1,4 @@
-"""The bots' part: links, pages, servers, games, one task that is killed, the stop step, and the data of all that."""
+"""The bots' part of a rehearsal: links, pages, servers, games, a killed task, the stop step, and the data."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from hippodrome.ports import Topic
 from hippodrome.servers import resources
 
 PLAY = 8.0  # seconds that a bot plays
-VICTIM_PLAYS = 25.0  # seconds that the one plays whose task is killed: long enough to be in the midst of it
-STRUCK = 2.0  # seconds of play until then
-ARRIVALS = 1.0  # seconds between two bots
+VICTIM_PLAYS = 25.0  # seconds that the victim (the bot whose task is killed) plays: longer than `STRUCK` and a look
+STRUCK = 2.0  # seconds of play after which its task is killed
+ARRIVALS = 1.0  # seconds between the arrivals of two bots
 GONE = 240.0  # seconds until nothing of the last server may be left: stopTimeout is 120
 KILLED = "Rehearsal: killed, as when a Spot task is interrupted"
-"""What StopTask says. ECS puts a caller's reason into the task's `stoppedReason` (ECS API Reference, StopTask), and
-`hippodrome/model/messages.py` takes these words for a Spot interruption, whatever the code: the server is lost."""
+"""The reason for StopTask. ECS puts it into the task's `stoppedReason` (ECS API Reference, StopTask). These words count
+as a Spot interruption in `hippodrome/model/messages.py`, whatever the stop code: the server is lost."""
 
 LOGS = "See `python -m deploy logs --errors`."
 
 
 class Walk:
-    """Sends bots through the copy. After that, each method adds a line on one result."""
+    """Sends bots through the copy (`run`). Each other method adds a line on one result to the transcript."""
 
     def __init__(self, scene: RehearsalContext, bots: int) -> None:
         self._scene = scene
-        bots += -(bots + 1) % scene.copy.players  # with the victim, as many as play together, or a multiple of that
+        bots += -(bots + 1) % scene.copy.players  # with the victim, a multiple of the players of a session
         self.bots = [scene.bot(f"{number}", PLAY) for number in range(1, bots + 1)]
         self.victim = scene.bot("victim", VICTIM_PLAYS)
-        self._struck: Server | None = None
+        self._struck: Server | None = None  # the record of the server whose task was killed
         self._not_struck = "its game never began"
-        self.records: dict[str, Server] = {}  # by bot: those of one session have the same record
+        self.records: dict[str, Server] = {}  # bot's id → its server; the bots of a session have the same one
 
     @property
     def all(self) -> list[Bot]:
@@ -54,13 +54,13 @@ class Walk:
 
     @property
     def ran(self) -> list[Server]:
-        """The servers that ran, each once."""
+        """The bots' servers, each once."""
         return each_once(self.records.values())
 
     # Links
 
     def links(self) -> None:
-        """A link without a signature is refused, and one with another participant's signature; the site sends HSTS."""
+        """A link without a signature is refused, and so is a link with another participant's signature."""
         scene = self._scene
         own, other = scene.copy.link(self.bots[0].report.user_id), scene.copy.link(self.victim.report.user_id)
         unsigned = own.partition("&signature=")[0]
@@ -80,7 +80,7 @@ class Walk:
             )
 
     def site(self) -> None:
-        """The site answers over TLS, and tells browsers to keep to that."""
+        """The site answers over TLS, and tells browsers to use only TLS (HSTS)."""
         scene = self._scene
 
         async def asked() -> tuple[int, str]:
@@ -98,7 +98,7 @@ class Walk:
     # Walking
 
     def run(self) -> None:
-        """Send all bots, and kill the task of one. KeyboardInterrupt ends them."""
+        """Send all bots, and kill the victim's task. KeyboardInterrupt ends all bots."""
         interruptible(self._walk())
 
     async def _walk(self) -> None:
@@ -115,15 +115,15 @@ class Walk:
 
     def _watch(self, reports: Sequence[BotReport]) -> None:
         stages = [report.stage for report in reports]
-        self._scene.told("bots: " + ", ".join(f"{stages.count(stage)} {stage}" for stage in dict.fromkeys(stages)))
+        self._scene.progress("bots: " + ", ".join(f"{stages.count(stage)} {stage}" for stage in dict.fromkeys(stages)))
 
     async def _strike(self) -> None:
-        """Kill the task of the victim, in the midst of its game."""
+        """Kill the victim's task, `STRUCK` seconds after its game began."""
         while not any(play.seconds >= STRUCK for play in self.victim.report.plays):
             await asyncio.sleep(0.2)
         try:
             self._struck = await asyncio.to_thread(self._kill)
-        except Exception as error:  # noqa: BLE001 - said in its line
+        except Exception as error:  # noqa: BLE001 - the line `killed` says it
             self._not_struck = f"{type(error).__name__}: {error}"
 
     def _kill(self) -> Server | None:
@@ -135,7 +135,7 @@ class Walk:
         ecs.stop_task(cluster=record.cluster, task=record.task, reason=KILLED)
         return record
 
-    # What came of it
+    # The results
 
     def pages(self) -> None:
         """Every bot came to the last page."""
@@ -150,7 +150,7 @@ class Walk:
         self._scene.transcript.bad("pages", f"{finished} of {len(reports)} bots finished: {why}.", LOGS)
 
     def servers(self) -> None:
-        """Every bot got a server that became ready; says how, and after how many seconds."""
+        """Every bot got a server that became ready. The line tells how many were on Spot, and how long bots waited."""
         transcript = self._scene.transcript
         found = {bot: self._scene.server(bot.report.user_id) for bot in self.all}
         self.records = {bot.report.user_id: record for bot, record in found.items() if record}
@@ -187,7 +187,7 @@ class Walk:
         )
 
     def killed(self) -> None:
-        """The victim got another server, and came to the end of its game there."""
+        """The victim's server was replaced, and the victim came to the end of its game there."""
         transcript, report = self._scene.transcript, self.victim.report
         record = self.records.get(report.user_id)
         if self._struck is None or record is None:
@@ -210,16 +210,16 @@ class Walk:
         )
 
     def end(self) -> None:
-        """The stop step ended every server; nothing is left."""
+        """The stop step ended every server, and nothing of the servers is left."""
         scene, users = self._scene, [bot.report.user_id for bot in self.all]
         late = CheckFailed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
         for bot in self.all:
-            if not bot.report.finished:  # it never came to the step that stops its server
+            if not bot.report.finished:  # it has not come to the step that stops its server
                 stop = StopServer(scene.copy.id, bot.report.user_id)
                 scene.platform.bus.publish(Topic.STOP, to_message(stop))
 
         def gone() -> bool | None:
-            self._left = [what for user in users for what in left(scene, user)]
+            self._left = [text for user in users for text in left(scene, user)]
             return None if self._left else True
 
         try:
@@ -244,26 +244,26 @@ class Walk:
         return [bot for bot in self.all if bot is self.victim or bot.report.user_id in own]
 
     def data(self) -> None:
-        """`deploy data` brings everything that the bots have sent and played."""
+        """`deploy data` fetches all answers and recordings of the bots."""
         scene, context = self._scene, self._scene.context
-        scene.told("fetching the bots' data")
+        scene.progress("fetching the bots' data")
         source = Bucket(context.account.client("s3"), context.installation["Bucket"], context.account.id)
         recorded = bool(scene.copy.project.trial.get("s3upload", True))
         with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary)
             made = data.run(source, scene.copy.id, folder / "data", data.Options(raw=True))
-            seen = folder / "seen" / scene.copy.id
-            seen.mkdir(parents=True)
+            stored = folder / "stored" / scene.copy.id
+            stored.mkdir(parents=True)
             for owners in ("users", "sessions"):
-                (seen / owners).symlink_to(folder / "data" / "private" / "raw")
+                (stored / owners).symlink_to(folder / "data" / "private" / "raw")
             struck = self._played_with_the_victim()
             others = [bot for bot in self.all if bot not in struck]
             found = [
-                verification.verify(folder / "seen", scene.copy.id, [bot.report for bot in bots], recorded=recorded)
+                verification.verify(folder / "stored", scene.copy.id, [bot.report for bot in bots], recorded=recorded)
                 for bots in (others, struck)
             ]
         of_others, of_struck = found
-        # A recording that a killed server has left may lack its end: that is what being killed means.
+        # The recording of a killed server may lack its end.
         missing = [*of_others.missing, *(one for one in of_struck.missing if not one.endswith("is cut off"))]
         counts = made["counts"]
         if missing or counts["problems"] or counts["participants"] != len(self.all):
@@ -282,12 +282,12 @@ class Walk:
 
 
 def each_once(records: Iterable[Server]) -> list[Server]:
-    """The servers without repetitions, since the members of a session share one."""
+    """The servers without repetitions. The members of a session have the same server."""
     return list({record.label: record for record in records}.values())
 
 
 def left(scene: RehearsalContext, user: str) -> list[str]:
-    """What is left of a bot's server; nothing if the bot never had one."""
+    """What is left of a bot's server, in words; empty if the bot never had a server."""
     record = scene.server(user)
     if record is None:
         return []
