@@ -22,21 +22,21 @@ _SENTENCE = 3  # words from which on a text is not the same in two languages
 
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
-    """Yield mistakes in texts: places such as `{seconds}` that the text does not have, and wrong languages."""
+    """Yield mistakes in texts: placeholders such as `{seconds}` that the text does not have, and wrong languages."""
     for name, text in checked.root.project.own_texts.items():
         if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
-        elif wrong := [place for place in _BRACES.findall(text) if place[1:-1] not in places(ENGLISH[name])]:
+        elif wrong := [found for found in _BRACES.findall(text) if found[1:-1] not in places(ENGLISH[name])]:
             yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")
         elif left := re.search("[{}]", _BRACES.sub("", text)):
             yield Mistake((*TEXTS, name), f"participants would read {left[0]}, a brace too many; {_known(name)}")
 
 
 def _known(name: str) -> str:
-    """The places of this text, in words."""
-    known = [f"{{{place}}}" for place in places(ENGLISH[name])]
+    """A clause that names the placeholders which this text may have."""
+    known = [f"{{{found}}}" for found in places(ENGLISH[name])]
     if not known:
-        return "this text has no places"
+        return "this text has no placeholders"
     *first, last = known
     return f"there {'are' if first else 'is'} {' and '.join(filter(None, [', '.join(first), last]))}"
 

@@ -76,7 +76,7 @@ OPTIONS: tuple[Option, ...] = (
     Option("assets_to_preload", "rendering", list, "images and atlases are copied to the project's `assets/` under the `name` of each"),
     Option("animation_configs", "rendering", list, "`animations` of the atlas of the sprite sheet; they repeat for ever, whatever `repeat` says"),
     # hosting
-    Option("host", "hosting", None, "no effect", "on one machine a study is held for that machine only; for others deploy it (docs/aws.md)"),
+    Option("host", "hosting", None, "no effect", "on one machine only its own browsers reach a study; for others deploy it (docs/aws.md)"),
     Option("port", "hosting", 8000, "the port of `python experiment.py`"),
     Option("max_concurrent_games", "hosting", 1, "`project.maxServers`, if you set it"),
     Option("max_ping", "hosting", None, "`trial.maxPing`", _PING, of_several=True),

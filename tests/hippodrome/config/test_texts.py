@@ -61,13 +61,13 @@ def remarks(folder: Path, config: str) -> list[str]:
         ),
         (
             '{start: "Los }"}',
-            "project.texts.start: participants would read }, a brace too many; this text has no places",
+            "project.texts.start: participants would read }, a brace too many; this text has no placeholders",
         ),
         (
             "{language: fr-FRA}",
             'project.texts.language: must be a language as pages name it, such as de or pt-BR, not "fr-FRA"',
         ),
-        ('{start: "Los {}"}', "project.texts.start: nothing stands for {} here; this text has no places"),
+        ('{start: "Los {}"}', "project.texts.start: nothing stands for {} here; this text has no placeholders"),
         ("{start: [Los]}", 'project.texts.start: must be text, in quotes: "…", not a list'),
         (
             "{start: no}",

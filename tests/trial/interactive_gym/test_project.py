@@ -106,7 +106,7 @@ def test_texts_become_pages(tmp_path: Path) -> None:
 
 def test_what_has_no_effect_is_said(tmp_path: Path) -> None:
     _, said = made(tmp_path)
-    assert "Remark: host has no effect: on one machine a study is held for that machine only" in said
+    assert "Remark: host has no effect: on one machine only its own browsers reach a study" in said
     assert "Remark: max_ping has no effect: no participant is turned away" in said
     assert "waitroom" not in said, "only what the experiment sets"
 
