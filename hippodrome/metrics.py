@@ -1,4 +1,4 @@
-"""Writes CloudWatch metrics. The sweep reports how many servers run, the age of the oldest, and what it removed.
+"""Writes CloudWatch metrics. The sweep reports how many servers run, the age of the oldest, and what it did.
 Functions that see servers fail report how many failed, by `causes.FailureCategory`. No dimension names a project:
 alarms watch dimensions that are known beforehand. `deploy status` names the project.
 

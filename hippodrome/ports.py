@@ -3,7 +3,7 @@
 `hippodrome.aws` implements them on S3, ECS, Route 53, EventBridge Scheduler and SNS/SQS; `local` implements them on one
 machine. Every implementation passes the same contract tests. All of them keep these rules:
 
-* A method that removes or stops something succeeds if it is already gone.
+* A method that removes or stops something succeeds if there is nothing to remove or stop.
 * A method that creates something under a given name may be repeated: the second call finds the result of the first.
 * Transient errors (throttling, a lost connection) are raised as the library raises them; the caller's queue retries.
 """

@@ -91,7 +91,7 @@ def count_participants(
                 break
         if arrived is None:
             continue
-        at = Progress.from_listing(participant_folder(project.id, user_id), listed).position(project)
+        at = Progress.from_listing(participant_folder(project.id, user_id), listed).due_step(project)
         found.participants += 1
         found.by_step[at.key] += 1
         found.finished += at.key == project.final.key

@@ -43,7 +43,7 @@ _ORIGIN = "Hippodrome: ordered at "
 
 @dataclass(frozen=True)
 class Issued:
-    """A new certificate: its private key and its chain (PEM), and what its first certificate says."""
+    """A new certificate: its private key and its chain (PEM), and the names and dates of its first certificate."""
 
     key: str = field(repr=False)
     chain: str

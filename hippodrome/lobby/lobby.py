@@ -2,7 +2,7 @@
 
 This module handles participants' requests and start messages. Each request of a participant at the game step makes a
 *run*:
-1. It reads the document of decisions (`decisions.py`), and lists the folder of those who wait (`entries.py`).
+1. It reads the document of decisions (`decisions.py`), and lists the entries in the lobby's folder (`entries.py`).
 2. It looks up who can be a member, and which servers are ready (`lookups.py`).
 3. It decides (`run.py`, by `rules.py`), and writes the document if something has changed. If another run has written
    the document since step 1, it reads the document and decides again; mostly nothing is left to do.
@@ -29,7 +29,7 @@ from datetime import timedelta
 from functools import partial
 from typing import Any
 
-from hippodrome.lobby import entries as folder
+from hippodrome.lobby import entries as lobby_entries
 from hippodrome.lobby import matchmaking, questions, rules, servers_ahead, traits
 from hippodrome.lobby.decisions import Decisions, Formed, Proposal, Unmatched
 from hippodrome.lobby.entries import Entries, Waiting, WaitingDocument
@@ -115,7 +115,7 @@ class Lobby:
         label = ids.server_label(project.id, user_id)
         membership = self._repository.membership(project.id, user_id)
         if membership is None:
-            found = self._ask(project, _Asker(label, user_id, group, answers))
+            found = self._run(project, _Asker(label, user_id, group, answers))
             if not isinstance(found, Membership):
                 return found
             membership = found
@@ -133,7 +133,7 @@ class Lobby:
         found = self._store.entries(project, label)
         one = found.waiting.get(label)
         if one is not None:
-            self._documents.put(folder.departure_key(project.id, label, one.joined), b"")
+            self._documents.put(lobby_entries.departure_key(project.id, label, one.joined), b"")
         if one is not None or label in found.left:
             self._store.delete(key for key in found.keys[label] if ".left." not in key)
 
@@ -154,7 +154,7 @@ class Lobby:
         if self._repository.progress(project.id, user_id).answered.keys() >= set(project.game_steps):
             return
         label = ids.server_label(project.id, user_id)
-        way = folder.way_key(project.id, label)
+        way = lobby_entries.way_key(project.id, label)
         self._documents.put(way, b"")
         entries = self._store.entries(project)
         if label in entries.waiting:
@@ -194,7 +194,7 @@ class Lobby:
 
     # A participant's request
 
-    def _ask(self, project: Project, me: _Asker) -> LobbyState | NoServerYet | Membership:
+    def _run(self, project: Project, me: _Asker) -> LobbyState | NoServerYet | Membership:
         """One run, for a participant without a membership."""
         known = self._store.read(project)
         formed = known.formed_of(me.label)
@@ -224,11 +224,12 @@ class Lobby:
             if not matchmaking.patience_is_over(own.joined, project, run.now):
                 return document
             code = ids.completion_code(project.secret, me.user_id, UNMATCHED)
-            waited = folder.seconds_since(own.joined, run.now)
+            waited = lobby_entries.seconds_since(own.joined, run.now)
             return rules.give_up(document, Unmatched(me.label, me.user_id, run.now, code, waited))
 
         after = known
-        if settle(known) != rules.without_done(known, entries.done):  # to drop what is done alone is worth no write
+        # Decisions that are carried out leave the document with the next other change: alone they are worth no write.
+        if settle(known) != rules.without_done(known, entries.done):
             after = self._change(project, known, settle)
             if after is not known:
                 self._store.forget_done(project, after, entries)
@@ -238,9 +239,9 @@ class Lobby:
             return made[me.label]
         self._store.delete(entries.outdated[:DELETED_AT_ONCE])
         if formed := after.formed_of(me.label):
-            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
-        seconds = folder.seconds_since(own.joined, run.now) if own else 0.0
-        here = rules.here(after, entries, project, me.label, run.now)
+            return _no_server_yet(formed, servers)
+        seconds = lobby_entries.seconds_since(own.joined, run.now) if own else 0.0
+        here = rules.number_here(after, entries, project, me.label, run.now)
         is_proposed = after.proposal_of(me.label) is not None or after.is_decided(me.label)
         return LobbyState(here, seconds, is_proposed)
 
@@ -271,13 +272,12 @@ class Lobby:
             return servers.given(document, now, open_for)
 
         if settle(known) is known:  # mostly
-            return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
+            return _no_server_yet(formed, servers)
         after = self._change(project, known, settle)
         made = self._store.carry_out(project, _due(me.label, known, before, after), Entries())
         if me.label in made:
             return made[me.label]
-        formed = after.formed_of(me.label) or formed
-        return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
+        return _no_server_yet(after.formed_of(me.label) or formed, servers)
 
     def _change(self, project: Project, known: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
         """Change the document; return `known` if others change it all the time. The next request then decides."""
@@ -293,14 +293,14 @@ class Lobby:
         if found is not None and now - found.seen < SEEN_ANEW:
             return entries
         if found is None:
-            back = left is not None and now - left.at < folder.PRESENT
-            joined = left.joined if left is not None and back else folder.milliseconds(now)
+            is_back = left is not None and now - left.at < lobby_entries.PRESENT
+            joined = left.joined if left is not None and is_back else lobby_entries.milliseconds(now)
             answers = me.answers() if field_of(project.matching) is not None else {}
             found = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
         one = Waiting(found.label, found.joined, found.trait, now)
-        present = folder.waiting_key(project.id, one)
-        self._documents.put(present, folder.body(WaitingDocument(me.user_id, me.group)))
-        others = (key for key in entries.keys.get(me.label, ()) if key != present and ".yes." not in key)
+        own_key = lobby_entries.waiting_key(project.id, one)
+        self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))
+        others = (key for key in entries.keys.get(me.label, ()) if key != own_key and ".yes." not in key)
         self._store.delete(others)  # the entries that they left, are under way, or wait on another page
         return entries.with_waiting(one)
 
@@ -309,10 +309,14 @@ class Lobby:
 
         Of two participants who confirm at once, at least one sees both confirmations.
         """
-        self._documents.put(folder.confirmation_key(project.id, me.label, proposal.id), b"")
+        self._documents.put(lobby_entries.confirmation_key(project.id, me.label, proposal.id), b"")
         own = entries.waiting.get(me.label)
         entries = self._store.entries(project).with_confirmation(proposal.id, me.label)
         return entries.with_waiting(own) if own and me.label not in {*entries.waiting, *entries.left} else entries
+
+
+def _no_server_yet(formed: Formed, servers: StartedAhead) -> NoServerYet:
+    return NoServerYet(formed.id, len(formed.members), servers.records.get(formed.id), formed.players)
 
 
 def _candidate(me: _Asker) -> questions.Candidate:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from datetime import timedelta
 from functools import partial
 
-from hippodrome.lobby import entries as folder
+from hippodrome.lobby import entries as lobby_entries
 from hippodrome.lobby import rules
 from hippodrome.lobby.decisions import Decisions, Matched, Proposal
 from hippodrome.lobby.entries import Entries, Waiting
@@ -130,8 +130,8 @@ class Lookups:
     def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
         """The participant who waits, as a member; None if they have left or have a membership; the error of a read."""
         try:
-            found = self._platform.documents.get(folder.waiting_key(project.id, one))
-            written = folder.read_body(found.body) if found else None
+            found = self._platform.documents.get(lobby_entries.waiting_key(project.id, one))
+            written = lobby_entries.read_body(found.body) if found else None
             if written is None or ids.server_label(project.id, written.user_id) != one.label:
                 return None
             membership = self._repository.membership(project.id, written.user_id)
@@ -141,5 +141,5 @@ class Lookups:
         if membership:
             return None
         return Matched(
-            one.label, written.user_id, written.group, folder.seconds_since(one.joined, self._platform.now())
+            one.label, written.user_id, written.group, lobby_entries.seconds_since(one.joined, self._platform.now())
         )

@@ -68,7 +68,7 @@ def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
     ]
 
 
-def here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
+def number_here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
     """How many participants, this one included, could play together now; at most `players`."""
     proposal = document.proposal_of(label)
     if proposal is not None:

@@ -1,4 +1,4 @@
-"""Reads and writes the lobby's documents: the document of decisions, the entries, and what follows from decisions.
+"""Reads and writes the lobby's documents: of decisions, entries, and the sessions that follow from decisions.
 
 Every write may be repeated, by the same function or by others at the same time.
 """
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import timedelta
 
 from hippodrome.lobby import decisions
-from hippodrome.lobby import entries as folder
+from hippodrome.lobby import entries as lobby_entries
 from hippodrome.lobby.decisions import Decisions, Formed
 from hippodrome.lobby.entries import Entries
 from hippodrome.log import failure, logger
@@ -66,16 +66,16 @@ class LobbyStore:
         A participant counts as under way as long as the server that was started ahead for them can be used. So a
         participant who never comes costs no second server.
         """
-        prefix = folder.prefix_of(project.id, label) if label else folder.folder(project.id)
+        prefix = lobby_entries.prefix_of(project.id, label) if label else lobby_entries.folder(project.id)
         way = min(timedelta(minutes=project.max_runtime), sessions.open_for(project, self._platform.settings))
-        return folder.read(project.id, self._documents.list(prefix), self._platform.now(), way)
+        return lobby_entries.read(project.id, self._documents.list(prefix), self._platform.now(), way)
 
     def delete(self, keys: Iterable[str]) -> None:
         """Delete these entries."""
         for key in keys:
             self._documents.delete(key)
 
-    # What is decided for good
+    # Decisions for good
 
     def carry_out(self, project: Project, decided: Decisions, entries: Entries) -> Mapping[str, Membership]:
         """Write the sessions' documents and all memberships, delete the entries, and mark the decisions as done.
@@ -93,7 +93,7 @@ class LobbyStore:
             made[one.label] = self._write_membership(project, one.user_id, membership)
         self.delete(key for label in made for key in entries.keys.get(label, ()))
         for name in [*(each.id for each in decided.formed), *(each.label for each in decided.unmatched)]:
-            self._documents.put(folder.done_key(project.id, name), b"")
+            self._documents.put(lobby_entries.done_key(project.id, name), b"")
         return made
 
     def finish_sessions(self, project: Project) -> None:
@@ -127,7 +127,7 @@ class LobbyStore:
     def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
         """Delete the marks of decisions that are not in `document`, which must have been read after the listing."""
         kept = {*(each.id for each in document.formed), *(each.label for each in document.unmatched)}
-        self.delete(folder.done_key(project.id, name) for name in sorted(entries.done - kept))
+        self.delete(lobby_entries.done_key(project.id, name) for name in sorted(entries.done - kept))
 
     def answer_as_unmatched(self, project: Project, user_id: str) -> None:
         """Store the answer `unmatched` at each game step, which moves the participant on. An earlier answer stays."""
@@ -138,7 +138,7 @@ class LobbyStore:
                 self._create(answer_key(project.id, user_id, step.key), answer.to_json(record))
 
     def start_server(self, project: Project, session_id: str, players: int) -> None:
-        """Send the start message of a session of so many players."""
+        """Send the start message of this session's server. `players`: the number of players of the session."""
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, session_id, players=players)))
 
     def _write_session(self, project: Project, formed: Formed) -> Mapping[str, Membership]:

@@ -57,7 +57,7 @@ class Progress:
                 answered[name.removeprefix("answers/").removesuffix(".json")] = entry.modified
         return cls(has_arrived, answered)
 
-    def position(self, project: Project) -> Step:
+    def due_step(self, project: Project) -> Step:
         """The step that is due: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 

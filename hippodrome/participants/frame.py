@@ -66,11 +66,6 @@ def form_message(title: str, text: str, *, step: str = "", ticket: str = "", als
     return fields + also + fill("message", title=title, text=text)
 
 
-def style(kind: str | None = None) -> str:
-    """The style sheet for pages of this kind ("step", "game" or "message"); None: for all pages."""
-    return _style(kind)
-
-
 def frame(
     project: Project,
     step: Step,
@@ -210,8 +205,8 @@ _SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", 
 
 
 @cache
-def _style(kind: str | None) -> str:
-    """`style.css` without the sections of other kinds of pages; all of it for None."""
+def style(kind: str | None = None) -> str:
+    """The style sheet for pages of this kind ("step", "game" or "message"), from `style.css`; None: for all pages."""
     text = (WEB / "style.css").read_text(encoding="utf-8")
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)

@@ -117,7 +117,7 @@ class Journey:
 
     def _show(self, request: Request, project: Project, user_id: str) -> Response:
         progress = self._repository.progress(project.id, user_id)
-        step = progress.position(project)
+        step = progress.due_step(project)
         if not progress.has_arrived:
             self._arrive(request, project, user_id, step)
         elif participant.reached_without_post(project, step):
@@ -164,7 +164,7 @@ class Journey:
         if shown is not None:
             return shown
         progress = self._repository.progress(project.id, user_id)
-        current = progress.position(project)
+        current = progress.due_step(project)
         if not progress.has_arrived or form.step not in (None, current.key):
             return None
         may_repeat = form.step is None and not current.type.on_server

@@ -71,7 +71,7 @@ def step_page(view: StepView) -> Page:
     """A step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
-    prepared = _prepared(view)
+    prepared = _prepare(view.project, view.source, view.files)
     content = Html(prepared.render(view.values, nonce))
     problem = fill("problem", text=view.problem) if view.problem else Html()
     is_asked = prepared.has_fields or view.has_form
@@ -108,7 +108,7 @@ def fragment(view: StepView) -> str:
     The hidden fields that name the step come first. The program sends them with the form: HIPPO's front end posts all
     named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
     """
-    return _step_fields(view) + _prepared(view).render(view.values)
+    return _step_fields(view) + _prepare(view.project, view.source, view.files).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -262,10 +262,6 @@ def _lobby(view: GameView, texts: Texts) -> Html:
 def _players(view: GameView) -> int:
     """How many participants play together: the session's number, if it differs from the registered one."""
     return int(view.state.get("players", view.project.players))
-
-
-def _prepared(view: StepView) -> Fragment:
-    return _prepare(view.project, view.source, view.files)
 
 
 def _prepare(project: Project, source: str, files: str | None) -> Fragment:

@@ -10,7 +10,7 @@ says that they have left (`hippodrome/servers/sessions.py`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import timedelta
 from typing import Any
 
@@ -66,7 +66,7 @@ class Relays:
         """
         return self._respond(request, self._stop)
 
-    def _respond(self, request: Request, act: Any) -> Response:
+    def _respond(self, request: Request, act: Callable[[Project, str, PostedForm], None]) -> Response:
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
         try:
@@ -102,7 +102,7 @@ class Relays:
         record = self._repository.server_of(project.id, owner)
         self._authorize(project, user_id, form, record)
         progress = self._repository.progress(project.id, user_id)
-        if not progress.has_arrived or not participant.may_have_server(project, progress.position(project)):
+        if not progress.has_arrived or not participant.may_have_server(project, progress.due_step(project)):
             raise Refusal(409, "No server is due at this step.")
         if record is None:
             attempt = 1

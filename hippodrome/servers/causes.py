@@ -63,12 +63,12 @@ class Cause(StrEnum):
     @property
     def sentence(self) -> str:
         """What happened, and what to do about it."""
-        return f"{_EXPLANATIONS[self].what} {_EXPLANATIONS[self].remedy}"
+        return f"{_EXPLANATIONS[self].event} {_EXPLANATIONS[self].remedy}"
 
 
 class _Explanation(NamedTuple):
     category: FailureCategory
-    what: str
+    event: str
     remedy: str
 
 

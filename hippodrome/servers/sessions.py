@@ -71,5 +71,5 @@ class Sessions:
         return all(self._has_left(project, user_id) for user_id in session.user_ids if user_id != leaves)
 
     def _has_left(self, project: Project, user_id: str) -> bool:
-        step = self._repository.progress(project.id, user_id).position(project)
+        step = self._repository.progress(project.id, user_id).due_step(project)
         return participant.is_past_server(project, step)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hippodrome.storage.secret import SecretCache
 
 FRESH = timedelta(seconds=10)  # the age at which the cached master list is read again
-PAGE_FRESH = timedelta(minutes=5)  # the same of a page; a registration of its project makes it too old at once
+PAGE_FRESH = timedelta(minutes=5)  # the age at which a cached page is read again; at once after a registration
 MAX_DOCUMENTS = 200  # if the cache has so many, it is emptied
 
 

@@ -153,7 +153,7 @@ def test_all_members_of_a_session_that_is_formed_are_counted_as_there(room: Wait
     room.poll("ann", "bob", seconds=4)
     document, entries = room.document(), room.lobby._store.entries(room.project)
     assert [each.id for each in document.formed] == [room.session("ann").id]
-    assert rules.here(document, entries, room.project, room.label("ann"), room.platform.now()) == 2
+    assert rules.number_here(document, entries, room.project, room.label("ann"), room.platform.now()) == 2
 
 
 def test_a_function_of_the_researchers_may_choose_the_groups() -> None:

@@ -461,7 +461,7 @@ def test_the_documents_key() -> None:
 
 
 def here(label: str, *people: Waiting, document: Decisions | None = None, **changes: Any) -> int:
-    return rules.here(document or Decisions(), lobby(*people), pairs(**{"players": 3, **changes}), label, NOW)
+    return rules.number_here(document or Decisions(), lobby(*people), pairs(**{"players": 3, **changes}), label, NOW)
 
 
 def test_those_are_counted_who_could_play_together() -> None:

@@ -19,7 +19,7 @@ def progress(*names: str) -> Progress:
 
 
 def test_a_newcomer_stands_at_the_first_step() -> None:
-    assert progress().position(study()).key == "1"
+    assert progress().due_step(study()).key == "1"
     assert not progress().has_arrived
 
 
@@ -27,13 +27,13 @@ def test_each_answer_moves_on_by_one_step_up_to_the_last() -> None:
     names = ["participant.json"]
     for answered, expected in [("1", "2"), ("2", "3"), ("3", "4"), ("4", "finalStep"), ("finalStep", "finalStep")]:
         names.append(f"answers/{answered}.json")
-        assert progress(*names).position(study()).key == expected
+        assert progress(*names).due_step(study()).key == expected
     assert progress(*names).has_arrived
 
 
 @given(st.sets(st.sampled_from(["1", "2", "3", "4", "finalStep", "99", "x"])))
 def test_the_position_is_the_first_step_without_an_answer_whatever_else_lies_there(keys: set[str]) -> None:
-    here = progress(*[f"answers/{key}.json" for key in keys]).position(study()).key
+    here = progress(*[f"answers/{key}.json" for key in keys]).due_step(study()).key
     before = [step.key for step in study().steps[: study().index(here)]]
     assert set(before) <= keys
     assert here == "finalStep" or here not in keys
