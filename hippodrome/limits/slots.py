@@ -17,7 +17,7 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.storage.compare_and_swap import SharedDocuments
 
-FULL_FOR = timedelta(seconds=10)  # for so long a function takes a study for full without a call
+FULL_FOR = timedelta(seconds=10)  # for this time a function remembers, without a call, that a study is full
 
 
 class Release(NamedTuple):
@@ -41,7 +41,7 @@ class Slots:
     def admit(self, project: Project, user_id: str) -> bool:
         """Give a newcomer a slot; return False if none is free. Mostly two calls; none without `maxParticipants`.
 
-        A participant who holds a slot keeps it, even if a crash prevented that `participant.json` was written.
+        A participant who holds a slot keeps it, even if `participant.json` was not written because of a crash.
         """
         limit = project.max_participants
         if limit is None or self._is_known_full(project, limit):

@@ -27,9 +27,9 @@ from protocol.session import is_session_id
 
 FOLDER = "_lobby/"
 PRESENT = timedelta(seconds=10)
-"""A participant counts as present for so long after a request. The lobby's page sends one every two seconds."""
+"""A participant counts as present for this time after a request. The lobby's page sends one every two seconds."""
 REMEMBERED = timedelta(seconds=30)
-"""For so long after a request a participant keeps the time at which they came; later their waiting begins anew."""
+"""For this time after a request a participant keeps the time at which they came; later their waiting begins anew."""
 DELETED = timedelta(seconds=60)
 """Entries of this age are deleted: well after `REMEMBERED`, so that no request under way still writes one of them."""
 NO_TRAIT = "-"  # the trait of all participants, if `matching` needs none
@@ -95,7 +95,7 @@ class Entries:
 
 
 def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta) -> Entries:
-    """Read a listing of `folder(project_id)`. A participant counts as under way for so long as `way` says."""
+    """Read a listing of `folder(project_id)`. Entries of participants under way count up to the age `way`."""
     prefix = folder(project_id)
     waiting: dict[str, Waiting] = {}
     confirmed: dict[str, set[str]] = {}

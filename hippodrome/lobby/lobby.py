@@ -228,7 +228,7 @@ class Lobby:
             return rules.give_up(document, Unmatched(me.label, me.user_id, run.now, code, waited))
 
         after = known
-        # Decisions that are carried out leave the document with the next other change: alone they are worth no write.
+        # Decisions that are carried out leave the document with the next other change. Alone they need no write.
         if settle(known) != rules.without_done(known, entries.done):
             after = self._change(project, known, settle)
             if after is not known:

@@ -80,7 +80,7 @@ class DnsRecords:
         return again + failed + [event for event, record in named if record.name in unregistered]
 
     def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Look up addresses again in `RETRY_PAUSE`, by messages; return the events that have none left to try."""
+        """Look up addresses again in `RETRY_PAUSE`, by messages; return the events without a further try."""
         soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
             seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
