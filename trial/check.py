@@ -58,18 +58,18 @@ def main(file: Path, seconds: float) -> int:
         report = Path(folder) / "report"
         status = _run(file, report, seconds)
         try:
-            found = json.loads(report.read_text())
+            result = json.loads(report.read_text())
         except (OSError, ValueError):
-            found = {}
-    if found.get("lacks"):
-        print(f"{LACKS}{found['lacks']}", flush=True)
+            result = {}
+    if result.get("lacks"):
+        print(f"{LACKS}{result['lacks']}", flush=True)
         return 1
     if status is None:
-        found["failed"] = f"it has not come back within {seconds:g} s"
-    if "failed" not in found and not found.get("well"):
-        found["failed"] = f"it ended Python itself (status {status})"
-    if "failed" in found:
-        print(f"Warning: the agent could not be tried in the image, which is built all the same: {found['failed']}")
+        result["failed"] = f"it has not come back within {seconds:g} s"
+    if "failed" not in result and not result.get("well"):
+        result["failed"] = f"it ended Python itself (status {status})"
+    if "failed" in result:
+        print(f"Warning: the agent could not be tried in the image, which is built all the same: {result['failed']}")
     else:
         print("The agent was tried in the image: it starts, draws and takes a step.")
     return 0
@@ -94,13 +94,13 @@ def _try(file: Path, report: Path) -> None:
     folder = Path(os.environ[environment.AGENT_DIR]).resolve()
     try:
         _play(folder, json.loads(file.read_text()))
-        found: dict[str, Any] = {"well": True}
+        result: dict[str, Any] = {"well": True}
     except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
         failure = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
         remedy = _remedy(error)
-        found = {"lacks": f"{failure}{REMEDY}{remedy}"} if remedy else {"failed": failure}
+        result = {"lacks": f"{failure}{REMEDY}{remedy}"} if remedy else {"failed": failure}
     part = report.with_suffix(".part")
-    part.write_text(json.dumps(found))
+    part.write_text(json.dumps(result))
     part.replace(report)
 
 

@@ -1,4 +1,4 @@
-"""Measures how long an episode's first picture stands still (`resetFreeze`) and how long the episode is played. Pure.
+"""Measures for how long an episode shows its first picture (`resetFreeze`), and for how long it is played. Pure.
 
 All times are seconds of one monotonic clock, which is passed in.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 class EpisodeTime:
     """The times of the present episode.
 
-    `freeze`: how long its first picture stands still. `limit`: how long it may be played, 0 for no limit.
+    `freeze`: for how long it shows its first picture. `limit`: for how long it may be played, 0 for no limit.
     """
 
     def __init__(self, freeze: float, limit: float) -> None:
@@ -29,13 +29,13 @@ class EpisodeTime:
         self._frozen, self._played = False, played
 
     def rest(self, now: float) -> None:
-        """The game is held. If its first picture stands still, it does so for its whole time again afterwards."""
+        """The game is held. If the time of the first picture was running, it begins anew afterwards."""
         if self._runs_since is not None:
             self._played += now - self._runs_since
         self._frozen_since = self._runs_since = None
 
     def starts_in(self, now: float) -> float:
-        """Return the seconds for which the first picture still stands still. They run from the first call on."""
+        """Return the seconds for which the first picture is still shown. They run from the first call on."""
         if not self._frozen:
             return 0.0
         if self._frozen_since is None:

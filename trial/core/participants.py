@@ -96,7 +96,7 @@ class Alone:
         """Return what to store, after `seconds` of play: the answer if the game could be `played`, else none."""
         return SaveAnswer(records.answers(self._progress, seconds, self._trial_id) if played else None)
 
-    # ---- what the participant is told
+    # ---- what clients are told
 
     def session_version(self) -> None:
         """Return a value that changes when the fields about members do: always None."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -20,7 +20,7 @@ Where = Literal["here", "reads", "awaited", "away", "policy"]
 episodes; awaited: has not come yet, or is still being measured; away: was here; policy: a policy plays in the place."""
 LEAST_ABSENCE = 3.0
 """The least time that one absence uses up, in seconds; a third of `absent` (before the game: of `gather`) if that is
-less. So short absences cannot go on for ever, although each makes the countdown begin anew."""
+less. So a member cannot hold the game again and again by short absences, each of which is followed by a countdown."""
 GIVEN_BACK = 0.25
 """The used time that a member gets back for each second of play, in seconds."""
 MEASURED_SECONDS = 20.0
@@ -396,12 +396,6 @@ def _where(member: _Member, page: bool, plays_on: bool) -> Where:
     if member.here:
         return "reads" if page and not member.gone_on else "here"
     return "away" if member.has_come and not member.takes_part else "awaited"
-
-
-def outcomes(presence: Presence, outcome: str | None) -> Mapping[str, str | None]:
-    """Return, by player, how the trial has ended for each member. `outcome` is that of the trial."""
-    names: dict[Over | None, str | None] = {"absent": "left", "ping": "ping", None: outcome}
-    return {player: names[presence.over(player)] for player in presence.players}
 
 
 def _median(samples: Iterable[float]) -> float:

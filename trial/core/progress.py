@@ -73,7 +73,7 @@ class TrialProgress:
         self.needs_reset = True
         """Whether the environment must be reset before the next step."""
         self.frozen = config.reset_freeze > 0
-        """Whether the episode's first picture stands still, or will (`resetFreeze`): keys do nothing meanwhile."""
+        """Whether the time of the first picture (`resetFreeze`) runs or is still to come: keys do nothing meanwhile."""
         self.ended: list[Episode | Break] = []
         """Episodes and breaks that are over and not recorded, in order. The caller removes them."""
         self._failures = 0
@@ -129,7 +129,7 @@ class TrialProgress:
 
     @property
     def shows_first_picture(self) -> bool:
-        """Whether the episode's first picture is shown and stands still (`resetFreeze`)."""
+        """Whether the episode's first picture is shown and its time (`resetFreeze`) is not over."""
         return self.frozen and self.playing and not self.needs_reset
 
     @property

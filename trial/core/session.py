@@ -16,7 +16,7 @@ from protocol.trial import TrialSection as Config
 from trial.core import ended, messages, records
 from trial.core.effects import Effect, RecordLine, ResetPolicy, SaveAnswer, SaveMember, WriteLog
 from trial.core.flow_control import Window
-from trial.core.presence import Presence, Rules, outcomes
+from trial.core.presence import Presence, Rules
 from trial.core.progress import TrialProgress
 from trial.core.recording import Recordings
 from trial.core.seeds import policy_seed
@@ -56,7 +56,7 @@ class TrialSession:
         places: Mapping[str, str],
         *,
         vacant: Sequence[str],
-        gone: Sequence[str],
+        erased: Sequence[str],
         answered: Mapping[str, Mapping[str, Any]],
         recorded: RecordedTrial | None,
         trial_id: str,
@@ -64,7 +64,7 @@ class TrialSession:
         recording: Recordings,
         emit: Callable[[Effect], None],
     ) -> None:
-        """`vacant` are the players that a policy plays from the start. `gone` are the players of members whose data
+        """`vacant` are the players that a policy plays from the start. `erased` are the players of members whose data
         were erased: they count as absent from the start. `recorded` is what earlier servers have recorded. `answered`
         holds the answers of this step that some members have already, by their ids: a member whose answer says that
         they were refused does not play.
@@ -83,7 +83,7 @@ class TrialSession:
         resumed = recorded is not None and recorded.begun
         self.presence = Presence(
             Rules(config.absent, config.gather, config.countdown, config.max_ping, config.ping_samples),
-            (*places.values(), *gone),
+            (*places.values(), *erased),
             reads=bool(config.instructions) and not resumed,
             begun=resumed,
         )
@@ -113,7 +113,7 @@ class TrialSession:
                 self.presence.mark_absent(player)
             elif player in self._humans and outcome == "stopped":
                 self._stopped.add(player)
-        for player in gone:
+        for player in erased:
             self.presence.mark_absent(player)
         for human, answers in answered.items():
             if human in places and answers.get("outcome") == "ping":
@@ -338,16 +338,18 @@ class TrialSession:
         return self._answered.get(human)
 
     def _answer(self, player: str, seconds: float) -> dict[str, Any]:
-        return records.member_answers(self._progress, player, self.outcomes()[player], seconds, self._trial_id)
+        return records.member_answers(self._progress, player, self._outcome(player), seconds, self._trial_id)
 
     def outcomes(self) -> Mapping[str, str | None]:
         """Return, by player, how the trial has ended for each member; None while it goes on."""
-        found = outcomes(self.presence, self._progress.outcome)
-        return {player: self._outcome(player, outcome) for player, outcome in found.items()}
+        return {player: self._outcome(player) for player in self.presence.players}
 
-    def _outcome(self, player: str, outcome: str | None) -> str | None:
-        """Turn `stopped` into `partnerLeft` for the members who did not stop the game themselves."""
-        return ended.PARTNER_LEFT if outcome == "stopped" and self._stopped and player not in self._stopped else outcome
+    def _outcome(self, player: str) -> str | None:
+        over, outcome = self.presence.over(player), self._progress.outcome
+        if over is not None:
+            return "left" if over == "absent" else "ping"
+        stopped_by_another = outcome == "stopped" and self._stopped and player not in self._stopped
+        return ended.PARTNER_LEFT if stopped_by_another else outcome
 
     def reset_fields(self) -> dict[str, Any]:
         """Return further fields for the line of a reset: round trips, and the players whose members are replaced."""
@@ -370,7 +372,7 @@ class TrialSession:
         where = {"episode": self._progress.episode, "step": self._progress.steps}
         self._waiting.append(RecordLine(kind, {**where, **fields}))
 
-    # ---- what members are told
+    # ---- what clients are told
 
     def wake_at(self, now: float) -> float | None:
         """Return when to call `attend` again if nothing happens before; None if there is no need."""
@@ -403,7 +405,7 @@ class TrialSession:
             return PING
         if not self._progress.over:
             return None
-        if self._progress.outcome == "stopped" and self.outcomes()[player] == ended.PARTNER_LEFT:
+        if self._progress.outcome == "stopped" and self._outcome(player) == ended.PARTNER_LEFT:
             return PARTNER_STOPPED
         if self._progress.outcome != ended.PARTNER_LEFT:
             return None

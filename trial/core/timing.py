@@ -146,7 +146,7 @@ class Timing:
         return Due.MORE
 
     def _frozen(self, progress: TrialProgress, now: float) -> bool:
-        """Return whether the first picture still stands still. If it does not, the episode is played from now on."""
+        """Return whether the time of the first picture is not over. If it is, the episode is played from now on."""
         left = self._episode.starts_in(now)
         if left > 0.0:
             self._rest()

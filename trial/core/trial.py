@@ -185,13 +185,13 @@ class Trial:
         *,
         places: Mapping[str, str] | None = None,
         vacant: Sequence[str] = (),
-        gone: Sequence[str] = (),
+        erased: Sequence[str] = (),
         answered: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> list[Effect]:
         """The agent has started. `players` are the environment's; `recorded` is what earlier servers have recorded.
 
         In a session: `places` is the player that each member plays, by the member's id. `vacant` are the places without
-        a member, in which policies play. `gone` are the places of members whose data were erased, and who never come.
+        a member, in which policies play. `erased` are the places of members whose data were erased, and who never come.
         `answered` holds the answers of this step that some members have already, by their ids.
         """
         if self.phase is not Phase.STARTING:
@@ -204,7 +204,7 @@ class Trial:
                 self.progress,
                 places,
                 vacant=vacant,
-                gone=gone,
+                erased=erased,
                 answered=answered or {},
                 recorded=recorded,
                 trial_id=self.id,

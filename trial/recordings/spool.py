@@ -55,7 +55,7 @@ class Spool:
 async def store_file(store: Store, key: str, path: Path) -> None:
     """Store a closed recording under its key, or under the key with a number if that exists; then delete the file.
 
-    Errors are retried for ever.
+    After an error it tries again, without a limit.
     """
     for number in count(1):
         attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)

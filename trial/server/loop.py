@@ -208,8 +208,8 @@ class TrialLoop:
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
         self._use_callbacks(started, playing.players)
         now = self._loop.time()
-        places, vacant, gone = playing.places, playing.vacant, playing.gone
-        start = partial(self.core.start, places=places, vacant=vacant, gone=gone, answered=answered)
+        places, vacant, erased = playing.places, playing.vacant, playing.erased
+        start = partial(self.core.start, places=places, vacant=vacant, erased=erased, answered=answered)
         self._apply(start(playing.players, recorded, now))
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:

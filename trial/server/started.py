@@ -29,7 +29,7 @@ class TrialPlayers:
     """In a session: the players of the seats that no member has. Policies play them."""
     stand_ins: Mapping[str, Policy] = field(default_factory=dict)
     """In a session: the policies that may play for members who are away, by player."""
-    gone: tuple[str, ...] = ()
+    erased: tuple[str, ...] = ()
     """In a session without `substitute`: the players of members whose data were erased, and who never come."""
 
 
@@ -86,7 +86,7 @@ class StartedAgent:
                 raise PlayersError(
                     f"trial.substitute must say what plays in the place of {missing[0]}, who has not come"
                 )
-            return replace(playing, places=places, seats=tuple(seats), gone=vacant)
+            return replace(playing, places=places, seats=tuple(seats), erased=vacant)
         away = seats if config.after_absent == "policy" else vacant
         stand_ins = self._policies([replace(each, plays=substitute) for each in playing.players if each.name in away])
         return TrialPlayers(
