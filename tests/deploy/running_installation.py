@@ -71,7 +71,7 @@ class RunningInstallation(Installed):
         self._working = threading.RLock()  # one function at a time: handlers share one module's platform
         self._over = threading.Event()
         self._processes: dict[str, Process] = {}  # by task
-        self._ports: dict[str, int] = {}  # of servers, by task
+        self._servers: dict[str, tuple[str, int]] = {}  # public address, and port on loopback, by running task
         self._ended: set[str] = set()
         self._served: dict[str, str] = {}
         self.stopped: list[str] = []  # the reasons that StopTask was given
@@ -136,10 +136,8 @@ class RunningInstallation(Installed):
         def connect(host: str, port: int) -> tuple[str, int]:
             if host == f"study.{self.root_domain}":
                 return "127.0.0.1", int(self._site.server_address[1])
-            addresses = {
-                self.public_ip(task): here for task, here in list(self._ports.items()) if task not in self._ended
-            }
-            return "127.0.0.1", addresses.get(self.records().get(host, ""), NOBODY)
+            ports = dict(list(self._servers.values()))
+            return "127.0.0.1", ports.get(self.records().get(host, ""), NOBODY)
 
         servers = self.platform.settings.game_sources.split()
         tls = ssl.create_default_context(cadata=self.authority.decode())
@@ -208,7 +206,7 @@ class RunningInstallation(Installed):
             task.created_at = datetime.now(UTC)
             self._processes[arn] = process = self._run(task)
             port = json.loads(process.stdout.readline())["port"] if process.stdout else 0
-            self._ports[arn] = port
+            self._servers[arn] = self.public_ip(arn), port
             task.started_at = datetime.now(UTC)
             self._tell(arn, "RUNNING")
         if process is not None and arn not in self._ended:
@@ -241,6 +239,7 @@ class RunningInstallation(Installed):
     def _tell_end(self, arn: str, exit_code: int | None) -> None:
         """As ECS does: of a task that somebody has stopped, with the reason that was given."""
         self._ended.add(arn)
+        self._servers.pop(arn, None)
         task = self.task(arn)
         task.execution_stopped_at = task.stopped_at = datetime.now(UTC)
         reason = task.stopped_reason
