@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from export.recording_columns import humans_of, players_of, unpack_array
+from export.recording_columns import as_number, as_whole, humans_of, players_of, unpack_array
 
 
 class Spec(NamedTuple):
@@ -110,10 +110,10 @@ def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dic
     if action is None and isinstance(idle, dict):  # it was not the human's turn: the environment took the idle action
         action = idle.get(human)
     found = {
-        "action": _whole(action),
+        "action": as_whole(action),
         "by": part.get("by") or ("none" if row["kind"] == "step" else None),
-        "human": _whole(part.get("human")),
-        "reward": float(reward) if isinstance(reward := part.get("reward"), int | float) else None,
+        "human": as_whole(part.get("human")),
+        "reward": as_number(part.get("reward")),
         "info": json.dumps(part["info"]) if "info" in part else None,
         "observation": None,
         "observationDtype": None,
@@ -166,7 +166,3 @@ def _observed(rows: list[dict[str, Any]], player: str) -> tuple[str, tuple[int, 
                 continue
             return dtype, tuple(shape)
     return "", ()
-
-
-def _whole(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None

@@ -310,7 +310,8 @@ class TrialSection:
             yield path, [name for name, plays in players.items() if plays == player_checks.HUMAN]
 
     def players_of(self, group: int | None) -> dict[str, str]:
-        """Return what plays each player in this group; {} if the section does not say. None is the first group."""
+        """Return what plays each player in this group; {} if the section does not say. For None it is the first
+        group."""
         if player_checks.by_group(self.players):
             return dict(self.players.get(str(self.groups()[0] if group is None else group), {}))
         return dict(self.players)

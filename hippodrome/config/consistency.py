@@ -199,8 +199,8 @@ def _event_steps(checked: Checked) -> Iterator[Mistake]:
             yield Mistake(path, f"there is no {step_name(key)}; the steps are {step_range(keys)}")
     games = [index for index, key in enumerate(keys) if type_of(steps.get(key, "")).on_server]
     if start is not None and games and start > games[0]:
-        usual = keys[default_start(games)]
-        why = f"comes after the game, {names[games[0]]}, which needs the server; {usual} is the usual choice"
+        default = keys[default_start(games)]
+        why = f"comes after the game, {names[games[0]]}, which needs the server; {default} is the usual choice"
         yield Mistake(_START, f"{names[start]} {why}")
     if stop is not None and games and stop <= games[-1]:
         better = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"

@@ -20,6 +20,8 @@ from protocol.values import Plain, flag, number_in, show
 
 CLOSING_PAGE = "hippodrome-the-end"
 """The last page of a study without pages (`step_files.CLOSING`)."""
+SSL_NO_EFFECT = "no effect: servers get the certificate of the installation"
+"""The remark on the section `ssl`."""
 
 _CPU, _MEMORY = 2, 10  # vCPUs and GB: the defaults of HIPPO's updateProject.py
 _SSL = ("sslBucket", "fullchain", "privkey")
@@ -215,22 +217,21 @@ def _drop_steps(adapted: Adapted, keys: Iterable[str], why: str) -> None:
         adapted.remark((*STEPS, key), why)
 
 
-def _renumber(adapted: Adapted, kept: list[str], before: list[str]) -> None:
-    """Number the steps in `kept` without gaps, also in `events`. `before` are all numbered steps."""
+def _renumber(adapted: Adapted, with_page: list[str], before: list[str]) -> None:
+    """Number the steps in `with_page` without gaps, also in `events`. `before` are all numbered steps."""
     given = adapted.section(STEPS)
-    now = {key: str(number) for number, key in enumerate(kept, 1)}
-    moved = [key for key in kept if now[key] != key]
+    now = {key: str(number) for number, key in enumerate(with_page, 1)}
+    moved = [key for key in with_page if now[key] != key]
     if moved:
         adapted.remark((*STEPS, moved[0]), f"counts as step {now[moved[0]]}, since one before it has no page")
     final = {FINAL: given[FINAL]} if not _blank(given.get(FINAL)) else {}
-    _put_steps(adapted, {now[key]: given[key] for key in kept} | final, {now[key]: key for key in moved})
+    _put_steps(adapted, {now[key]: given[key] for key in with_page} | final, {now[key]: key for key in moved})
     events = adapted.section(("project", "events"))
     for event in ("startServerStep", "stopServerStep"):
         named = number_in(events.get(event))
         if named is None or str(named) not in before or now.get(str(named)) == str(named):
             continue
-        later = next((now[key] for key in kept if int(key) >= named), FINAL)
-        events[event] = later
+        events[event] = next((now[key] for key in with_page if int(key) >= named), FINAL)
 
 
 def _put_steps(adapted: Adapted, steps: dict[str, Any], origins: Mapping[str, str]) -> None:
@@ -288,7 +289,7 @@ def _certificate(adapted: Adapted) -> None:
         return
     del project["ssl"]
     if any(not _blank(value) for value in ssl.values()) and _is_true(project.get("useAWS")):
-        adapted.remark(path, "no effect: servers get the certificate of the installation")
+        adapted.remark(path, SSL_NO_EFFECT)
 
 
 # trial

@@ -81,8 +81,8 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
     remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
-    kept = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
-    remarks += [f"project.{key}: {json.dumps(kept[key])} {_STAYS}" for key in kept if key in _SHOWN]
+    added = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
+    remarks += [f"project.{key}: {json.dumps(value)} {_STAYS}" for key, value in added.items() if key in _SHOWN]
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):
         trial["game"] = "none"
@@ -90,4 +90,4 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     if steps and all(map(is_step_key, steps)):
         with_page = [key for key in ordered(steps) if steps[key] not in (None, "")]
         project["steps"] = [{"key": key, "page": steps[key]} for key in with_page]
-    return {**kept, **project, "trial": trial}, remarks
+    return {**added, **project, "trial": trial}, remarks

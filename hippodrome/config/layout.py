@@ -51,7 +51,7 @@ class Layout:
         return file.relative_to(self.folder).as_posix() if file.is_relative_to(self.folder) else file.name
 
     def problems(self) -> Iterator[Diagnostic]:
-        """Yield mistakes and remarks on the place of agent.py. It is a mistake if servers would not find it."""
+        """Yield mistakes and remarks on the place of agent.py. It is a mistake if servers would not use the agent."""
         if self.agent is None:
             yield from self._missing_agent()
             return

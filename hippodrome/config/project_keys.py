@@ -264,7 +264,7 @@ class ProjectKeys(Model):
     max_runtime: Annotated[int, whole(1, 1440)] = 60
     """Minutes after which a server is stopped, whatever happens."""
     use_aws: _Flag = False
-    """Whether the study is for AWS. With false it cannot be deployed. Default: it can be deployed."""
+    """Whether the study runs on AWS; false keeps it on one machine. Default: on AWS as soon as it is deployed."""
     aws_setup: AwsSetupKeys = AwsSetupKeys()
     """The size of the servers, and their place on AWS; needed for AWS."""
     events: EventsKeys = EventsKeys()

@@ -10,6 +10,7 @@ from hippodrome.config import sessions, texts
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
 from hippodrome.config.folder import ConfigSource, read_source
+from hippodrome.config.hippo import SSL_NO_EFFECT
 from hippodrome.config.project_keys import STEPS
 from protocol import keyboard
 from protocol.values import printable
@@ -28,7 +29,6 @@ PARTS = frozenset({*ARROWS, "fire"})
 KEYS: Keys = ("trial", "keys")
 
 CERTIFICATE: Keys = ("project", "ssl")
-NO_EFFECT = "no effect: servers get the certificate of the installation"
 
 PLAIN_CLIENTS: Keys = ("project", "plainClients")
 WHO_KNOWS_AN_ID = "whoever knows a participant's id can play in that participant's place"
@@ -109,8 +109,8 @@ def combined_after_single(config: Config) -> Iterator[Remark]:
             alone = [part for part in parts if len(parts) > 1 and part in keys]
             if alone:
                 first = keyboard.shown(alone[0])
-                said = f'with input: single, {first} does "{keys[alone[0]]}" before the other key is down'
-                yield Remark((*KEYS, *path, combined), said)
+                message = f'with input: single, {first} does "{keys[alone[0]]}" before the other key is down'
+                yield Remark((*KEYS, *path, combined), message)
 
 
 def several_humans(config: Config) -> Iterator[Remark]:
@@ -120,9 +120,9 @@ def several_humans(config: Config) -> Iterator[Remark]:
     for path, names in config.trial.humans():
         if len(names) > 1:
             shown = printable(", ".join(names), 100)
-            said = f"{len(names)} players are human ({shown}), and a game has one participant, who plays the first"
+            message = f"{len(names)} players are human ({shown}), and a game has one participant, who plays the first"
             advice = f"write players: {len(names)} under project, or let the others be played by a policy"
-            yield Remark((*sessions.WHO_PLAYS, *path), f"{said}; {advice}")
+            yield Remark((*sessions.WHO_PLAYS, *path), f"{message}; {advice}")
 
 
 def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
@@ -152,14 +152,14 @@ def without_observations(source: ConfigSource, config: Config) -> Iterator[Remar
 def keys_of_sessions(source: ConfigSource, config: Config) -> Iterator[Remark]:
     """Yield a remark on each key for games of several participants if each participant plays alone."""
     if not config.project.has_sessions:
-        said = sessions.no_effect(config.trial)
-        yield from (Remark(path, said) for path in sessions.OF_SESSIONS if source.names(path))
+        message = sessions.no_effect(config.trial)
+        yield from (Remark(path, message) for path in sessions.OF_SESSIONS if source.names(path))
 
 
 def remarks(config: Config) -> Iterator[Remark]:
     """Yield the remarks that need only the values of the configuration."""
     if _names_a_certificate(config):
-        yield Remark(CERTIFICATE, NO_EFFECT)
+        yield Remark(CERTIFICATE, SSL_NO_EFFECT)
     if config.project.plain_clients:
         links = "; signedLinks does not protect the game then" if config.project.signed_links else ""
         yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")

@@ -68,8 +68,8 @@ def _humans(checked: Checked) -> Iterator[Mistake]:
     if not trial.players:
         example = ", ".join(f"player_{index}: {HUMAN}" for index in range(min(wanted, 2)))
         more = ", …" if wanted > 2 else ""
-        said = f"missing; project.players is {wanted}, so name the environment's players, {wanted} of them human"
-        yield Mistake(WHO_PLAYS, f"{said}, such as {{{example}{more}}}")
+        message = f"missing; project.players is {wanted}, so name the environment's players, {wanted} of them human"
+        yield Mistake(WHO_PLAYS, f"{message}, such as {{{example}{more}}}")
         return
     for path, humans in trial.humans():
         if len(humans) == wanted:
@@ -84,8 +84,8 @@ def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
     """`players` may differ between groups only if the participants of each game are of one group."""
     project = checked.root.project
     if by_group(checked.trial.players) and project.matching != "group" and checked.valid(MATCHING, WHO_PLAYS):
-        said = "is given group by group, and a game may have participants of several groups"
-        yield Mistake(WHO_PLAYS, f"{said}; write matching: group under project, or one map for all")
+        message = "is given group by group, and a game may have participants of several groups"
+        yield Mistake(WHO_PLAYS, f"{message}; write matching: group under project, or one map for all")
 
 
 def _empty_places(checked: Checked) -> Iterator[Mistake]:
@@ -94,8 +94,8 @@ def _empty_places(checked: Checked) -> Iterator[Mistake]:
     needs = checked.root.project.after_patience == "policies" and trial.after_absent != "policy"
     path: Keys = ("trial", "substitute")
     if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
-        said = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
-        yield Mistake(path, f"missing; {said}")
+        message = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
+        yield Mistake(path, f"missing; {message}")
 
 
 def _seats(checked: Checked) -> Iterator[Mistake]:
@@ -106,27 +106,31 @@ def _seats(checked: Checked) -> Iterator[Mistake]:
     if project.seats == "match" and project.matching != "match":
         yield Mistake(SEATS, "match, and no function says who plays with whom; write matching: match, or seats: lot")
     elif project.seats == "group" and project.matching not in ("mixed", "match"):
-        said = (
+        message = (
             "group, and a game is not of different groups; write matching: mixed or match under project, or seats: lot"
         )
-        yield Mistake(SEATS, said)
+        yield Mistake(SEATS, message)
     elif project.after_patience == "policies" and checked.valid(("project", "afterPatience")):
-        said = "and with afterPatience: policies a game may lack people, whose places are always the last ones"
-        yield Mistake(SEATS, f"{project.seats}, {said}; write seats: lot, or afterPatience: unmatched")
+        message = "and with afterPatience: policies a game may lack participants, whose places are always the last ones"
+        yield Mistake(SEATS, f"{project.seats}, {message}; write seats: lot, or afterPatience: unmatched")
 
 
 def _of_one_participant(checked: Checked) -> Iterator[Mistake]:
     """HIPPO's front end, servers named by userId, and clusters of a participant need participants who play alone."""
     project = checked.root.project
     if project.plain_clients:
-        said = "HIPPO's front end opens the game of one participant: write plainClients: false, or players: 1"
-        yield Mistake(("project", "plainClients"), said)
+        message = "HIPPO's front end opens the game of one participant: write plainClients: false, or players: 1"
+        yield Mistake(("project", "plainClients"), message)
     elif project.subdomain == "userId":
-        said = "several participants share a server, so it cannot have the id of one as its name: use subdomain: hash"
-        yield Mistake(("project", "subdomain"), said)
+        message = (
+            "several participants share a server, so it cannot have the id of one as its name: use subdomain: hash"
+        )
+        yield Mistake(("project", "subdomain"), message)
     if project.cluster == "participant":
-        said = "several participants share a server, so it cannot run in the cluster of one: use cluster: installation"
-        yield Mistake(("project", "cluster"), said)
+        message = (
+            "several participants share a server, so it cannot run in the cluster of one: use cluster: installation"
+        )
+        yield Mistake(("project", "cluster"), message)
 
 
 def remarks(config: Config) -> Iterator[Remark]:
@@ -138,20 +142,20 @@ def remarks(config: Config) -> Iterator[Remark]:
         yield Remark(PLAYERS, "no effect: no step is game, so no participant plays")
         return
     if project.max_participants is not None and project.max_participants < project.players:
-        said = f"below players, which is {project.players}: a participant finds no other to play with"
-        yield Remark(("project", "maxParticipants"), said)
+        message = f"below players, which is {project.players}: a participant finds no other to play with"
+        yield Remark(("project", "maxParticipants"), message)
     yield from _one_for_all(trial)
     yield from _without_keys(trial)
     yield from _too_short(config)
     if trial.pace == "turns" and not trial.turn_seconds:
-        said = "0: a participant who does nothing keeps the others waiting without end; write turnSeconds: 20"
-        yield Remark(("trial", "turnSeconds"), said)
+        message = "0: a participant who does nothing keeps the others waiting without end; write turnSeconds: 20"
+        yield Remark(("trial", "turnSeconds"), message)
     if trial.absent == 0 and trial.after_absent == "end":
-        said = "0: a connection that is lost for a moment ends the game for all; write absent: 30"
-        yield Remark(("trial", "absent"), said)
+        message = "0: a connection that is lost for a moment ends the game for all; write absent: 30"
+        yield Remark(("trial", "absent"), message)
     if trial.gather == 0 and trial.after_absent == "end":
-        said = "0: the game ends for the first participant who comes, since nobody waits for the others"
-        yield Remark(("trial", "gather"), f"{said}; write gather: 120, or afterAbsent: policy with a substitute")
+        message = "0: the game ends for the first participant who comes, since nobody waits for the others"
+        yield Remark(("trial", "gather"), f"{message}; write gather: 120, or afterAbsent: policy with a substitute")
 
 
 def _without_keys(trial: TrialSection) -> Iterator[Remark]:
@@ -170,8 +174,8 @@ def _too_short(config: Config) -> Iterator[Remark]:
     takes = math.ceil((trial.max_episodes * trial.episode_seconds + (trial.max_episodes - 1) * between) / 60)
     if trial.episode_seconds and takes > most:
         episodes = f"{trial.max_episodes} episodes" if trial.max_episodes > 1 else "an episode"
-        said = f"the server ends then, and {episodes} of {trial.episode_seconds:g} seconds can take {takes}"
-        yield Remark(("project", "maxRuntime"), f"{most} minute{'' if most == 1 else 's'}: {said}")
+        message = f"the server ends then, and {episodes} of {trial.episode_seconds:g} seconds can take {takes}"
+        yield Remark(("project", "maxRuntime"), f"{most} minute{'' if most == 1 else 's'}: {message}")
 
 
 def _one_for_all(trial: TrialSection) -> Iterator[Remark]:

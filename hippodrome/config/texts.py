@@ -47,8 +47,8 @@ def shown_as_they_are(config: Config) -> Iterator[Remark]:
         if found := _HTML.search(text):
             yield Remark((*TEXTS, name), f"participants read {found[0]} as it stands here: a text is no HTML")
         elif _QUOTED.fullmatch(text):
-            said = f'participants read the quotation marks, too; YAML\'s own are "…", not {text[0]}…{text[-1]}'
-            yield Remark((*TEXTS, name), said)
+            message = f'participants read the quotation marks, too; YAML\'s own are "…", not {text[0]}…{text[-1]}'
+            yield Remark((*TEXTS, name), message)
 
 
 def left_in_english(config: Config) -> Iterator[Remark]:
@@ -69,11 +69,11 @@ def left_in_english(config: Config) -> Iterator[Remark]:
 
 def _unnamed(own: Mapping[str, str]) -> Remark:
     """The remark on a study that is not in English, and names no language."""
-    said = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are"
+    message = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are"
     if own:
-        return Remark(TEXTS, f"{said}; give the language of these texts, such as language: fr")
+        return Remark(TEXTS, f"{message}; give the language of these texts, such as language: fr")
     how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
-    return Remark(TEXTS[:1], f"{said}; {how}")
+    return Remark(TEXTS[:1], f"{message}; {how}")
 
 
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
@@ -87,9 +87,9 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
         language = foreign[0]
         path: Keys = TEXTS if own else ("project",)
         shown = ", ".join(missing[:_SHOWN]) + (" …" if len(missing) > _SHOWN else "")
-        which = f"{len(missing)} texts of ours stay" if len(missing) > 1 else "one text of ours stays"
-        said = f"the study is in another language ({language}), and {which} English: {shown}"
-        yield Remark(path, f"{said}; see docs/texts.md")
+        which = f"{len(missing)} of Hippodrome's texts stay" if len(missing) > 1 else "one of Hippodrome's texts stays"
+        message = f"the study is in another language ({language}), and {which} English: {shown}"
+        yield Remark(path, f"{message}; see docs/texts.md")
 
 
 def _is_untouched(name: str, text: str) -> bool:

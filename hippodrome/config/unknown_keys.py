@@ -30,10 +30,10 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
         place = f"under {path_text(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
     for home in (section, *_ELSEWHERE):
-        near = nearest(key, sorted(NAMES[home]))
-        if near:
-            meant = (*home, near)
-            question = f"did you mean {near if home == section else path_text(meant)}?"
+        similar = nearest(key, sorted(NAMES[home]))
+        if similar:
+            meant = (*home, similar)
+            question = f"did you mean {similar if home == section else path_text(meant)}?"
             return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
     names_here = sorted(NAMES[section])
     which = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
@@ -50,9 +50,9 @@ def meant_for(path: Keys) -> Keys | None:
     if home is not None:
         return (*home, key)
     for home in (section, *_ELSEWHERE):
-        near = nearest(key, sorted(NAMES[home]), _LIKELY if home == section else _LIKELY_ELSEWHERE)
-        if near:
-            return (*home, near)
+        similar = nearest(key, sorted(NAMES[home]), _LIKELY if home == section else _LIKELY_ELSEWHERE)
+        if similar:
+            return (*home, similar)
     return None
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pyarrow.dataset
 import pyarrow.parquet as pq
+import pytest
 
 from console.problem import Exit
 from deploy.__main__ import main
@@ -207,6 +208,24 @@ def test_minari_has_a_dataset_for_each_human_player(tmp_path: Path, monkeypatch:
     right = load(out, "maze-3-right-v0", monkeypatch)
     (episode,) = right.iterate_episodes()
     assert [json.loads(text) for text in episode.infos["info"][1:]] == [{"right": n} for n in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(b'"action":2', "an action that is no number from 0 on"), (b'"reward":0.5', "a reward that is no number")],
+)
+def test_an_episode_with_a_number_that_no_dataset_can_hold_is_left_out(
+    place: Place, number: bytes, reason: str
+) -> None:
+    register(place.put)
+    pair(place.put, place.tmp)
+    name, _, _ = number.partition(b":")
+    hostile = [line.replace(number, name + b":" + b"9" * 400) for line in lines()]
+    assert hostile != lines()
+    place.put(recording_key(), packed(place.tmp, hostile))
+    left, right = place.done("--format", "minari")["minari"]
+    assert (left["id"], left["episodes"], left["leftOut"]) == ("maze-3-left-v0", 1, {})
+    assert (right["id"], right["episodes"], right["leftOut"]) == ("maze-3-right-v0", 0, {reason: 1})
 
 
 def test_who_could_be_either_player_has_a_dataset_of_each(tmp_path: Path, monkeypatch: Any) -> None:

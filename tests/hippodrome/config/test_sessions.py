@@ -98,7 +98,7 @@ def test_two_people_in_one_game(folder: Path) -> None:
         ),
         (
             "matching: mixed\nseats: group\nafterPatience: policies\n", TWO + "substitute: random\n",
-            "project.seats: group, and with afterPatience: policies a game may lack people, whose places are always the "
+            "project.seats: group, and with afterPatience: policies a game may lack participants, whose places are always the "
             "last ones; write seats: lot, or afterPatience: unmatched",
         ),
         (

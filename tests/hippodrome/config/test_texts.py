@@ -116,7 +116,7 @@ def test_the_german_texts_are_without_mistakes_and_remarks(folder: Path) -> None
 def test_texts_that_stay_english_get_one_remark(folder: Path) -> None:
     pages = texts_of(has_game=False, has_sessions=False)
     said = remarks(folder, with_texts(PAGES, "    language: de\n    step: Schritt\n    continue: Weiter\n"))
-    which = f"the study is in another language (de), and {len(pages) - 3} texts of ours stay English"
+    which = f"the study is in another language (de), and {len(pages) - 3} of Hippodrome's texts stay English"
     assert said == [f"config.yml:2: remark: project.texts: {which}: titleStep, studyBy, send …; see docs/texts.md"]
 
 
@@ -126,7 +126,7 @@ ALL_ENGLISH = (ROOT / "docs" / "texts.en.yml").read_text(encoding="utf-8").parti
 def test_sentences_that_were_copied_and_not_translated_stay_english(folder: Path) -> None:
     texts = ALL_ENGLISH.replace("    language:", "    language: fr").replace("A study by", "Une étude de")
     (said,) = remarks(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
-    assert "(fr), and 32 texts of ours stay English: saved, stillSending, noReply …; see" in said
+    assert "(fr), and 32 of Hippodrome's texts stay English: saved, stillSending, noReply …; see" in said
 
 
 def test_a_page_says_which_language_the_study_is_in(folder: Path) -> None:
@@ -142,7 +142,7 @@ def test_only_one_text_that_stays_english_is_named(folder: Path) -> None:
         f"    {name}: x\n" for name in texts_of(has_game=False, has_sessions=False) if name not in ("send", "language")
     )
     (said,) = remarks(folder, with_texts(PAGES, f"    language: de\n{own}"))
-    assert said.endswith("and one text of ours stays English: send; see docs/texts.md")
+    assert said.endswith("and one of Hippodrome's texts stays English: send; see docs/texts.md")
 
 
 @pytest.mark.parametrize("texts", ["    continue: Next page\n", "    language: en-GB\n    continue: Next page\n"])
