@@ -269,19 +269,10 @@ def check(folder: Path) -> list[str]:
         raise Problem(f"There is no {manifest.NAME} in {folder}.", "Name the folder that `data` has filled.")
     wrong = [f"{path} {difference}" for path, difference in manifest.damaged(folder, about["files"])]
     wrong += [f"{path} is not in the manifest" for path in manifest.unlisted(folder, about["files"])]
-    private = folder / PRIVATE
-    if (private / manifest.NAME).exists():
-        files = [ExportedFile(file["path"], file["bytes"], file["sha256"]) for file in _private_files(private)]
-        wrong += [f"{path} {difference}" for path, difference in manifest.damaged(folder, files)]
+    private = manifest.read(folder / PRIVATE)
+    if private is not None:
+        wrong += [f"{path} {difference}" for path, difference in manifest.damaged(folder, private["files"])]
     return wrong
-
-
-def _private_files(private: Path) -> list[dict[str, Any]]:
-    try:
-        found: list[dict[str, Any]] = msgspec.json.decode((private / manifest.NAME).read_bytes())["files"]
-    except (msgspec.MsgspecError, KeyError, TypeError):
-        return []
-    return found
 
 
 # The folder

@@ -154,18 +154,15 @@ class ExportState:
             return known
         while True:
             number = number or ("p" + "".join(secrets.choice(_LETTERS) for _ in range(9)) if apart else user)
+            folder = self._free_folder(number)
             try:
                 self._db.execute(
-                    "INSERT INTO participants (user, number, folder) VALUES (?, ?, ?)",
-                    (user, number, self._free_folder(number)),
+                    "INSERT INTO participants (user, number, folder) VALUES (?, ?, ?)", (user, number, folder)
                 )
             except sqlite3.IntegrityError:
                 number = ""  # another participant has this number: for a random one, 1 in 20 million million
                 continue
-            return ExportedParticipant(user, number, self._folder_of(user), {})
-
-    def _folder_of(self, user: str) -> str:
-        return str(self._db.execute("SELECT folder FROM participants WHERE user=?", (user,)).fetchone()[0])
+            return ExportedParticipant(user, number, folder, {})
 
     def _free_folder(self, number: str) -> str:
         """A name for the participant's folder. Names that differ only by case are one folder on some systems, and

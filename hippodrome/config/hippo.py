@@ -143,7 +143,7 @@ def _id(adapted: Adapted, name: str) -> None:
     blank = _blank(given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
-    if blank and _is_true(project.get("useAWS")):  # another folder may have this name; HIPPO refuses an empty id, too
+    if blank and _flag(project.get("useAWS")):  # another folder may have this name; HIPPO refuses an empty id, too
         return
     better = re.sub(r"[^A-Za-z0-9_-]+", "-", name if blank else text).strip("-_")
     if not ids.is_project_id(better):
@@ -257,7 +257,7 @@ def _stop_step(adapted: Adapted) -> None:
 
 def _size(adapted: Adapted) -> None:
     """Fills in the size of servers if its keys are empty, as in HIPPO's template."""
-    if not _is_true(adapted.at(("project", "useAWS"))):
+    if not _flag(adapted.at(("project", "useAWS"))):
         return
     setup = adapted.section(("project", "awsSetup"))
     for key, default, unit in (("cpu", _CPU, "vCPUs"), ("memory", _MEMORY, "GB")):
@@ -267,18 +267,12 @@ def _size(adapted: Adapted) -> None:
             adapted.remark(("project", "awsSetup", key), message)
 
 
-def _is_true(value: object) -> bool:
+def _flag(value: object) -> bool | None:
+    """True or false; None for any other value."""
     try:
         return flag(value)
     except ValueError:
-        return False
-
-
-def _is_false(value: object) -> bool:
-    try:
-        return not flag(value)
-    except ValueError:
-        return False
+        return None
 
 
 def _certificate(adapted: Adapted) -> None:
@@ -288,7 +282,7 @@ def _certificate(adapted: Adapted) -> None:
     if not isinstance(ssl, dict) or not any(_blank(ssl.get(key)) for key in _SSL):
         return
     del project["ssl"]
-    if any(not _blank(value) for value in ssl.values()) and _is_true(project.get("useAWS")):
+    if any(not _blank(value) for value in ssl.values()) and _flag(project.get("useAWS")):
         adapted.remark(path, SSL_NO_EFFECT)
 
 
@@ -329,7 +323,7 @@ def _actions(adapted: Adapted) -> None:
 def _frame_rates(adapted: Adapted) -> None:
     """Replaces bounds that do not fit the starting frame rate, if participants may not change the rate."""
     trial = adapted.section(("trial",))
-    if any(_is_true(trial.get(key)) for key in (RATE_CHANGE, RATE_CHANGE_MISSPELT)):
+    if any(_flag(trial.get(key)) for key in (RATE_CHANGE, RATE_CHANGE_MISSPELT)):
         return
     defaults = TrialSection()
     low, start, high = (
@@ -394,6 +388,6 @@ def _own_control(adapted: Adapted, path: Keys) -> None:
     """Remove one of the project's own controls if it is neither true nor false."""
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]
-    if not (_blank(value) or _is_true(value) or _is_false(value)):
+    if not _blank(value) and _flag(value) is None:
         del ui[str(path[-1])]
         adapted.remark(path, "no effect: neither true nor false")

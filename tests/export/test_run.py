@@ -335,9 +335,11 @@ def test_what_is_damaged_here_is_found_by_its_hash_and_made_anew(place: Place, h
 def test_a_damaged_manifest_or_state_is_said(place: Place) -> None:
     crowd(place.put, place.tmp, 2)
     place.done()
-    (place.out / "manifest.json").write_text('{"files": [')
-    assert "damaged" in place.run("--check").err
-    place.done()
+    for name in ("manifest.json", "private/manifest.json"):
+        (place.out / name).write_text('{"files": [')
+        checked = place.run("--check")
+        assert (checked.code, f"{name} is damaged" in checked.err) == (Exit.FAILED, True)
+        place.done()
     (place.out / "private/state.sqlite").write_bytes(b"no database at all" * 100)
     for more in ([], ["--dry-run"]):
         ran = place.run(*more)
