@@ -34,7 +34,7 @@ LOBBY, UNMATCHED = "lobby", "unmatched"  # states of the game page (docs/pages.m
 POLL_SECONDS = 0.5  # between two polls for the server's state
 LOBBY_SECONDS = 2.0  # between two polls of the lobby
 RETRY_SECONDS = 0.5  # between two tries of a request that failed
-MAX_RELOADS = 3  # tries of a request after it was answered with a status from 500
+MAX_RELOADS = 3  # further tries of a request after a status of 500 or more
 MAX_RESTARTS = 3  # times that a bot presses "Try again" after its server has ended
 MAX_PAGES = 200  # more than any study has
 
@@ -140,8 +140,8 @@ class Bot:
     async def _ask(self, address: str, body: bytes | None = None) -> Reply:
         """Send one request, again after a failure, and return the first response with a status below 400.
 
-        Raises Failed if there is no response within `patience`, after MAX_RELOADS further tries of a request that is
-        answered with a status from 500, and at once after any other status from 400.
+        Raises Failed if there is no response within `patience`, after MAX_RELOADS further tries with a status of
+        500 or more, and at once after a status from 400 to 499.
         """
         until, tries = time.monotonic() + self.patience, 0
         complaints: list[str] = []
@@ -149,12 +149,12 @@ class Bot:
             try:
                 reply = await ask(address, body, allowed=self.allowed)
             except OSError as error:  # a TimeoutError is one
+                complaint = f"no answer from {_without_query(address)}: {_reason(error)}"
                 if time.monotonic() > until:
-                    raise Failed(f"no answer from {_without_query(address)}: {error}") from error
+                    raise Failed(complaint) from error
                 tries += 1
                 if tries == 1:
-                    reason = error or type(error).__name__
-                    self.report.troubles.append(f"no answer from {_without_query(address)}: {reason}")
+                    self.report.troubles.append(complaint)
                 await asyncio.sleep(RETRY_SECONDS)
                 continue
             if reply.status < 400:
@@ -272,7 +272,12 @@ class Bot:
         except FrameError as error:
             self.report.errors.append(str(error))
         except (OSError, WebSocketException) as error:
-            self.report.troubles.append(f"the game's connection failed: {error or type(error).__name__}")
+            self.report.troubles.append(f"the game's connection failed: {_reason(error)}")
+
+
+def _reason(error: Exception) -> str:
+    """The error's text; its type if it has none, as a TimeoutError."""
+    return str(error) or type(error).__name__
 
 
 def _without_query(address: str) -> str:

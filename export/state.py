@@ -160,7 +160,7 @@ class ExportState:
                     "INSERT INTO participants (user, number, folder) VALUES (?, ?, ?)", (user, number, folder)
                 )
             except sqlite3.IntegrityError:
-                number = ""  # another participant has this number: for a random one, 1 in 20 million million
+                number = ""  # another participant has this number (a random one: with a probability of 4e-14)
                 continue
             return ExportedParticipant(user, number, folder, {})
 

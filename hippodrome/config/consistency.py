@@ -136,10 +136,10 @@ def _keys_known(checked: Checked) -> bool:
     return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in invalid)
 
 
-_ECS_LIMIT = (
-    8192  # characters of a task's overrides: https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html
-)
-_OTHER_LENGTH = 1210  # of them for the names of variables, ids, secrets and addresses, each of its greatest length
+_ECS_LIMIT = 8192
+"""Characters of a task's overrides (https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html)."""
+_OTHER_LENGTH = 1210
+"""Characters of the names of variables, ids, secrets and addresses, each of its greatest length."""
 
 
 def _environment_size(checked: Checked) -> Iterator[Mistake]:

@@ -25,7 +25,7 @@ from protocol.trial_sections import Ui
 from protocol.values import show
 
 _EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
-_ENOUGH = 200  # mistakes after which unknown keys get no suggestions, which take time to find
+_ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding them takes time
 
 
 @dataclass(slots=True)
