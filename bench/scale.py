@@ -179,7 +179,7 @@ def served(name: str, made: Sequence[ServedCrowd], theirs: Mapping[str, Any], se
     left = Counter[str]()
     for one in made:
         left.update({thing: count for thing, count in one.world.left().items() if count})
-    told = Counter(visit.told for one in made for visit in one.visits if visit.finished is None)
+    told = Counter(visit.reason for one in made for visit in one.visits if visit.finished is None)
     worst = min(one.served for one in made)
     return row(
         f"{name}: share that plays to the end, nothing left behind",

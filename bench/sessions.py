@@ -86,7 +86,7 @@ class Together:
     @property
     def at_best(self) -> list[float]:
         """How long they would wait if each ready server went to the next session at once, in the order of arrival."""
-        found = (from_json(body, Server) for key, (body, _, _) in self._kept.items() if key.startswith(RECORDS))
+        found = (from_json(body, Server) for key, (body, _, _) in self._documents.items() if key.startswith(RECORDS))
         ready = sorted((one.ready - EPOCH).total_seconds() for one in found if one.ready)
         there = sorted(one.lobby for one in self.came if one.lobby is not None and one.matched is not None)
         players = self.project.players
@@ -95,7 +95,7 @@ class Together:
         return [max(members[-1], server) - one for members, server in pairs for one in members]
 
     @property
-    def _kept(self) -> lobby.Kept:
+    def _documents(self) -> lobby.StoredDocuments:
         return self.world.platform.documents.kept
 
 
@@ -180,7 +180,7 @@ def judged(how: str, found: Together) -> Iterator[Row]:
     """
     world, came = found.world, found.came
     left = {kind: count for kind, count in world.left().items() if count}
-    ended = Counter("played to the end" if one.visit.finished is not None else one.visit.told for one in came)
+    ended = Counter("played to the end" if one.visit.finished is not None else one.visit.reason for one in came)
     well = 100 * sum(faults.served_or_told(one.visit) for one in came) / len(came)
     sizes = Counter(len(one.members) for one in lobby.formed(world.platform.documents.kept, found.project))
     within = WITHIN if len(came) == CROWD else SMALLER_WITHIN

@@ -452,7 +452,7 @@ class TimedInstallation:
 class VisitorOnMoto:
     """A participant who reads, answers, waits and plays, and who comes back after a fault.
 
-    At the end `finished` is true, or `told` is the reason why the study was over for them.
+    At the end `finished` is true, or `reason` is why the study was over for them.
     """
 
     READS, PLAYS, POLLS, UNREACHABLE = 15, 20, 45, 180  # seconds; UNREACHABLE: at an address where no server answers
@@ -474,7 +474,7 @@ class VisitorOnMoto:
         """
         self.installation, self.user, self.leaves = installation, user, leaves
         self.goal = AFTER if at_game else FINAL
-        self.finished, self.told = False, ""
+        self.finished, self.reason = False, ""
         if at_game:
             self._has_come_to_the_game()
         installation.go_on(itertools.chain([comes], self.walk()))
@@ -482,7 +482,7 @@ class VisitorOnMoto:
     @property
     def served_or_told(self) -> bool:
         """Whether they have finished, or were told why they cannot."""
-        return self.finished or bool(self.told)
+        return self.finished or bool(self.reason)
 
     def _has_come_to_the_game(self) -> None:
         project = from_data(self.installation.project, Project)
@@ -502,16 +502,16 @@ class VisitorOnMoto:
         while page and not self.served_or_told:
             if "state" in page:
                 if self.leaves:
-                    self.told = "left by themselves"
+                    self.reason = "left by themselves"
                     return
                 yield from self._game(page)
-                if self.told:
+                if self.reason:
                     return
                 page = yield from self.ask("GET")
             elif page.get("step") == self.goal:
                 self.finished = True
             elif "step" not in page:
-                self.told = page["message"]
+                self.reason = page["message"]
             else:
                 yield self.READS
                 step, said = page["step"], {"said": f"at {page['step']}"}
@@ -546,7 +546,7 @@ class VisitorOnMoto:
                     return
             elif state["state"] in ("failed", "ended"):
                 if not state["again"] or restarts == 2:
-                    self.told = f"{state['state']}: {state['reason']}"
+                    self.reason = f"{state['state']}: {state['reason']}"
                     return
                 restarts += 1
                 yield from self.ask("POST", {"hippodrome-step": GAME, "hippodrome-action": "restart"})

@@ -292,13 +292,13 @@ def _keep(
     arguments alive, for keys that consist of their ids.
     """
     wrapped = getattr(owner, name)
-    kept: dict[Hashable, tuple[Any, Any]] = {}
+    results: dict[Hashable, tuple[Any, Any]] = {}
 
     @functools.wraps(wrapped)
     def known(*arguments: Any, **more: Any) -> Any:
         found = key(*arguments, **more)
-        if found not in kept:
-            kept[found] = made(wrapped(*arguments, **more)), (arguments, more) if hold else None
-        return given(kept[found][0])
+        if found not in results:
+            results[found] = made(wrapped(*arguments, **more)), (arguments, more) if hold else None
+        return given(results[found][0])
 
     setattr(owner, name, known)

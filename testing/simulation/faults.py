@@ -197,12 +197,12 @@ class FaultOutcome:
 
 def how_it_ended(visit: SimulatedVisit) -> str:
     """Return `finished`, `stranded`, or why the study was over for the participant."""
-    return "finished" if visit.finished is not None else visit.told or "stranded"
+    return "finished" if visit.finished is not None else visit.reason or "stranded"
 
 
 def served_or_told(visit: SimulatedVisit) -> bool:
     """Return whether the participant has finished, has left by themselves, or was told why the study is over for them."""
-    told = bool(visit.told) and not visit.told.startswith(("waited too long", "no answer"))
+    told = bool(visit.reason) and not visit.reason.startswith(("waited too long", "no answer"))
     return visit.finished is not None or told
 
 
@@ -222,11 +222,11 @@ def run(
     for person in people:
         world.clock.spawn(person.walk, delay=journey.comes)
     world.settle(HORIZON)
-    kept = world.platform.documents.kept
-    lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in kept]
+    documents = world.platform.documents.kept
+    lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in documents]
     first, *others = [person.visit for person in people]
     members = [person for person in people if isinstance(person, SimulatedMember)]
-    wrong = tuple(session_checks.wrong(kept, world.project, members))
+    wrong = tuple(session_checks.wrong(documents, world.project, members))
     outcome = FaultOutcome(
         journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong
     )

@@ -171,14 +171,14 @@ def ends(owner: object) -> float:
 
 @dataclass
 class HeldMessage:
-    """A message in a queue. `receipt` is the number of its latest receive; `gone` says whether it was deleted."""
+    """A message in a queue. `receipt` is the number of its latest receive; `deleted` says whether it was."""
 
     number: int
     body: str
     lineage: Lineage = field(default_factory=dict)
     receives: int = 0
     receipt: int = 0
-    gone: bool = False
+    deleted: bool = False
 
 
 class Wire(NamedTuple):
@@ -259,7 +259,7 @@ class SimulatedQueue:
 
     def _back(self, held: HeldMessage, receipt: int) -> None:
         """Show the message again after its visibility timeout, unless it was deleted or received again."""
-        if not held.gone and held.receipt == receipt:
+        if not held.deleted and held.receipt == receipt:
             self._show(held)
 
     def _serve(self, batch: list[HeldMessage]) -> None:
@@ -274,8 +274,8 @@ class SimulatedQueue:
         else:
             failed = {one["itemIdentifier"] for one in answer.get("batchItemFailures", [])}
         for held in batch:
-            if str(held.number) not in failed and not held.gone:
-                held.gone = True
+            if str(held.number) not in failed and not held.deleted:
+                held.deleted = True
                 self.waiting -= 1
         self._running -= 1
         self._gather()

@@ -12,13 +12,13 @@ from protocol import session as sessions
 from protocol.keys import sessions_folder
 from protocol.session import SessionDocument
 
-Kept = Mapping[str, tuple[bytes, str, datetime]]  # by key: a document's body, ETag and time
+StoredDocuments = Mapping[str, tuple[bytes, str, datetime]]  # by key: a document's body, ETag and time
 
 
-def left_over(kept: Kept, project: Project) -> list[str]:
+def left_over(documents: StoredDocuments, project: Project) -> list[str]:
     """Return the entries of the lobby that are left, and what its document still lists, as texts."""
-    found = [key for key in kept if key.startswith(entries.folder(project.id))]
-    if stored := kept.get(decisions.key(project.id)):
+    found = [key for key in documents if key.startswith(entries.folder(project.id))]
+    if stored := documents.get(decisions.key(project.id)):
         document = json.loads(stored[0])
         found += [
             f"{name} {one}" for name in ("open", "proposed", "formed", "unmatched") for one in document.get(name) or ()
@@ -26,8 +26,8 @@ def left_over(kept: Kept, project: Project) -> list[str]:
     return found
 
 
-def formed(kept: Kept, project: Project) -> Iterator[SessionDocument]:
+def formed(documents: StoredDocuments, project: Project) -> Iterator[SessionDocument]:
     """Yield all sessions that were formed."""
-    for key in sorted(kept):
+    for key in sorted(documents):
         if key.startswith(sessions_folder(project.id)) and key.endswith("/session.json"):
-            yield sessions.parse(kept[key][0])
+            yield sessions.parse(documents[key][0])

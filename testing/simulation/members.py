@@ -52,7 +52,7 @@ class SimulatedMember(SimulatedParticipant):
         try:
             super()._walk()
         except Quit:
-            self.visit.told = "left by themselves"
+            self.visit.reason = "left by themselves"
 
     def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
         self.asked_at.append(self.clock.now())
@@ -87,14 +87,14 @@ class SimulatedMember(SimulatedParticipant):
             state = self._poll_lobby(step)
             if state is not None and state.get("state") != "lobby":
                 return self._loaded()
-        self.visit.told = "waited too long: lobby"
+        self.visit.reason = "waited too long: lobby"
         return None
 
     def _loaded(self) -> dict[str, Any] | None:
         """Load the page again and return it; None if it does not come."""
         found = self._ask("GET")
         if found is None:
-            self.visit.told = "no answer from the site"
+            self.visit.reason = "no answer from the site"
         return found
 
     def _poll_lobby(self, step: str) -> dict[str, Any] | None:
@@ -115,7 +115,7 @@ class SimulatedMember(SimulatedParticipant):
         if self.habits.beacon is not None:
             self.clock.spawn(lambda: self._beacon(step), delay=self.habits.beacon)
         if self.habits.back is None:
-            self.visit.told = "left by themselves"
+            self.visit.reason = "left by themselves"
             return None
         self.clock.sleep(self.habits.back)
         return self._loaded()
@@ -127,7 +127,7 @@ class SimulatedMember(SimulatedParticipant):
 
     def _second_tab(self, step: str) -> None:
         """Poll from another tab in the lobby, until they are matched or gone."""
-        while self.matched is None and not self.visit.told and self.visit.finished is None:
+        while self.matched is None and not self.visit.reason and self.visit.finished is None:
             self._poll_lobby(step)
             self.clock.sleep(POLL)
 

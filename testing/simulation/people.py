@@ -49,7 +49,7 @@ class SimulatedVisit:
     pages: int = 0  # pages that they requested, without polls
     unanswered: int = 0  # of these, the pages that did not come at the first try
     finished: float | None = None
-    told: str = ""  # why the study was over for them, if they have not finished
+    reason: str = ""  # why the study was over for them, if they have not finished
 
 
 class SimulatedParticipant:
@@ -81,7 +81,7 @@ class SimulatedParticipant:
         while page is not None:
             if "state" in page:
                 if self._leaves_at == "wait":
-                    self.visit.told = "left by themselves"
+                    self.visit.reason = "left by themselves"
                     return
                 if not self._game(page):
                     return
@@ -89,7 +89,7 @@ class SimulatedParticipant:
                 continue
             step = page.get("step")
             if step is None:
-                self.visit.told = str(page.get("message"))
+                self.visit.reason = str(page.get("message"))
                 return
             if step == self.world.project.final.key:
                 self.visit.finished = self.clock.seconds
@@ -102,7 +102,7 @@ class SimulatedParticipant:
                 self.answered.append(step)
                 if step == self._first_ask:
                     self.visit.asked = sent
-        self.visit.told = self.visit.told or "no answer from the site"
+        self.visit.reason = self.visit.reason or "no answer from the site"
 
     def _step_before_server(self) -> str | None:
         """Return the step whose answer starts the server; None if the first request of the link does."""
@@ -161,13 +161,13 @@ class SimulatedParticipant:
                 if self._is_over():
                     return True
                 if not state.get("again") or restarts == 2:
-                    self.visit.told = f"{state['state']}: {state.get('reason')}"
+                    self.visit.reason = f"{state['state']}: {state.get('reason')}"
                     return False
                 restarts += 1
                 form = {"hippodrome-step": page["step"], "hippodrome-action": "restart"}
                 self._ask("POST", urlencode(form))
             if self.clock.seconds - since > PATIENCE:
-                self.visit.told = f"waited too long: {state.get('state')}"
+                self.visit.reason = f"waited too long: {state.get('state')}"
                 return False
             self.clock.sleep(poll_delay(state, polls))
             polls += 1

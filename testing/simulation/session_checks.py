@@ -10,29 +10,29 @@ from datetime import datetime, timedelta
 from hippodrome.model import memberships
 from hippodrome.model.project import Project
 from protocol.keys import answer_key, membership_key
-from testing.simulation.lobby import Kept, formed
+from testing.simulation.lobby import StoredDocuments, formed
 from testing.simulation.members import SimulatedMember
 
 PRESENT = timedelta(seconds=10)  # a participant counts as present for so long after a request
 ANSWERS = timedelta(seconds=30)  # a request may take so long; those present at its beginning count
 
 
-def wrong(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
+def wrong(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
     """Return each fault as a sentence; "split", "merged" or "ghost" stands before the colon."""
     return [
-        *_split(kept, project, people),
-        *_merged(kept, project),
-        *_ghosts(kept, project, people),
-        *_answers(kept, project),
+        *_split(documents, project, people),
+        *_merged(documents, project),
+        *_ghosts(documents, project, people),
+        *_answers(documents, project),
     ]
 
 
-def _split(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
+def _split(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
     """Compare the members in the sessions' documents with the membership that each participant has."""
-    members = {(member.user_id, one.id) for one in formed(kept, project) for member in one.members}
+    members = {(member.user_id, one.id) for one in formed(documents, project) for member in one.members}
     memberships_found = set()
     for user in {person.visit.user for person in people}:
-        if stored := kept.get(membership_key(project.id, user)):
+        if stored := documents.get(membership_key(project.id, user)):
             membership = memberships.read(stored[0])
             if membership.session is not None:
                 memberships_found.add((user, membership.session))
@@ -42,10 +42,10 @@ def _split(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> I
         yield f"split: {user} has a membership of {session} and is no member"
 
 
-def _merged(kept: Kept, project: Project) -> Iterator[str]:
+def _merged(documents: StoredDocuments, project: Project) -> Iterator[str]:
     """Find participants in two sessions, and sessions with too many or too few members."""
     count: Counter[str] = Counter()
-    for one in formed(kept, project):
+    for one in formed(documents, project):
         count.update(member.user_id for member in one.members)
         if len(one.members) > project.players:
             yield f"merged: {one.id} has {len(one.members)} members"
@@ -54,24 +54,24 @@ def _merged(kept: Kept, project: Project) -> Iterator[str]:
     yield from (f"merged: {user} is in {times} sessions" for user, times in sorted(count.items()) if times > 1)
 
 
-def _ghosts(kept: Kept, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
+def _ghosts(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> Iterator[str]:
     """Find members who had sent no request for long when their session was formed."""
     asked: dict[str, list[datetime]] = defaultdict(list)
     for person in people:
         asked[person.visit.user] += person.asked_at
-    for one in formed(kept, project):
+    for one in formed(documents, project):
         when = datetime.fromisoformat(one.formed.replace("Z", "+00:00"))
         for member in one.members:
             if not any(when - PRESENT - ANSWERS <= at <= when for at in asked[member.user_id]):
                 yield f"ghost: {member.user_id} had sent no request for long when {one.id} was formed"
 
 
-def _answers(kept: Kept, project: Project) -> Iterator[str]:
+def _answers(documents: StoredDocuments, project: Project) -> Iterator[str]:
     """Find game steps that members of a session have answered in another session."""
-    for one in formed(kept, project):
+    for one in formed(documents, project):
         for member in one.members:
             for step in project.game_steps:
-                if stored := kept.get(answer_key(project.id, member.user_id, step)):
+                if stored := documents.get(answer_key(project.id, member.user_id, step)):
                     answers = json.loads(stored[0])["answers"]
                     if answers.get("session") != one.id:
                         yield f"split: {member.user_id} has played in {answers.get('session')}, not in {one.id}"

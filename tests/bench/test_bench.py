@@ -286,7 +286,7 @@ def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the
 def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.ServedCrowd) -> None:
     theirs = {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}
     assert scale.served("a crowd", [crowd], theirs, 1.0)["met"]
-    visits = [*crowd.visits[1:], dataclasses.replace(crowd.visits[0], finished=None, told="waited too long")]
+    visits = [*crowd.visits[1:], dataclasses.replace(crowd.visits[0], finished=None, reason="waited too long")]
     stranded = dataclasses.replace(crowd, visits=visits)
     assert scale.served("a crowd", [stranded], theirs, 1.0)["met"] is False
     assert scale.served_many(stranded, {})["met"] is False
@@ -699,7 +699,7 @@ def test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goa
         assert sum(found.at_best) < sum(found.waits), "nobody is served before a server is ready"
         found.came[0].visit.finished = None
         assert next(sessions.judged("in pairs", found))["met"] is False
-        found.came[0].visit.told = "left by themselves"
+        found.came[0].visit.reason = "left by themselves"
         assert next(sessions.judged("in pairs", found))["met"] is True
         found.came[0].asked_at.clear()
         assert next(sessions.judged("in pairs", found))["met"] is False

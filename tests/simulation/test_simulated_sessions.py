@@ -67,7 +67,7 @@ def fair(world, came):
     """Nothing left, nothing wrong; everybody came to the end, left by themselves, or was told."""
     assert session_checks.wrong(world.platform.documents.kept, world.project, came) == [], world.story()
     assert not any(world.left().values()), (world.left(), world.story())
-    assert all(faults.served_or_told(person.visit) for person in came), [p.visit.told for p in came]
+    assert all(faults.served_or_told(person.visit) for person in came), [p.visit.reason for p in came]
     assert not world.cloud.dropped, "no chain of messages is taken for a loop"
 
 
@@ -139,7 +139,7 @@ def test_those_who_leave_the_lobby_are_matched_only_if_they_had_asked_a_moment_b
     }
     world, came = crowd(60, 20, habits=lambda number: habits.get(number % 10, Habits()))
     fair(world, came)
-    gone = {person.visit.user: person for person in came if person.visit.told}
+    gone = {person.visit.user: person for person in came if person.visit.reason}
     assert len(gone) >= 6
     for one in lobby.formed(world.platform.documents.kept, PAIRS):
         formed = datetime.fromisoformat(one.formed)
@@ -167,7 +167,7 @@ def test_when_the_study_closes_while_they_wait_they_are_told():
     world.clock.after(90, world.close)
     world.settle(7200)
     assert MASTER_LIST in world.platform.documents.kept
-    assert one.visit.told, world.story()
+    assert one.visit.reason, world.story()
     assert not any(world.left().values()), world.left()
 
 

@@ -139,7 +139,7 @@ def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_serve
     served_and_gone(world, visits)
     assert world.cloud.most_invocations == 10
     assert sum(visit.unanswered for visit in visits) < sum(visit.pages for visit in visits) / 100
-    assert not any("no answer" in visit.told for visit in visits)
+    assert not any("no answer" in visit.reason for visit in visits)
 
 
 def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
@@ -179,7 +179,7 @@ def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_
     world.clock.spawn(person.walk)
     world.clock.after(20, world.close)
     world.run(600)
-    assert "study may be over" in person.visit.told
+    assert "study may be over" in person.visit.reason
     assert person.answered == []
     assert person.visit.asked is None
 

@@ -285,7 +285,7 @@ def run(installation: TimedInstallation, journey: Journey, fault: AwsFault | Non
     installation.live()
     wrong = [f"{person.user} is stranded" for person in people if not person.served_or_told]
     if fault is None and journey.finishes:
-        wrong += [f"{person.user} is told {person.told!r}" for person in people if not person.finished]
+        wrong += [f"{person.user} is told {person.reason!r}" for person in people if not person.finished]
     fine = ["dead letters"] if journey.alarms else []
     wrong += [f"{count} {what} left" for what, count in installation.left().items() if count and what not in fine]
     wrong += [f"lost {key}" for key in installation.lost()] + installation.too_long + journey.check(installation)

@@ -465,8 +465,8 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     kept = world.platform.documents.kept
     visits = [person.visit for person in arrived]
     assert sum(key.endswith("participant.json") for key in kept) == 50
-    assert sum(visit.told.startswith("This study is full") for visit in visits) == 20
-    told = {visit.told.partition(".")[0] for visit in visits if visit.finished is None}
+    assert sum(visit.reason.startswith("This study is full") for visit in visits) == 20
+    told = {visit.reason.partition(".")[0] for visit in visits if visit.finished is None}
     assert told == {"This study is full", "failed: full"}
     assert most == 8
     assert sum(visit.finished is not None for visit in visits) >= 8
