@@ -96,10 +96,14 @@ def words() -> frozenset[str]:
 
 @cache
 def sentences() -> list[str]:
-    """Every text in the code of the commands, with a hole where a value comes in."""
+    """Every text in the code of the commands but docstrings, with a hole where a value comes in."""
     found = []
     for file in sorted((first_hour.ROOT / "deploy").rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text())):
+        nodes = [*ast.walk(ast.parse(file.read_text()))]
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in nodes:
+            if id(node) in docstrings:
+                continue
             if isinstance(node, ast.JoinedStr):
                 found.append("".join(str(one.value) if isinstance(one, ast.Constant) else HOLE for one in node.values))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):

@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -222,6 +222,14 @@ def is_ours(found: Mapping[str, Any]) -> bool:
 def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
     """The parameters of a described stack."""
     return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
+
+
+def other_installations(account: Account, stack: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """The other installations in the account and region: the name and the parameters of each stack that has our tag."""
+    for page in account.client("cloudformation").get_paginator("describe_stacks").paginate():
+        for other in page["Stacks"]:
+            if other["StackName"] != stack and any(tag["Key"] == TAG for tag in other.get("Tags", ())):
+                yield other["StackName"], parameters_of(other)
 
 
 def elsewhere(account: Account, stack: str) -> str:

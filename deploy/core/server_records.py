@@ -92,7 +92,7 @@ class Records:
             record = from_json(document.body, Server) if document else None
         except (ValueError, RecursionError):
             return None
-        # A record names its server. One that lies under another server's key does not count.
+        # A record names its server. A record under another server's key does not count.
         return record if record and key == server.key(record.label) else None
 
 

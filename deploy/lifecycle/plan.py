@@ -25,7 +25,7 @@ from deploy.stack.states import StackAction
 if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
-STATEFUL = {  # resource type → what its resource holds and a new one in its place would not
+STATEFUL = {  # resource type → what is lost if a new resource replaces an old one of this type
     "AWS::S3::Bucket": "participants' data",
     "AWS::ECR::Repository": "the projects' images",
     "AWS::SQS::Queue": "messages on their way",

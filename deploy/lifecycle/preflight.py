@@ -17,9 +17,8 @@ from console import screen
 from console.formatting import count
 from console.problem import Problem
 from deploy.aws import caa, concurrency, quotas, regions
-from deploy.aws.account import Account, parameters_of
+from deploy.aws.account import Account, other_installations
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
-from deploy.aws.resource_names import TAG
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
 from deploy.stack import domain_change, inventory
 from deploy.stack.changes import Prepared
@@ -260,15 +259,13 @@ def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
 def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
     """Two installations may share a domain if they never have the same study: its servers would have the same names."""
     name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
-    for page in checked.account.client("cloudformation").get_paginator("describe_stacks").paginate():
-        for other in page["Stacks"]:
-            ours = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
-            if ours and parameters_of(other).get("RootDomain") == root and other["StackName"] != name:
-                yield look(
-                    "domain",
-                    f"The stack {other['StackName']} has the domain {root} as well: never register a project in both.",
-                    f"A domain of its own, below that, is safer: --domain {name.lower()}.{root}",
-                )
+    for other, parameters in other_installations(checked.account, name):
+        if parameters.get("RootDomain") == root:
+            yield look(
+                "domain",
+                f"The stack {other} has the domain {root} as well: never register a project in both.",
+                f"A domain of its own, below that, is safer: --domain {name.lower()}.{root}",
+            )
 
 
 _OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = {

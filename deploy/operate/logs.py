@@ -22,6 +22,7 @@ from deploy.code.template import Template
 from deploy.core import options, participants
 from deploy.core.server_records import Records
 from deploy.operate.log_lines import TRIAL, LogLine, moment, read
+from hippodrome.aws import errors as aws_errors
 
 POLL = 5  # seconds between two looks; an account may call FilterLogEvents 5 times a second in most regions
 OVERLAP = timedelta(seconds=60)  # events may arrive this late, so each look goes back so far
@@ -49,7 +50,7 @@ class Reader:
                 for group in page["logGroups"]
             ]
         except ClientError as error:
-            if error.response["Error"]["Code"] != "AccessDeniedException":
+            if aws_errors.code(error) != "AccessDeniedException":
                 raise
             return sorted([*Template.read().functions, TRIAL])
         return sorted(found)
@@ -91,7 +92,7 @@ class Reader:
                 for number, event in enumerate(page["events"]):
                     yield event["timestamp"], number, event, source
         except ClientError as error:
-            if error.response["Error"]["Code"] != "ResourceNotFoundException":  # deleted after it was listed
+            if aws_errors.code(error) != "ResourceNotFoundException":  # deleted after it was listed
                 raise
 
 

@@ -235,13 +235,8 @@ def midnight(now: datetime) -> datetime:
 def queues(account: Account, stack: str) -> list[StackQueue]:
     """The stack's queues. A queue that another one names in its RedrivePolicy is a dead-letter queue."""
     client = account.client("sqs")
-    urls = [
-        one["PhysicalResourceId"]
-        for one in Stack(account, stack).resources()
-        if one["ResourceType"] == "AWS::SQS::Queue"
-    ]
     found: dict[str, Mapping[str, str]] = {}
-    for url in urls:
+    for url in Stack(account, stack).ids_of("AWS::SQS::Queue"):
         found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
     policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in found.values())
     return [

@@ -31,7 +31,7 @@ _GONE = {"ResourceNotFoundException", "NoSuchHostedZone"}
 
 
 class Validation(NamedTuple):
-    """A validation record: the hosted zone it lies in, and the CNAME."""
+    """A validation record: its hosted zone, and the CNAME's name and value."""
 
     zone: str
     name: str  # without the final dot, in lower case

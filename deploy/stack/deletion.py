@@ -74,7 +74,7 @@ class StackDeletion:
                 pass  # each try does that itself
 
     def _free_policies(self) -> None:
-        """Detach the stack's managed policies, and print from whom."""
+        """Detach the stack's managed policies, and print to whom they were attached."""
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
             if freed := policies.detach(self._account, arn):
                 screen.success(f"The policy {freed.name} is detached from {freed.whom}.")

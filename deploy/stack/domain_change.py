@@ -13,8 +13,7 @@ from datetime import UTC, datetime
 
 from console import screen
 from console.problem import Problem
-from deploy.aws.account import Account, Installation, parameters_of
-from deploy.aws.resource_names import TAG
+from deploy.aws.account import Account, Installation, other_installations
 from deploy.core.server_records import Records
 from deploy.stack import certificate
 from deploy.stack.certificate import Choice
@@ -177,15 +176,10 @@ def _must_not_cover_a_site(prepared: Prepared, domain: str) -> None:
     Every agent can read the key of the servers' certificate.
     """
     ours = prepared.parameters["RootDomain"]
-    for page in prepared.account.client("cloudformation").get_paginator("describe_stacks").paginate():
-        for other in page["Stacks"]:
-            theirs = parameters_of(other)
-            tagged = any(tag["Key"] == TAG for tag in other.get("Tags", ()))
-            if not tagged or other["StackName"] == prepared.stack.name or "ServersHost" not in theirs:
-                continue
-            if theirs["RootDomain"] == domain or servers_domain(theirs) == ours:
-                raise Problem(
-                    f"The servers' certificate of one installation would be for the site of the other: this one and "
-                    f"{other['StackName']}.",
-                    "Take another --domain or another --servers.",
-                )
+    for name, theirs in other_installations(prepared.account, prepared.stack.name):
+        if "ServersHost" in theirs and (theirs["RootDomain"] == domain or servers_domain(theirs) == ours):
+            raise Problem(
+                f"The servers' certificate of one installation would be for the site of the other: this one and "
+                f"{name}.",
+                "Take another --domain or another --servers.",
+            )

@@ -69,7 +69,7 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
 
 
 def detach(account: Account, arn: str) -> PolicyAttachments:
-    """Detach the policy and delete its other versions; return from whom. Raises `Problem` if it is a boundary."""
+    """Detach the policy and delete its other versions; return who had it. Raises `Problem` if it is a boundary."""
     must_be_no_boundary(account, arn)
     found = attached(account, arn)
     iam = account.client("iam")

@@ -15,6 +15,7 @@ from deploy.aws.hosted_zone import read_zone
 from deploy.core.finding import Finding, bad, good, look
 from deploy.operate import snapshot
 from deploy.operate.doctor.check_context import CheckContext
+from deploy.stack.stack import Stack
 from hippodrome.certificates.rules import names_of
 
 PATIENCE = 10  # seconds to wait for the site
@@ -54,7 +55,8 @@ def zone(context: CheckContext) -> Iterator[Finding]:
 
 def site_certificate(context: CheckContext) -> Iterator[Finding]:
     """The state of the site's certificate, which ACM renews by itself if DNS is right."""
-    arns = context.of_type("AWS::CertificateManager::Certificate")
+    stack = Stack(context.account, context.installation.stack)
+    arns = stack.ids_of("AWS::CertificateManager::Certificate")
     if not arns:
         yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
     for arn in arns:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
-from typing import Any
 
 from deploy.aws.account import Account, Installation
 from deploy.aws.hosted_zone import Delegation, Zone, delegation
 from deploy.core import participants
 from deploy.core.finding import Finding
-from deploy.stack.stack import Stack
 from hippodrome.aws import AwsPlatform
 from hippodrome.model.project import Project
 
@@ -39,15 +37,6 @@ class CheckContext:
         if self.wanted is not None:
             return [self.wanted]
         return [p for p in participants.registered_projects(self.platform.documents, []) if p.live]
-
-    @cached_property
-    def resources(self) -> Sequence[Mapping[str, Any]]:
-        """The resources of the stack."""
-        return Stack(self.account, self.installation.stack).resources()
-
-    def of_type(self, kind: str) -> list[str]:
-        """The physical ids of the stack's resources of that type."""
-        return [str(one["PhysicalResourceId"]) for one in self.resources if one["ResourceType"] == kind]
 
     @cached_property
     def cpu(self) -> float:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from console.problem import Problem
+from deploy.code.packages import ROOT
 from deploy.study.image.files import project_files
 from hippodrome.config import agent_imports, layout
 from hippodrome.config.layout import REQUIREMENTS
 
-ROOT = Path(__file__).resolve().parents[3]
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time in a zip, for all files: the same files make the same bytes
 _CHUNK = 1024 * 1024
 

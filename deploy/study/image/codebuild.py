@@ -17,7 +17,7 @@ from botocore.exceptions import ClientError
 from console import formatting, screen
 from console.problem import Problem
 from deploy.aws.account import Account
-from deploy.study.image.bundle import ROOT
+from deploy.code.packages import ROOT
 from deploy.study.image.follow import BuildLog
 from deploy.study.image.order import Order
 from hippodrome.aws import errors

@@ -24,6 +24,7 @@ from deploy.core.finding import Finding, Mark, examine
 from deploy.operate.doctor import CHECKS, addresses, capacity, images, safety
 from deploy.operate.doctor.check_context import CheckContext
 from deploy.operate.doctor.rehearsal import Rehearsal
+from deploy.stack.stack import Stack
 from hippodrome.model.project import Project, step_key
 from hippodrome.model.server import Reason
 from hippodrome.servers.causes import Cause
@@ -280,13 +281,13 @@ def test_certificates_can_be_checked_on_a_machine_without_authorities(monkeypatc
     assert len(authorities() - mozillas) == 1
 
 
-def test_the_sites_certificate(world: Installed, account: Account) -> None:
+def test_the_sites_certificate(world: Installed, account: Account, monkeypatch: pytest.MonkeyPatch) -> None:
     arn = world.client("acm").request_certificate(DomainName="study.example.org", ValidationMethod="DNS")[
         "CertificateArn"
     ]
     here = [{"ResourceType": "AWS::CertificateManager::Certificate", "PhysicalResourceId": arn}]
+    monkeypatch.setattr(Stack, "resources", lambda _: here)
     one = context(account)
-    one.__dict__["resources"] = here
     world.answer(
         "acm:DescribeCertificate", {"Certificate": {"Status": "PENDING_VALIDATION", "DomainName": "study.example.org"}}
     )

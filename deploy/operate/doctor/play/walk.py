@@ -25,7 +25,7 @@ from hippodrome.ports import Topic
 from hippodrome.servers import resources
 
 PLAY = 8.0  # seconds that a bot plays
-VICTIM_PLAYS = 25.0  # seconds that the victim (the bot whose task is killed) plays: longer than `STRUCK` and a look
+VICTIM_PLAYS = 25.0  # seconds that the victim, whose task is killed, plays: its game must still run then
 STRUCK = 2.0  # seconds of play after which its task is killed
 ARRIVALS = 1.0  # seconds between the arrivals of two bots
 GONE = 240.0  # seconds until nothing of the last server may be left: stopTimeout is 120
