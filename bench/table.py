@@ -47,7 +47,7 @@ def row(
         if about_ratio and ratio is None:
             raise ValueError(f"{name}: the yardstick is 0, and the goal is about the ratio to it")
         if not about_ratio and not bound:
-            raise ValueError(f"{name}: nobody says whose the bound is")
+            raise ValueError(f"{name}: the row does not say whose the bound is")
         judged = ratio if about_ratio and ratio is not None else value
         if at_most is not None:
             goal, met = f"≤ {at_most:g}", judged <= at_most

@@ -157,7 +157,7 @@ def waiting() -> Iterator[Row]:
 def judged_idle(share: float) -> Row:
     """Return the row of a server without a participant, with its share of a core."""
     return row(
-        "CPU with nobody connected",
+        "CPU without a connected participant",
         100 * share,
         "% of a core",
         at_most=1,

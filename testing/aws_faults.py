@@ -36,7 +36,7 @@ from hippodrome.aws.retry import retry_while_busy
 
 
 class FaultKind(StrEnum):
-    """What goes wrong."""
+    """The kind of a fault."""
 
     THROTTLED = "throttled"  # in the service's own words
     INTERNAL = "internal error"  # 500, and nothing was done

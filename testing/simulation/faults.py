@@ -61,7 +61,9 @@ JOURNEYS = (
     SimulatedJourney("AWS is slow", conditions=lambda: Conditions(slow_zone=1.0, late_addresses=1.0, late=1.0)),
     SimulatedJourney("the image cannot be pulled", conditions=lambda: Conditions(stillborn=1.0), finishes=False),
     SimulatedJourney(
-        "nobody comes to play", person=lambda world: SimulatedParticipant(world, 0, leaves_at="wait"), finishes=False
+        "the participant does not come to the game",
+        person=lambda world: SimulatedParticipant(world, 0, leaves_at="wait"),
+        finishes=False,
     ),
     SimulatedJourney(
         "within the project's limits", limits={"max_participants": 1, "max_servers": 1, "max_server_hours": 5}
