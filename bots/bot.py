@@ -25,6 +25,7 @@ from bots.http import Reply, ask
 from bots.links import with_user
 from bots.page import VisitedPage
 from bots.report import BotReport, PlayedStep
+from hippodrome.config.project_keys import MAX_STEPS
 from trial.pictures.frames import FrameError
 
 SUBPROTOCOLS = [Subprotocol(f"hippodrome.{version}") for version in (3, 2, 1)]
@@ -36,7 +37,7 @@ LOBBY_SECONDS = 2.0  # between two polls of the lobby
 RETRY_SECONDS = 0.5  # between two tries of a request that failed
 MAX_RELOADS = 3  # further tries of a request after a status of 500 or more
 MAX_RESTARTS = 3  # times that a bot presses "Try again" after its server has ended
-MAX_PAGES = 200  # more than any study has
+MAX_PAGES = MAX_STEPS + 1  # the numbered steps and finalStep
 
 
 class Failed(Exception):

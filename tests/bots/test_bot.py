@@ -1,4 +1,4 @@
-"""What a bot says of a request that failed."""
+"""A bot's walk through a study, and what it says of a request that failed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from random import Random
 import pytest
 
 from bots.bot import Bot
+from bots.page import VisitedPage
+from hippodrome.config.project_keys import MAX_STEPS
 
 
 def test_a_request_that_is_not_answered_in_time_is_said_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,3 +23,23 @@ def test_a_request_that_is_not_answered_in_time_is_said_with_its_reason(monkeypa
     report = asyncio.run(bot.run())
     assert report.errors == ["no answer from 127.0.0.1:8000/next: TimeoutError"]
     assert report.troubles == ["no answer from 127.0.0.1:8000/next: TimeoutError"]
+
+
+class Walker(Bot):
+    """A bot in a study of so many pages."""
+
+    pages = 0
+
+    async def open(self) -> VisitedPage:
+        return VisitedPage(self.address, "")
+
+    async def do(self, page: VisitedPage) -> VisitedPage | None:
+        self.pages -= 1
+        return page if self.pages else None
+
+
+@pytest.mark.parametrize(("pages", "errors"), [(MAX_STEPS + 1, []), (MAX_STEPS + 2, ["the study does not end"])])
+def test_a_bot_comes_to_the_end_of_the_longest_study(pages: int, errors: list[str]) -> None:
+    bot = Walker("http://127.0.0.1:8000/next?projectId=x", "ada", Random(0))
+    bot.pages = pages
+    assert asyncio.run(bot.run()).errors == errors
