@@ -106,7 +106,7 @@ def test_what_is_refused_is_named_without_its_token() -> None:
 
 
 class Site:
-    """A site on loopback, over TLS, that answers what it is told to; `dialled` is where bots connected to."""
+    """A site on loopback, over TLS, with responses that a test sets; `dialled` has the addresses that bots connected to."""
 
     def __init__(self, folder: Path) -> None:
         made = authority()
@@ -131,7 +131,7 @@ class Site:
         writer.close()
 
     def walk(self, patience: float = 2) -> list[str]:
-        """Send a bot; what it says went wrong."""
+        """Send a bot, and return its errors and troubles."""
 
         async def held() -> list[str]:
             server = await asyncio.start_server(self._serve, "127.0.0.1", 0, ssl=self._own)

@@ -1,4 +1,4 @@
-"""A bot's walk through a study, and what it says of a request that failed."""
+"""A bot walks through a study, and reports requests that failed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from bots.page import VisitedPage
 from hippodrome.config.project_keys import MAX_STEPS
 
 
-def test_a_request_that_is_not_answered_in_time_is_said_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A TimeoutError has no text of its own."""
+def test_a_request_that_is_not_answered_in_time_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`str()` of a TimeoutError is empty."""
 
     async def late(*_: object, **__: object) -> None:
         raise TimeoutError
@@ -26,7 +26,7 @@ def test_a_request_that_is_not_answered_in_time_is_said_with_its_reason(monkeypa
 
 
 class Walker(Bot):
-    """A bot in a study of so many pages."""
+    """A bot in a study of `pages` pages."""
 
     pages = 0
 

@@ -1,4 +1,4 @@
-"""What bots look for in a study's data: a recording is what somebody's agent wrote, whatever that is."""
+"""Bots' data are verified. A study's agent decides what a recording holds, so it can hold anything."""
 
 from __future__ import annotations
 

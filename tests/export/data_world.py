@@ -137,7 +137,7 @@ def recording_key(user: str, name: str = "3-episode-0001", attempt: int = 1) -> 
 
 
 def crowd(put: Put, work: Path, people: int = 3, **how: Any) -> list[str]:
-    """A small study: everybody has finished, the last has not yet played."""
+    """A small study. All participants have finished except the last one, who has not played yet."""
     register(put)
     users = [f"user-{number:04d}" for number in range(people)]
     for number, user in enumerate(users):

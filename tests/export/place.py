@@ -36,7 +36,7 @@ class Place:
         return {line["path"]: line["sha256"] for line in json.loads((self.out / "manifest.json").read_text())["files"]}
 
     def done(self, *more: str) -> dict[str, Any]:
-        """What a run that succeeds says it did."""
+        """Run the command, which must succeed, and return the summary that it prints."""
         ran = self.run("--json", *more)
         assert ran.code == Exit.DONE, ran.err
         assert self.run("--check").code == Exit.DONE

@@ -35,18 +35,18 @@ def recording_key(session: str = SID, name: str = "3-episode-0001", attempt: int
 
 
 def session(*members: str, session_id: str = SID, players: int = 2) -> SessionDocument:
-    """The document of a session of these members; an empty id is that of an erased one."""
+    """The document of a session of these members; an empty id stands for an erased member."""
     seated = tuple(Member(user, 1, seat) for seat, user in enumerate(members))
     return SessionDocument(session_id, players, seated, 1, TIME)
 
 
 def said(user: str) -> str:
-    """What only this participant can have sent."""
+    """A text that only this participant has sent."""
     return f"words-of-{user.partition('-')[0]}"
 
 
 def round_trip(user: str) -> float:
-    """What only this participant's browser measured, in ms."""
+    """A round trip that only this participant has, in milliseconds."""
     return 20.5 + sum(user.encode())
 
 
@@ -62,7 +62,7 @@ def lines(
 ) -> list[bytes]:
     """A session's recording, line by line: both have pressed keys, given feedback, left and come back.
 
-    In the steps of `replaced` the substitute played in the place of the one on the right.
+    In the steps of `replaced` the substitute has played in the place of the right player.
     """
     clock = itertools.count(1)
     stamp = {"v": recording.SCHEMA, "session": server(session_id, attempt), "trial": "t-1"}
@@ -119,7 +119,7 @@ def lines(
 
 
 def packed(folder: Path, made: Sequence[bytes], *, close: bool = True) -> bytes:
-    """These lines as the trial's recorder leaves them."""
+    """A recording with these lines, written by the trial's own code."""
     path = folder / f"session-{next(_numbers)}.gz"
     file = Recording(path, "unused")
     for line in made:
@@ -139,7 +139,7 @@ def join(put: Put, user: str, seat: int, *, session_id: str = SID, score: float 
 
 
 def unmatched(put: Put, user: str, code: str = "UNMATCHED7") -> None:
-    """One for whom no partner was found."""
+    """The documents of a participant who was unmatched."""
     arrive(put, user, {"1": {"consent": "yes"}, "2": {"age": "40"}, "3": {"outcome": "unmatched"}, "4": {"words": ""}})
     put(membership_key(PROJECT.id, user), to_json(Membership(unmatched=True, completion_code=code)))
 
@@ -153,7 +153,7 @@ def pair(put: Put, work: Path, *, members: Sequence[str] = (ANN, BOB), session_i
 
 
 def study(put: Put, work: Path, **how: Any) -> None:
-    """A pair, and one who has found no partner."""
+    """A pair, and a participant who was unmatched."""
     register(put)
     pair(put, work, **how)
     unmatched(put, CY)

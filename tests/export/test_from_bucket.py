@@ -116,7 +116,7 @@ def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> N
 
 
 def demolish(world: Installed) -> str:
-    """The stack goes and the bucket stays, as with `destroy`; its name."""
+    """Remove the stack but not the bucket, as `destroy` does; return the bucket's name."""
     world.client("cloudformation").delete_stack(StackName="hippodrome")
     return world.env["BUCKET"]
 
@@ -208,7 +208,7 @@ def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path
 
 
 def test_a_process_that_is_ended_in_the_middle_and_once_more(world: Installed, tmp_path: Path) -> None:
-    """By Ctrl-C, and the next one by `kill -9`."""
+    """One run is ended by Ctrl-C, and the next one by `kill -9`."""
     crowd(world.put, tmp_path, 30)
     out = tmp_path / "out"
     with world.served() as env:

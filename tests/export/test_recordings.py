@@ -1,4 +1,4 @@
-"""Recordings become Parquet and Minari datasets, whole or broken, and with identities apart they name nobody."""
+"""Whole and damaged recordings become Parquet files and Minari datasets, which have no ids with `--identities apart`."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_what_else_a_step_returned_is_in_tables_and_datasets(tmp_path: Path, mon
 
 
 def test_a_dataset_ends_where_the_human_left_the_game(tmp_path: Path, monkeypatch: Any) -> None:
-    """The others play on. What stands in the lines from then on is none of the human's steps."""
+    """The other players play on, and the later lines have no steps of this human."""
     put = into_folder(tmp_path / "data")
     (user,) = crowd(put, tmp_path, 1)
     lines = recording.read(record(tmp_path, user, frames=6, observe=True, head={"players": {

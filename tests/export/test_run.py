@@ -1,4 +1,4 @@
-"""`deploy data` as people run it, on a folder: again and again, cut off, damaged, with broken input."""
+"""`deploy data` on a folder: runs that repeat, are interrupted, or find damaged files or broken input."""
 
 from __future__ import annotations
 
@@ -387,7 +387,7 @@ def test_cut_off_while_fetching_it_goes_on_from_there(place: Place, monkeypatch:
 
 
 def test_killed_between_a_file_and_its_note(place: Place) -> None:
-    """The file is there and nobody wrote it down: it is made again."""
+    """The file exists, and the state does not have it, so it is made again."""
     crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Fetcher, "_save", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))

@@ -1,4 +1,4 @@
-"""Sessions in `deploy data`: their recordings are read once, and each row says whose it is."""
+"""Sessions in `deploy data`: each recording is read once, and each row names its participant."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def test_who_could_be_either_player_has_a_dataset_of_each(tmp_path: Path, monkey
 
 
 def test_half_a_session_still_gives_what_there_is(place: Place) -> None:
-    """Cut off, without its document, or with a damaged one."""
+    """A recording that is cut off, and sessions whose document is missing or damaged."""
     study(place.put, place.tmp)
     made = lines()
     place.put(recording_key(attempt=2), packed(place.tmp, made[:9], close=False))
@@ -275,7 +275,7 @@ def test_half_a_session_still_gives_what_there_is(place: Place) -> None:
 
 
 def test_a_seat_that_the_substitute_had_from_the_beginning_is_no_persons(place: Place) -> None:
-    """Its place says its seat, and that a policy plays there. What stands beside `players` is the other human's."""
+    """The header says that a policy plays at this seat. The columns beside `players` are those of the other human."""
     register(place.put)
     join(place.put, BOB, 1)
     place.put(session_key(PROJECT.id, SID), session("", BOB).to_json())

@@ -1,4 +1,4 @@
-"""The tables hold what people sent, whatever they sent, and read back as it was."""
+"""Tables hold any answers that people send, and reading them gives the same answers."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
 def written(
     state: ExportState, folder: Path, apart: bool = False, **style: Any
 ) -> tuple[list[dict[str, str]], list[Any]]:
-    """The answers as CSV and as Parquet give them back."""
+    """The answers, read from CSV and from Parquet."""
     answers = StudyAnswers(state, PROJECT, apart)
     sheet, parquet = table_files.write(folder / "answers", answers.columns, answers.rows(), table_files.Style(**style))
     with sheet.open(encoding="utf-8-sig", newline="") as file:

@@ -1,4 +1,4 @@
-"""A recording of a session without one of its members: nothing that they sent, and the others' game whole."""
+"""A session's recording without one of its members has nothing that they sent, and the whole game of the others."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_what_does_not_say_whose_it_is_goes(tmp_path: Path) -> None:
 
 
 def test_a_place_that_the_substitute_had_is_no_members(tmp_path: Path) -> None:
-    """Seats stand in the head; the order of the humans is not theirs any more once a member was erased."""
+    """The header has the seats. After the erasure of a member, the order of the humans is not that of the seats."""
     head = {"left": {"kind": "policy", "policy": "random", "seat": 0}, "right": {"kind": "human", "seat": 1}}
     body = packed(tmp_path, lines(head=head))
     left, _ = without(tmp_path, body, 1, BOB)

@@ -44,7 +44,7 @@ VARIABLES = {value for name, value in vars(environment).items() if name.isupper(
 
 
 def request(platform: FakePlatform, user: str = "alice") -> TaskRequest:
-    """What ECS is asked for the participant's server."""
+    """The request to ECS for the participant's server."""
     Servers(platform).start(StartServer("maze", user))
     (found,) = platform.tasks.running.values()
     return found
@@ -77,7 +77,7 @@ def test_a_trial_reads_what_the_control_plane_has_written() -> None:
 
 
 class Asked(dict[str, str]):
-    """An environment that remembers which variables it was asked for."""
+    """An environment that records the names of the variables that were read."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)

@@ -1,4 +1,4 @@
-"""What the control plane and the servers share: it leads nowhere else, and both sides use it."""
+"""`protocol/` imports no other package, and both the control plane and the servers import it."""
 
 from __future__ import annotations
 

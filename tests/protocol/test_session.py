@@ -172,7 +172,7 @@ def test_a_members_token_is_theirs_on_this_server_alone(one: str, other: str, to
 
 
 def test_a_members_token_is_as_the_wires_page_says() -> None:
-    """docs/wire.md says how it is made, for clients in other languages."""
+    """docs/wire.md describes the derivation, for clients in other languages."""
     import hmac
 
     assert member_token("secret", "P1") == hmac.new(b"secret", b"member\x00P1", "sha256").hexdigest()[:48]

@@ -1,4 +1,4 @@
-"""Which known name was probably meant by an unknown one."""
+"""The known name that was probably meant by an unknown one."""
 
 from __future__ import annotations
 

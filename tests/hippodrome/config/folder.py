@@ -88,7 +88,7 @@ def read(folder: Path, text: str) -> Config:
 
 
 def mistakes(folder: Path, text: str | bytes) -> list[str]:
-    """The lines a researcher sees."""
+    """The mistakes as lines, as a researcher reads them."""
     data = text if isinstance(text, bytes) else textwrap.dedent(text).encode()
     (folder / "config.yml").write_bytes(data)
     with pytest.raises(ConfigErrors) as caught:

@@ -1,4 +1,4 @@
-"""The keys of config.yml and their values: what each mistake is answered with."""
+"""The keys of config.yml and their values: the message about each mistake."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ def test_folders_of_hippodrome_begin_with_an_underscore_and_ids_do_not() -> None
 
 
 def test_the_folder_of_the_certificate_is_no_project(folder: Path) -> None:
-    """Servers may write nothing below SSL/: a study of this name would keep no answer of a game."""
+    """Servers may not write below SSL/, so a study with this id would keep no answers of games."""
     said = "project.id: must not be SSL: that is the folder of the servers' certificate in the bucket"
     assert one(folder, SMALL.replace("id: small", "id: SSL")) == said
     assert read(folder, SMALL.replace("id: small", "id: SSL-study")).project.id == "SSL-study"

@@ -1,4 +1,4 @@
-"""What a server is told fits into the 8,192 characters that ECS allows, or the study is not registered."""
+"""The variables of a server fit into the 8,192 characters that ECS allows, or the study is not registered."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Make = Callable[[int], dict[str, Any]]
 
 
 def message(trial: dict[str, Any], games: int = 1, **project: Any) -> dict[str, Any]:
-    """A registration with the longest id there can be."""
+    """A registration with an id of the greatest length."""
     pages = ["game"] * games + ["bye"]
     steps = [{"key": str(number), "page": page} for number, page in enumerate(pages, 1)]
     return {"id": LONG, "steps": steps, "trial": {"game": "x/Y-v0", **trial}, **project}
 
 
 def request_of(registration: dict[str, Any]) -> TaskRequest:
-    """What ECS is asked for the server of a participant with the longest id."""
+    """The request to ECS for the server of a participant with the longest id."""
     steps = [{**step, "variants": 0} for step in registration["steps"]]
     kept = {"id": LONG, "name": "n", "live": True, "secret": "s", "awsSetup": {"cpu": 16, "memory": 120}}
     project = from_json(
@@ -115,6 +115,6 @@ def test_the_addresses_of_a_front_end_count() -> None:
 
 
 def test_little_room_is_given_away() -> None:
-    """A section that is refused would not fit by much."""
+    """The check leaves little room unused: it accepts a section that nearly fills the limit of ECS."""
     actions = [f"action-{k}-{'a' * 40}" for k in range(107)]
     assert ecs_takes(request_of(parse_registration(message({"actionSpace": actions}))))

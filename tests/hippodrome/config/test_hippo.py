@@ -1,6 +1,6 @@
-"""What HIPPO Gym takes in a config.yml is taken here, with a remark that says what it does.
+"""A config.yml that HIPPO Gym accepts is accepted here, with remarks that say what its keys do.
 
-The shapes are those of HIPPO's template and documentation, and of studies that were held with it, in words of our own.
+The examples have the form of HIPPO's template and documentation, and of studies that used HIPPO, in our own words.
 """
 
 from __future__ import annotations

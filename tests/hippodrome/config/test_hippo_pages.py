@@ -1,4 +1,4 @@
-"""Pages of HIPPO Gym load images from anywhere: in a clone, the sites that they name are allowed."""
+"""In a clone of HIPPO Gym, pages may load images from the sites that they name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""requirements.txt of a HIPPO Gym project: what the image installs of it."""
+"""The lines of a HIPPO Gym project's requirements.txt that the image installs."""
 
 from __future__ import annotations
 

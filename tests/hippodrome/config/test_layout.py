@@ -1,4 +1,4 @@
-"""Where the files of a project folder are found: beside config.yml, and as in a clone of HIPPO Gym."""
+"""The files of a project folder are found beside config.yml, and in the places of a clone of HIPPO Gym."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading a researcher's folder: what is accepted, how mistakes come together, and the command that checks."""
+"""Reading a researcher's folder: accepted files, several mistakes at once, and the command `check`."""
 
 from __future__ import annotations
 

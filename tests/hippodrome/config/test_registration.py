@@ -1,4 +1,4 @@
-"""What leaves a project folder: the registration, its check on the other side, and the schema for editors."""
+"""The registration of a project folder, its check by the function, and the schema for editors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ trial:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A project that is fine."""
+    """A project without mistakes."""
     (tmp_path / "steps").mkdir()
     for page in ("consent", "rules-0", "rules-1", "thanks"):
         (tmp_path / "steps" / f"{page}.html").write_text("<p>")
@@ -153,7 +153,7 @@ pages = st.text(string.ascii_lowercase + string.digits + "_-", min_size=1, max_s
 
 @st.composite
 def registrations(draw: st.DrawFn) -> dict[str, Any]:
-    """A message that is right, of any kind of project."""
+    """A valid registration of any kind of project."""
     order = [*draw(st.lists(st.one_of(st.just("game"), pages), max_size=8)), draw(pages)]
     steps = [{"key": str(k), "page": page, "variants": 0} for k, page in enumerate(order, 1)]
     for step in steps:

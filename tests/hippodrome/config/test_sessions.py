@@ -1,4 +1,4 @@
-"""Several participants in one environment: which keys go together, and what each mistake is answered with."""
+"""Several participants in one environment: keys that depend on each other, and the message about each mistake."""
 
 from __future__ import annotations
 

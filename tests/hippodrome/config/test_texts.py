@@ -1,4 +1,4 @@
-"""The key `texts`: what each mistake is answered with, and what a study in another language leaves in English."""
+"""The key `texts`: the message about each mistake, and texts that a study in another language leaves in English."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: eac
 
 
 def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
-    """What the servers of a study with this section are told, or what is wrong with the section."""
+    """The section that servers get, or the mistakes in it."""
     try:
         return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
     except ConfigErrors as errors:
@@ -80,7 +80,7 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
 
 
 def started(section: dict[str, Any]) -> trial.TrialSection | str:
-    """What a server makes of it, or what is wrong with the section."""
+    """The settings that a server reads from the section, or the mistakes in it."""
     try:
         return trial_section(section)
     except SettingsError as error:
