@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import resource
+import select
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import psutil
 import typer
 
 from local.activity.function_log import function_log
@@ -25,6 +27,7 @@ from local.web import server
 from local.web.access import origin_of
 
 ROOT = ".hippodrome"
+STARTER_SECONDS = 1.0  # after which it is seen whether the starter still runs
 
 
 def main(
@@ -53,6 +56,9 @@ def main(
         ),
     ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; earlier data are moved aside.")] = False,
+    starter: Annotated[
+        int | None, typer.Option(help="End the study when the process with this id has ended.", hidden=True)
+    ] = None,
 ) -> None:
     """Run the study of FOLDER on this machine, and print its link."""
     os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
@@ -77,7 +83,7 @@ def main(
         raise typer.Exit(1)
     new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
     try:
-        _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study)
+        _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study, starter=starter)
     except files.InUse as error:
         at = f", at {error}" if str(error) else ""
         activity_log.show(f"A study already runs with the data in {data}{at}.", "End it there with Ctrl-C first.")
@@ -93,9 +99,19 @@ def main(
 
 
 def _run_study(
-    folder: Path, port: int, data: Path, fresh: bool, *, activity_log: ActivityLog, new_study: Callable[..., Study]
+    folder: Path,
+    port: int,
+    data: Path,
+    fresh: bool,
+    *,
+    activity_log: ActivityLog,
+    new_study: Callable[..., Study],
+    starter: int | None,
 ) -> None:
-    """Run the study until a signal ends it. Raises InUse, OSError, and the errors of `Study`."""
+    """Run the study until a signal or the end of the process `starter` ends it.
+
+    Raises InUse, OSError, and the errors of `Study`.
+    """
     root = data.resolve().parent / ROOT
     state = root / data.resolve().name
     root.mkdir(parents=True, exist_ok=True)
@@ -110,9 +126,19 @@ def _run_study(
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()
-            os.read(ended, 1)
+            _wait(ended, starter)
         finally:
             study.close()
+
+
+def _wait(ended: int, starter: int | None) -> None:
+    """Return once a byte can be read from `ended`, or the process `starter` has ended (looked at once a second)."""
+    process = None
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(starter) if starter is not None else None
+    while not select.select([ended], [], [], None if starter is None else STARTER_SECONDS)[0]:
+        if process is None or not process.is_running():
+            return
 
 
 _REMEDIES = {

@@ -56,7 +56,10 @@ class Process(Protocol):
 
 
 class StudyProcess:
-    """`python -m local` in a process of its own. `link` is the study's link once it has started."""
+    """`python -m local` in a process of its own. `link` is the study's link once it has started.
+
+    The study ends after this process, too, however this one ends.
+    """
 
     def __init__(self, folder: Path, data: Path, *, log: Path | None = None) -> None:
         self.folder, self.data = folder.resolve(), data.resolve()
@@ -75,7 +78,7 @@ class StudyProcess:
         with self.log.open("ab") as log:
             begin = log.tell()
             self._process = self._begin(
-                [str(self.folder), "--port", "0", "--data", str(self.data)],
+                [str(self.folder), "--port", "0", "--data", str(self.data), "--starter", str(os.getpid())],
                 cwd=ROOT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
                 stdout=log,

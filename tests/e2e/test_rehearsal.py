@@ -17,6 +17,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import psutil
 import pytest
 
 from bots.addresses import THIS_MACHINE, AddressRefused
@@ -130,6 +131,22 @@ def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, nu
     assert process.returncode == 130, text
     assert "Traceback" not in text
     assert servers_of(data) == []
+
+
+def test_its_study_and_servers_end_also_if_it_is_killed(project: Any, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    process = rehearsal(project(length=3000), "--bots", "1", "--play", "100", "--data", data)
+    until = time.monotonic() + 60
+    while not servers_of(data):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    in_use = (tmp_path / ".hippodrome" / "data.lock").read_text()
+    study = psutil.Process(int(re.findall(r"process (\d+)", in_use)[0]))
+    process.kill()
+    said(process)
+    while study.is_running() or servers_of(data):
+        assert time.monotonic() < until + 60
+        time.sleep(0.1)
 
 
 def interrupted(pid: int) -> bool:
