@@ -175,8 +175,8 @@ def main(
     known = templates()
     usage = f"make new PROJECT=../my-study TEMPLATE={next(iter(known), '')}"
     if template not in known:
-        said = f"There is no template {template}." if template else f"Name a template: {usage}"
-        sys.stdout.write(f"{said}\n{listing(known)}\n")
+        problem = f"There is no template {template}." if template else f"Name a template: {usage}"
+        sys.stdout.write(f"{problem}\n{listing(known)}\n")
         raise typer.Exit(1)
     if folder in ("", "."):
         sys.stdout.write(f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={template}\n")

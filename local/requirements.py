@@ -66,9 +66,9 @@ def main(
 ) -> None:
     """Install the packages of the study in FOLDER, once. The exit status is 0 even if that fails."""
     file = wanted(folder)
-    said = install(file, constraints, stamps) if file else ""
-    if said:
-        sys.stdout.write(f"{said}\n")
+    failure = install(file, constraints, stamps) if file else ""
+    if failure:
+        sys.stdout.write(f"{failure}\n")
 
 
 if __name__ == "__main__":

@@ -309,7 +309,7 @@ class TaskProcess:
             self.gone.wait(0.02)  # the shell has not started it yet
 
     def _terminate(self) -> bool:
-        """Send SIGTERM to the server; return False if it has not begun. Raises OSError."""
+        """Send SIGTERM to the server; return False if there is no process of it. Raises OSError."""
         note, mark = self._shared.files.note(self.task.name, "pid"), self._mark
         server = process_of(int(note), mark) if note.isdecimal() else child_of(self.task.pid, mark)
         if server is None:

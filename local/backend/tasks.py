@@ -173,17 +173,17 @@ class ProcessTasks:
         """End every server now, SIGTERM first; return when all are gone, at the latest a second after `seconds`."""
         with self._lock:
             self._closing = True
-            going = [server for server in self._all() if server.task.status != "STOPPED"]
+            running = [server for server in self._all() if server.task.status != "STOPPED"]
         until = time.monotonic() + seconds
-        for server in going:
+        for server in running:
             server.end("local mode was ended", until, even_unsaved=True)
-        for server in going:
+        for server in running:
             server.gone.wait(max(0.0, until - time.monotonic()))
-        for server in going:
+        for server in running:
             if not server.gone.is_set():
                 server.kill_at_once()
         until = time.monotonic() + 1
-        for server in going:
+        for server in running:
             server.gone.wait(max(0.0, until - time.monotonic()))
         self._shared.closed.set()
 
@@ -192,14 +192,14 @@ class ProcessTasks:
 
         For servers whose records were deleted: nothing else stops them, and new servers may get their names.
         """
-        going = [server for server in self._all() if names is None or server.task.name in names]
-        playing = [server for server in going if server.task.status != "STOPPED"]
+        forgotten = [server for server in self._all() if names is None or server.task.name in names]
+        playing = [server for server in forgotten if server.task.status != "STOPPED"]
         for server in playing:
             server.silent = True
             server.end("its record is gone", time.monotonic(), even_unsaved=True)
         for server in playing:
             server.gone.wait(5)
-        for server in going:
+        for server in forgotten:
             self._forget(server)
             self.log(server.task.name).unlink(missing_ok=True)
         return len(playing)
@@ -235,10 +235,10 @@ class ProcessTasks:
 
     def _prune(self) -> None:
         """Remove the records and logs of stopped servers, except for the newest. Raises OSError."""
-        gone = [server for server in self._all() if server.task.status == "STOPPED"]
-        gone.sort(key=lambda server: server.task.stopped or "", reverse=True)
-        for server in gone[KEPT_LOGS:]:
+        stopped = [server for server in self._all() if server.task.status == "STOPPED"]
+        stopped.sort(key=lambda server: server.task.stopped or "", reverse=True)
+        for server in stopped[KEPT_LOGS:]:
             self.log(server.task.name).unlink(missing_ok=True)
-        for server in gone[KEPT_TASKS:]:
+        for server in stopped[KEPT_TASKS:]:
             if not server.unfinished:
                 self._forget(server)

@@ -23,14 +23,14 @@ def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
         pages = open_folder(folder).path
     except StepFileError:
         return
-    asked = _asked(pages, folder, config)
-    if asked:
-        yield asked
+    unasked = _unasked(pages, folder, config)
+    if unasked:
+        yield unasked
     if config.project.after_patience == "unmatched":
         yield from _unmatched(pages, config)
 
 
-def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
+def _unasked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
     """A mistake if no page before the game has the field by which people are matched. A script may make the field."""
     field = field_of(config.project.matching)
     if field is None:
@@ -40,8 +40,8 @@ def _asked(pages: Path, folder: Path, config: Config) -> Diagnostic | None:
     if field in names or re.search(rf"""["'`]{re.escape(field)}["'`]""", text):
         return _too_alike(earlier, folder, config, field)
     there = f"; there are the fields {short(', '.join(names))}" if names else ", and none asks anything"
-    said = f"no page before the game asks {short(field)}{did_you_mean(field, names) or there}"
-    return read_source(folder).diagnostic(sessions.MATCHING, said)
+    message = f"no page before the game asks {short(field)}{did_you_mean(field, names) or there}"
+    return read_source(folder).diagnostic(sessions.MATCHING, message)
 
 
 def _too_alike(earlier: EarlierAnswers, folder: Path, config: Config, field: str) -> Diagnostic | None:
@@ -50,8 +50,10 @@ def _too_alike(earlier: EarlierAnswers, folder: Path, config: Config, field: str
     if "different" not in config.project.matching or choices is None or choices >= players:
         return None
     can = "one answer" if choices == 1 else f"{choices} different answers"
-    said = f"{short(field)} can have {can} only, and {players} players need different ones: no participant finds others"
-    return read_source(folder).diagnostic(sessions.MATCHING, said)
+    message = (
+        f"{short(field)} can have {can} only, and {players} players need different ones: no participant finds others"
+    )
+    return read_source(folder).diagnostic(sessions.MATCHING, message)
 
 
 def _unmatched(pages: Path, config: Config) -> Iterator[Diagnostic]:
@@ -59,8 +61,8 @@ def _unmatched(pages: Path, config: Config) -> Iterator[Diagnostic]:
     last = max(index for index, step in enumerate(config.steps) if step.type.on_server)
     after = [file for step in config.steps[last + 1 :] for file in step.files]
     if after and not any("unmatched" in source_of(file) for file in after):
-        said = (
+        message = (
             "participants who find no other to play with come here too, without having played; "
             "{% if participant.unmatched %} … {% else %} … {% endif %} tells them apart"
         )
-        yield Diagnostic(f"{pages.name}/{after[0].name}", None, "", said, remark=True)
+        yield Diagnostic(f"{pages.name}/{after[0].name}", None, "", message, remark=True)

@@ -130,16 +130,16 @@ def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
     users = place / project_id / "users"
     people = [user.name for user in users.iterdir() if not user.name.startswith("bot-")] if users.is_dir() else []
     if people or place.resolve() == (folder / "data").resolve():
-        whose = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
+        reason = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
         raise StudyNotStarted(
-            f"{place} {whose}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
+            f"{place} {reason}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
         )
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StudyNotStarted(
-            f"The bots' data cannot be kept in {place}: {error.strerror}. Name another folder with --data (with make: "
-            "DATA=)."
+            f"The bots' data cannot be stored in {place}: {error.strerror}. Name another folder with --data "
+            "(with make: DATA=)."
         ) from None
     return place
 

@@ -82,9 +82,9 @@ def _played(reports: Sequence[BotReport], found: Verification | None) -> Rows:
         rows.append(("server: request to ready", _spread(found.starts)))
     rates = [rate for play in plays if (rate := play.received_rate)]
     if rates:
-        asked = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
+        frame_rates = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
         amount = sum(play.bytes for play in plays)
-        rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {asked} set"))
+        rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {frame_rates} set"))
         rows.append(("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB"))
     return rows
 

@@ -52,18 +52,18 @@ def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: 
     `origins` get the CORS headers. Pages of this server may send each other a referrer: without that, browsers send
     `Origin: null` with forms.
     """
-    kept = dict(sent)
-    if kept.get("referrer-policy") == "no-referrer":
-        kept["referrer-policy"] = "same-origin"
-    if not any(name.startswith("access-control-") for name in kept):
-        return kept
+    headers = dict(sent)
+    if headers.get("referrer-policy") == "no-referrer":
+        headers["referrer-policy"] = "same-origin"
+    if not any(name.startswith("access-control-") for name in headers):
+        return headers
     if origin is not None and origin in origins:
         return {
-            **kept,
+            **headers,
             "access-control-allow-origin": origin,
-            "vary": ", ".join(filter(None, [kept.get("vary"), "Origin"])),
+            "vary": ", ".join(filter(None, [headers.get("vary"), "Origin"])),
         }
-    return {name: value for name, value in kept.items() if not name.startswith("access-control-")}
+    return {name: value for name, value in headers.items() if not name.startswith("access-control-")}
 
 
 def origin_of(address: str) -> str | None:

@@ -77,8 +77,8 @@ class App:
         """The headers that are sent with an answer (`access.headers_for`), and its cookies."""
         cookies = [(name, value) for name, value in headers if name == b"set-cookie"]
         others = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in headers if name != b"set-cookie"]
-        kept = access.headers_for(_headers(scope).get("origin"), others, self._origins)
-        return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.items()] + cookies
+        sent = access.headers_for(_headers(scope).get("origin"), others, self._origins)
+        return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in sent.items()] + cookies
 
     def _call(self, handler: Handler, event: dict[str, Any]) -> GatewayResponse:
         try:

@@ -114,12 +114,12 @@ class Names:
 
     def _choose(self, connection: ssl.SSLObject, name: str | None, _: ssl.SSLContext) -> int | None:
         """Choose the certificate of the name that the client asks for; refuse names that no server has."""
-        asked = (name or "").lower()
-        if self._find(asked) is None:
+        server_name = (name or "").lower()
+        if self._find(server_name) is None:
             return ssl.ALERT_DESCRIPTION_UNRECOGNIZED_NAME
-        if asked not in self._contexts:
-            self._contexts[asked] = self._authority.context(asked)
-        connection.context = self._contexts[asked]
+        if server_name not in self._contexts:
+            self._contexts[server_name] = self._authority.context(server_name)
+        connection.context = self._contexts[server_name]
         return None
 
     async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

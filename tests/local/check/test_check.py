@@ -76,7 +76,7 @@ def test_no_such_folder(tmp_path: Path) -> None:
     assert run(tmp_path / "nowhere") == (1, [f"{tmp_path / 'nowhere'}: there is no such folder", "1 mistake."])
 
 
-# --- while the study is held ------------------------------------------------------------------------
+# --- while the study runs -----------------------------------------------------------------------------
 
 
 def test_what_a_held_study_is_told(folder: Path, tmp_path: Path) -> None:
