@@ -1,4 +1,4 @@
-"""Examples, played to the end by bots as participants would play them."""
+"""Fixtures that let a bot play an example to the end, and that load an example's modules."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from testing.held_study import HeldStudy
 from trial.recordings.recording import read
 
 EXAMPLES = ROOT / "examples"
-PATIENCE = 120.0  # seconds in which a bot must have passed everything
+PATIENCE = 120.0  # seconds within which a bot must finish the study
 
 PlayExample = Callable[..., "Played"]
 LoadModule = Callable[[str, str], ModuleType]
@@ -32,7 +32,7 @@ LoadModule = Callable[[str, str], ModuleType]
 
 @dataclass(frozen=True)
 class Played:
-    """What is left of a participant: the lines of each recording, and the game's own result."""
+    """A participant's recordings, each as its lines, and the result of the game."""
 
     recordings: list[list[dict[str, Any]]]
     result: Mapping[str, Any]
@@ -44,7 +44,7 @@ class Played:
 
 @pytest.fixture
 def play_example(tmp_path: Path) -> Iterator[PlayExample]:
-    """Let a bot pass a whole example: `play_example("tamer", maxEpisodes=1)`, where the rest are keys of `trial`.
+    """Let a bot play an example to the end: `play_example("tamer", maxEpisodes=1)` sets these keys of `trial`.
 
     Fails if the bot does not come to the end, or if an answer, a recording or a server is missing or left over.
     """
@@ -76,7 +76,7 @@ def play_example(tmp_path: Path) -> Iterator[PlayExample]:
 
 @pytest.fixture
 def load_module(monkeypatch: pytest.MonkeyPatch) -> Iterator[LoadModule]:
-    """A module of an example, `load_module("tamer", "agent")`. The modules beside it are forgotten afterwards."""
+    """Load a module of an example: `load_module("tamer", "agent")`. After the test, the example's modules are forgotten."""
     before = set(sys.modules)
 
     def load(name: str, module: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""`make check` has nothing to say about the examples."""
+"""`make check` on each example."""
 
 from __future__ import annotations
 

@@ -15,27 +15,27 @@ RATE = 2
 
 
 class Teacher:
-    """Says 0.2 to 0.8 seconds after every second move whether it was better or worse than the policy.
+    """A teacher who says, 0.2 to 0.8 seconds after every second move, whether it was better or worse than the policy.
 
-    A word is the sign of the advantage, as the paper has it: of a move that is about as good as what the learner does
-    on average, this teacher says nothing. One word in twenty is wrong.
+    A word is the sign of the advantage, as in the paper. This teacher says nothing about a move that is about as good
+    as the learner's average one. One word in twenty is wrong.
     """
 
     def __init__(self, garden: Any, seed: int) -> None:
         self._garden, self._chance = garden, np.random.default_rng(seed)
-        self._away = dict(ways(garden))
+        self._away = dict(distances(garden))
         self._words: list[tuple[float, str]] = []
         self.said = 0
 
-    def worth(self, place: Any, move: int) -> float:
+    def value_of(self, place: Any, move: int) -> float:
         there = self._garden.beside(place, move)
         return -self._away[there] - 3 * (there in self._garden.FLOWERS)
 
     def watch(self, step: int, place: Any, move: int, probabilities: np.ndarray) -> None:
         if self._chance.random() > 0.5:
             return
-        usual = sum(share * self.worth(place, other) for other, share in enumerate(probabilities))
-        better = self.worth(place, move) - usual
+        usual = sum(share * self.value_of(place, other) for other, share in enumerate(probabilities))
+        better = self.value_of(place, move) - usual
         if abs(better) < 0.3:
             return
         good = (better > 0) != (self._chance.random() < 0.05)
@@ -47,8 +47,8 @@ class Teacher:
             self.said += 1
 
 
-def ways(garden: Any) -> Iterator[tuple[Any, int]]:
-    """How many moves each place is away from the station, around the flowers."""
+def distances(garden: Any) -> Iterator[tuple[Any, int]]:
+    """Yield each place with the number of moves from there to the station, around the flowers."""
     reached, edge, length = {garden.STATION}, [garden.STATION], 0
     while edge:
         yield from ((place, length) for place in edge)
@@ -64,8 +64,8 @@ def ways(garden: Any) -> Iterator[tuple[Any, int]]:
         length += 1
 
 
-def taught(agent: Any, garden: Any, seed: int, teacher: Teacher | None) -> list[tuple[float, bool]]:
-    """The score of each episode, and whether the robot reached its station."""
+def play_episodes(agent: Any, garden: Any, seed: int, teacher: Teacher | None) -> list[tuple[float, bool]]:
+    """Play the episodes; return each one's score, and whether the robot reached its station."""
     agent.start("garden")
     found, clock = [], 0
     for episode in range(EPISODES):
@@ -87,24 +87,24 @@ def taught(agent: Any, garden: Any, seed: int, teacher: Teacher | None) -> list[
 
 
 def last_three(load_module: Any, *, with_teacher: bool) -> tuple[float, float]:
-    """Of ten robots: the mean score of their last three episodes, and in which share of these they came home."""
+    """The mean score of the last three episodes of ten robots, and the share of these episodes in which a robot came home."""
     garden, module = load_module("coach", "garden"), load_module("coach", "agent")
     found = []
     for seed in range(1, 11):
         teacher = Teacher(garden, seed) if with_teacher else None
-        found += taught(module.Agent(), garden, seed, teacher)[-3:]
+        found += play_episodes(module.Agent(), garden, seed, teacher)[-3:]
         assert teacher is None or teacher.said < 150  # fewer than one word in two steps
     scores, home = zip(*found, strict=True)
     return float(np.mean(scores)), float(np.mean(home))
 
 
-def test_with_a_teacher_it_learns_to_come_home_around_the_flowers(load_module: Any) -> None:
+def test_with_a_teacher_the_robot_learns_to_come_home_around_the_flowers(load_module: Any) -> None:
     score, home = last_three(load_module, with_teacher=True)
     assert score > 2.5  # 5 is the best
     assert home >= 0.8
 
 
-def test_without_a_teacher_it_learns_nothing(load_module: Any) -> None:
+def test_without_a_teacher_the_robot_learns_nothing(load_module: Any) -> None:
     score, home = last_three(load_module, with_teacher=False)
     assert score < -4
     assert home <= 0.2
@@ -115,7 +115,7 @@ def learner(load_module: Any, **more: Any) -> tuple[Any, np.ndarray]:
     return load_module("coach", "coach").Coach(**settings), np.eye(3)
 
 
-def test_a_word_makes_what_was_done_more_or_less_likely(load_module: Any) -> None:
+def test_a_word_makes_the_move_before_it_more_or_less_likely(load_module: Any) -> None:
     for word, more in ((1.0, True), (-1.0, False)):
         coach, states = learner(load_module)
         coach.took(states[0], 1)
@@ -135,7 +135,7 @@ def test_a_word_moves_along_the_gradient_of_the_policy(load_module: Any) -> None
     assert coach._trace == pytest.approx(by_differences, abs=1e-5)
 
 
-def test_a_word_counts_less_for_what_came_before(load_module: Any) -> None:
+def test_a_word_counts_less_for_earlier_moves(load_module: Any) -> None:
     coach, states = learner(load_module)
     for state in states:
         coach.took(state, 1)
@@ -144,7 +144,7 @@ def test_a_word_counts_less_for_what_came_before(load_module: Any) -> None:
     assert weights == pytest.approx([0.125, 0.25, 0.5])
 
 
-def test_a_word_is_not_about_what_the_person_cannot_have_judged_yet(load_module: Any) -> None:
+def test_a_word_does_not_count_for_a_move_that_the_person_cannot_have_judged_yet(load_module: Any) -> None:
     coach, states = learner(load_module, delay=1, decay=0.0)
     coach.took(states[0], 1)
     coach.took(states[1], 1)
@@ -153,7 +153,7 @@ def test_a_word_is_not_about_what_the_person_cannot_have_judged_yet(load_module:
     assert coach.probabilities(states[1])[1] == 0.5
 
 
-def test_an_episode_begins_without_words_about_the_last_one(load_module: Any) -> None:
+def test_a_word_in_a_new_episode_does_not_count_for_the_moves_of_the_last_one(load_module: Any) -> None:
     coach, states = learner(load_module)
     coach.took(states[0], 1)
     coach.begin()
@@ -171,7 +171,7 @@ def test_the_seed_repeats_an_episode(load_module: Any) -> None:
     assert played[0] == played[1]
 
 
-def test_all_that_is_drawn_can_be_drawn(load_module: Any) -> None:
+def test_every_scene_can_be_drawn(load_module: Any) -> None:
     from trial.pictures.scene import as_scene
 
     agent = load_module("coach", "agent").Agent()
@@ -184,7 +184,7 @@ def test_all_that_is_drawn_can_be_drawn(load_module: Any) -> None:
         agent.step(0)
 
 
-def test_a_bot_plays_it_to_the_end(play_example: Any) -> None:
+def test_a_bot_plays_the_example_to_the_end(play_example: Any) -> None:
     played = play_example("coach", startingFrameRate=60, maxEpisodes=3, betweenEpisodes=0)
     assert [lines[-1]["kind"] for lines in played.recordings] == ["end", "end", "end"]
     assert {step["by"] for step in played.steps()} == {"agent"}

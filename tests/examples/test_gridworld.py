@@ -1,4 +1,4 @@
-"""examples/gridworld: two players in turn, a partner that plans, and images that a script makes."""
+"""examples/gridworld: two players take turns, the partner plans, and every image of the scene exists."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "gridworld"
 
 @pytest.fixture
 def modules(load_module: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any, Any]:
-    """forest, partners without the time that they seem to think, and agent."""
+    """The modules forest, partners (which do not wait as if they thought) and agent."""
     forest, partners = load_module("gridworld", "forest"), load_module("gridworld", "partners")
     monkeypatch.setattr(partners, "THINKING_SECONDS", 0)
     return forest, partners, load_module("gridworld", "agent")
 
 
 def turns_with(modules: Any, you: Any, partner: Any, seed: int) -> int:
-    """How many turns a game takes."""
+    """Play a game; return how many turns it took."""
     _, _, module = modules
     agent, players = module.Agent(), {"you": you, "partner": partner}
     agent.start("forest")
@@ -47,19 +47,19 @@ def test_the_planner_is_a_better_partner_than_the_one_that_goes_for_the_nearest(
     assert planner < nearest - 1
 
 
-def observed(forest: Any, **more: Any) -> dict[str, Any]:
+def observation(forest: Any, **more: Any) -> dict[str, Any]:
     return {"me": (7, 0), "other": (0, 5), "acorns": [], "trees": frozenset(), "left": 36, **more}
 
 
-def test_it_leaves_to_the_other_player_what_is_nearer_to_them(modules: Any) -> None:
+def test_the_planner_leaves_acorns_to_the_player_who_is_nearer(modules: Any) -> None:
     forest, partners, _ = modules
     near_the_other, far = (1, 5), (4, 0)
-    assert partners.first_of_plan(observed(forest, acorns=[near_the_other, far])) == far
-    assert partners.first_of_plan(observed(forest, acorns=[near_the_other])) is None
+    assert partners.first_of_plan(observation(forest, acorns=[near_the_other, far])) == far
+    assert partners.first_of_plan(observation(forest, acorns=[near_the_other])) is None
 
 
-def test_the_plan_is_the_best_of_all_divisions(modules: Any) -> None:
-    """Compared with a plain search through all divisions and orders."""
+def test_the_plan_is_the_best_division_of_the_acorns(modules: Any) -> None:
+    """It is compared with a plain search through all divisions and orders."""
     forest, partners, _ = modules
 
     def length(start: Any, order: Any) -> int:
@@ -69,7 +69,7 @@ def test_the_plan_is_the_best_of_all_divisions(modules: Any) -> None:
     for seed in range(10):
         chance = np.random.default_rng(seed)
         acorns = [(int(number) % 8, int(number) // 8) for number in chance.choice(np.arange(8, 40), 4, replace=False)]
-        watched = observed(forest, acorns=acorns)
+        watched = observation(forest, acorns=acorns)
         best: dict[tuple[int, int], set[Any]] = {}
         for count in range(len(acorns) + 1):
             for mine in itertools.permutations(acorns, count):
@@ -80,7 +80,7 @@ def test_the_plan_is_the_best_of_all_divisions(modules: Any) -> None:
         assert partners.first_of_plan(watched) in best[min(best)]
 
 
-def test_each_forest_can_be_collected_and_the_seed_repeats_it(modules: Any) -> None:
+def test_all_acorns_of_a_forest_can_be_reached_and_the_seed_repeats_it(modules: Any) -> None:
     forest, _, _ = modules
     for seed in range(50):
         one, same = forest.Forest(seed), forest.Forest(seed)
@@ -110,7 +110,7 @@ def test_no_player_walks_through_trees_or_through_the_other(modules: Any) -> Non
     assert game.places["you"] == (0, 0)
 
 
-def test_a_game_ends_when_all_is_collected_or_the_turns_are_over(modules: Any) -> None:
+def test_a_game_ends_when_all_acorns_are_collected_or_the_turns_are_over(modules: Any) -> None:
     forest, _, module = modules
     agent = module.Agent()
     agent.start("forest")
@@ -125,7 +125,7 @@ def test_a_game_ends_when_all_is_collected_or_the_turns_are_over(modules: Any) -
     assert (terminated["you"], truncated["you"]) == (True, False)
 
 
-def test_all_that_is_drawn_can_be_drawn(modules: Any) -> None:
+def test_every_scene_can_be_drawn(modules: Any) -> None:
     from trial.pictures.assets import load
     from trial.pictures.scene import as_scene, images_of
 
@@ -138,7 +138,7 @@ def test_all_that_is_drawn_can_be_drawn(modules: Any) -> None:
     assert set(images_of(scene)) <= set(load(EXAMPLE, "assets").by_name)
 
 
-def test_a_bot_and_the_planner_play_it_to_the_end(play_example: Any) -> None:
+def test_a_bot_and_the_planner_play_the_example_to_the_end(play_example: Any) -> None:
     played = play_example("gridworld", maxEpisodes=1)
     [lines] = played.recordings
     assert lines[-1]["kind"] == "end"

@@ -19,11 +19,11 @@ from trial.pictures.scene import as_scene, images_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "overcooked"
 STEPS = 300
-"""Of a round here: half a minute."""
+"""Steps of a round in these tests: half a minute."""
 
 
 Chef = Callable[[Any, int, Any], int]
-"""From what stands where, the chef's number and observation to an action."""
+"""A function that chooses an action by the kitchen's state, the chef's number and the chef's observation."""
 
 
 @pytest.fixture
@@ -42,13 +42,13 @@ def policy() -> Chef:
     return lambda _, __, seen: int(session.run(None, {"observation": seen[None]})[0][0].argmax())
 
 
-def at_random(seed: int) -> Chef:
+def random_chef(seed: int) -> Chef:
     chance = np.random.default_rng(seed)
     return lambda *_: int(chance.integers(6))
 
 
 def soups(env: Any, chefs: tuple[Chef, Chef], seed: int) -> int:
-    """How many soups they deliver in a round."""
+    """Play a round; return how many soups the chefs delivered."""
     observations, _ = env.reset(seed=seed)
     while env.agents:
         stands = env.kitchen()
@@ -56,20 +56,20 @@ def soups(env: Any, chefs: tuple[Chef, Chef], seed: int) -> int:
     return int(env.soups)
 
 
-def test_it_keeps_the_rules_of_pettingzoo(kitchen: Any) -> None:
+def test_the_environment_keeps_the_rules_of_pettingzoo(kitchen: Any) -> None:
     from pettingzoo.test import parallel_api_test
 
     parallel_api_test(kitchen.Overcooked(max_steps=60), num_cycles=100)
 
 
-def test_the_same_seed_and_actions_are_the_same_round(kitchen: Any) -> None:
+def test_the_same_seed_and_actions_give_the_same_round(kitchen: Any) -> None:
     env = kitchen.Overcooked(max_steps=80)
-    ends = [(soups(env, (at_random(1), at_random(2)), seed), env.kitchen()) for seed in (3, 3, 4)]
+    ends = [(soups(env, (random_chef(1), random_chef(2)), seed), env.kitchen()) for seed in (3, 3, 4)]
     assert ends[0] == ends[1] != ends[2]
 
 
 def test_rounds_without_a_seed_differ(kitchen: Any) -> None:
-    """The package itself takes the same one each time."""
+    """The package itself would take the same seed each time."""
     env = kitchen.Overcooked(max_steps=10)
     places = set()
     for _ in range(20):
@@ -78,11 +78,11 @@ def test_rounds_without_a_seed_differ(kitchen: Any) -> None:
     assert len(places) > 1
 
 
-def test_a_soup_from_the_first_onion_to_the_hatch(kitchen: Any, cook: Any) -> None:
-    """One chef alone: what happens is seen in the kitchen and in the rewards, and both chefs get them."""
+def test_one_chef_alone_delivers_a_soup(kitchen: Any, cook: Any) -> None:
+    """From the first onion to the hatch: the state of the kitchen and the rewards show it, and both chefs get the rewards."""
     env = kitchen.Overcooked(max_steps=STEPS)
     env.reset(seed=0)
-    while env.kitchen().chefs[1].cell == (1, 2):  # nobody else reaches the pot
+    while env.kitchen().chefs[1].cell == (1, 2):  # who stands there keeps chef 0 from the pot
         env.step({0: kitchen.NOOP, 1: kitchen.LEFT})
     earned: list[float] = []
     held: list[str | None] = []
@@ -107,11 +107,11 @@ def test_a_round_ends_after_its_steps(kitchen: Any) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_it_cooks_with_a_partner_who_stands_still(kitchen: Any, policy: Chef, number: int) -> None:
-    """Who acts at random in its place delivers nothing."""
+def test_the_policy_cooks_with_a_partner_who_stands_still(kitchen: Any, policy: Chef, number: int) -> None:
+    """A chef who acts at random in its place delivers nothing."""
     env = kitchen.Overcooked(max_steps=STEPS)
-    seed = next(seed for seed in range(50) if leaves_a_way(env, seed, 1 - number))
-    for chef, wanted in ((policy, range(4, 8)), (at_random(1), range(1))):
+    seed = next(seed for seed in range(50) if leaves_all_reachable(env, seed, 1 - number))
+    for chef, wanted in ((policy, range(4, 8)), (random_chef(1), range(1))):
         pair = (chef, idle) if number == 0 else (idle, chef)
         assert soups(env, pair, seed) in wanted
 
@@ -120,20 +120,20 @@ def idle(*_: Any) -> int:
     return 5
 
 
-def leaves_a_way(env: Any, seed: int, number: int) -> bool:
-    """Whether the chef begins where nothing can only be reached from: pot, plates and hatch have one such place each."""
+def leaves_all_reachable(env: Any, seed: int, number: int) -> bool:
+    """Whether pot, plates and hatch stay reachable: each is reached from one place, and the chef begins on none of them."""
     env.reset(seed=seed)
     return env.kitchen().chefs[number].cell not in {(1, 2), (2, 1), (2, 3)}
 
 
-def test_it_cooks_with_the_cook_by_rules_and_with_itself(kitchen: Any, cook: Any, policy: Chef) -> None:
+def test_the_policy_cooks_with_the_cook_by_rules_and_with_itself(kitchen: Any, cook: Any, policy: Chef) -> None:
     env = kitchen.Overcooked(max_steps=STEPS)
     assert soups(env, (lambda stands, chef, _: cook.act(stands, chef), policy), seed=1) >= 5
     assert soups(env, (policy, policy), seed=2) >= 5
 
 
-def test_it_cooks_with_a_partner_who_does_anything(kitchen: Any, policy: Chef) -> None:
-    assert soups(kitchen.Overcooked(max_steps=STEPS), (at_random(1), policy), seed=1) >= 2
+def test_the_policy_cooks_with_a_partner_who_acts_at_random(kitchen: Any, policy: Chef) -> None:
+    assert soups(kitchen.Overcooked(max_steps=STEPS), (random_chef(1), policy), seed=1) >= 2
 
 
 def test_the_policy_is_small_and_says_how_it_was_made() -> None:
@@ -145,7 +145,7 @@ def test_the_policy_is_small_and_says_how_it_was_made() -> None:
 
 
 def test_a_short_training_already_learns(tmp_path: Path) -> None:
-    """One round of it: most actions are those of the cook by rules."""
+    """After one round, most actions are those of the cook by rules."""
     said = subprocess.run(
         [sys.executable, "-W", "ignore", "train.py", "--rounds", "1", "--steps", "150", "--into", tmp_path / "made"],
         cwd=EXAMPLE,
@@ -164,8 +164,8 @@ def agent(load_module: Callable[[str, str], ModuleType]) -> Any:
     return made
 
 
-def test_the_scene_has_no_flaw_and_all_its_pictures_are_there(agent: Any, cook: Any) -> None:
-    frames = set(as_frames(EXAMPLE / "assets" / "kitchen.json"))
+def test_the_scene_has_no_problems_and_the_atlas_has_all_its_frames(agent: Any, cook: Any) -> None:
+    frames = set(frames_of_atlas(EXAMPLE / "assets" / "kitchen.json"))
     agent.env.reset(seed=1)
     scene, shown = as_scene(agent.render("0")), set()
     for _ in range(200):
@@ -180,7 +180,7 @@ def test_the_scene_has_no_flaw_and_all_its_pictures_are_there(agent: Any, cook: 
     assert scene.permanent == {name for name in scene.objects if name.startswith(("floor", "table"))}
 
 
-def as_frames(file: Path) -> dict[str, Any]:
+def frames_of_atlas(file: Path) -> dict[str, Any]:
     import json
 
     return dict(json.loads(file.read_text())["frames"])
@@ -188,13 +188,13 @@ def as_frames(file: Path) -> dict[str, Any]:
 
 def test_every_frame_lies_in_the_atlas() -> None:
     wide, high = Image.open(EXAMPLE / "assets" / "kitchen.png").size
-    for name, entry in as_frames(EXAMPLE / "assets" / "kitchen.json").items():
+    for name, entry in frames_of_atlas(EXAMPLE / "assets" / "kitchen.json").items():
         frame = entry["frame"]
         assert 0 <= frame["x"] <= wide - frame["w"], name
         assert 0 <= frame["y"] <= high - frame["h"], name
 
 
-def test_the_kitchen_fills_the_scene(agent: Any, load_module: Callable[[str, str], ModuleType]) -> None:
+def test_config_yml_fits_the_kitchen(agent: Any, load_module: Callable[[str, str], ModuleType]) -> None:
     import yaml
 
     section = yaml.safe_load((EXAMPLE / "config.yml").read_text())["trial"]
@@ -213,7 +213,7 @@ def test_the_kitchen_fills_the_scene(agent: Any, load_module: Callable[[str, str
         ({"0": "human", "1": "human"}, ["You are blue", "You are green"]),
     ],
 )
-def test_two_people_read_who_they_are(
+def test_two_people_read_their_colours_above_the_game(
     load_module: Any, monkeypatch: pytest.MonkeyPatch, plays: dict[str, str], said: list[str]
 ) -> None:
     monkeypatch.setenv("TRIAL", json.dumps({"players": plays}))

@@ -14,11 +14,11 @@ from PIL import Image
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 DRAWN = sorted(path.parent.name for path in EXAMPLES.glob("*/make_assets.py"))
 MOST_BYTES = 40_000
-"""Of all pictures of an example together."""
+"""Bytes of all pictures of an example together."""
 
 
 @pytest.mark.parametrize("example", DRAWN)
-def test_the_script_draws_what_is_there(example: str, tmp_path: Path) -> None:
+def test_the_script_draws_the_pictures_of_the_example(example: str, tmp_path: Path) -> None:
     shutil.copy(EXAMPLES / example / "make_assets.py", tmp_path)
     subprocess.run([sys.executable, tmp_path / "make_assets.py"], check=True)
     made, there = sorted((tmp_path / "assets").iterdir()), sorted((EXAMPLES / example / "assets").iterdir())

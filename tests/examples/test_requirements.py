@@ -1,4 +1,4 @@
-"""What the examples import is what their tests run with."""
+"""The packages that the examples require are those that their tests run with."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def requirements(file: Path) -> dict[str, Requirement]:
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
-def test_its_packages_are_those_of_the_tests(example: str) -> None:
+def test_an_examples_requirements_allow_the_versions_that_the_tests_run_with(example: str) -> None:
     tested = requirements(ROOT / "requirements" / "dev.txt")
     wanted = requirements(ROOT / "examples" / example / "requirements.txt")
     assert wanted

@@ -33,33 +33,33 @@ def train(load_module: Callable[[str, str], ModuleType]) -> Any:
 
 
 def match(env: Any, left: Callable[[Any], int], right: Callable[[Any], int], seed: int) -> dict[str, int]:
-    """The points of both after a whole match."""
+    """Play a whole match; return the points of both."""
     observations, _ = env.reset(seed=seed)
     while env.agents:
         observations, *_ = env.step({LEFT: left(observations[LEFT]), RIGHT: right(observations[RIGHT])})
     return dict(env.scores)
 
 
-def at_random(seed: int) -> Callable[[Any], int]:
+def random_player(seed: int) -> Callable[[Any], int]:
     chance = np.random.default_rng(seed)
     return lambda observation: int(chance.integers(6))
 
 
-def test_it_keeps_the_rules_of_pettingzoo(volleyball: Any) -> None:
+def test_the_environment_keeps_the_rules_of_pettingzoo(volleyball: Any) -> None:
     from pettingzoo.test import parallel_api_test
 
     parallel_api_test(volleyball.Volleyball(points=2, seconds=10), num_cycles=1000)
 
 
-def test_the_same_seed_is_the_same_match(volleyball: Any) -> None:
+def test_the_same_seed_and_actions_give_the_same_match(volleyball: Any) -> None:
     env = volleyball.Volleyball(points=2, seconds=20)
-    ends = [(match(env, at_random(1), at_random(2), seed), env.places()) for seed in (3, 3, 4)]
+    ends = [(match(env, random_player(1), random_player(2), seed), env.places()) for seed in (3, 3, 4)]
     assert ends[0] == ends[1] != ends[2]
 
 
 def test_a_match_ends_with_the_last_point_or_the_time(volleyball: Any) -> None:
     env = volleyball.Volleyball(points=2, seconds=100)
-    assert max(match(env, at_random(1), at_random(2), seed=1).values()) == 2
+    assert max(match(env, random_player(1), random_player(2), seed=1).values()) == 2
     short = volleyball.Volleyball(points=50, seconds=2)
     short.reset(seed=1)
     ends = [short.step({LEFT: NOOP, RIGHT: NOOP})[3] for _ in range(60)]
@@ -68,7 +68,7 @@ def test_a_match_ends_with_the_last_point_or_the_time(volleyball: Any) -> None:
 
 
 @pytest.mark.parametrize("player", [LEFT, RIGHT])
-def test_left_is_left_on_the_screen_for_both(volleyball: Any, player: str) -> None:
+def test_an_action_moves_both_players_the_same_way_on_the_screen(volleyball: Any, player: str) -> None:
     env = volleyball.Volleyball()
     env.reset(seed=1)
     before = env.places()[player]
@@ -88,7 +88,7 @@ def test_both_see_the_game_from_their_own_side(volleyball: Any) -> None:
 
 
 def share_of_points(train: Any, file: str, opponent: Any) -> float:
-    """Of all points, those that the policy on the right wins, in 200 games at once."""
+    """The share of all points that the policy on the right wins, in 200 games at once."""
     session = onnxruntime.InferenceSession(EXAMPLE / "policies" / file)
     games, won, lost = train.Games(200, np.random.default_rng(1)), 0, 0
     for _ in range(500):
@@ -99,20 +99,20 @@ def share_of_points(train: Any, file: str, opponent: Any) -> float:
     return won / (won + lost)
 
 
-def test_the_policy_beats_chance(train: Any) -> None:
-    """A serve falls on either side by chance: of two who do anything, each wins half of the points."""
+def test_the_policy_beats_a_random_player(train: Any) -> None:
+    """Each serve falls on a random side, so two random players each win half of the points."""
     chance = np.random.default_rng(2)
     share = share_of_points(train, "right.onnx", lambda seen: chance.integers(6, size=len(seen)))
     assert share >= 0.62, share
 
 
-def test_it_is_as_strong_as_the_packages_opponent(train: Any) -> None:
-    """Who does anything wins three points of ten against it."""
+def test_the_policy_is_about_as_strong_as_the_packages_opponent(train: Any) -> None:
+    """A random player wins three points of ten against it."""
     share = share_of_points(train, "right.onnx", train.Teacher(200))
     assert share >= 0.42, share
 
 
-def test_the_policy_of_the_left_half_is_the_same_seen_in_a_mirror(volleyball: Any) -> None:
+def test_the_left_players_policy_mirrors_the_right_players(volleyball: Any) -> None:
     left, right = (onnxruntime.InferenceSession(EXAMPLE / "policies" / f"{side}.onnx") for side in ("left", "right"))
     seen = np.random.default_rng(1).normal(size=(50, 12)).astype(np.float32)
     mirrored = right.run(None, {"observation": seen})[0][:, volleyball.MIRRORED]
@@ -120,13 +120,13 @@ def test_the_policy_of_the_left_half_is_the_same_seen_in_a_mirror(volleyball: An
 
 
 @pytest.mark.parametrize(("file", "player"), [("right.onnx", RIGHT), ("left.onnx", LEFT)])
-def test_it_returns_the_ball_in_the_environment(volleyball: Any, file: str, player: str) -> None:
-    """Of the serves to its own half, where who stands still loses nearly every point, it wins many."""
+def test_the_policy_returns_the_ball_in_the_environment(volleyball: Any, file: str, player: str) -> None:
+    """It wins a third of the serves to its own half. A player who stands still loses nearly all of them."""
     session = onnxruntime.InferenceSession(EXAMPLE / "policies" / file)
     env, returned, served = volleyball.Volleyball(points=1, seconds=20), 0, 0
     for seed in range(24):
         observations, _ = env.reset(seed=seed)
-        if observations[player][6] < 0.3:  # not to its own half
+        if observations[player][6] < 0.3:  # the serve goes to the other half
             continue
         served += 1
         while env.agents:
@@ -147,7 +147,7 @@ def test_policies_are_small_and_say_how_they_were_made() -> None:
 
 
 def test_training_plays_by_the_packages_own_rules(volleyball: Any, train: Any) -> None:
-    """The games that are played as arrays go as in the environment, from the same serve."""
+    """From the same serve, the games that are played as arrays go as in the environment."""
     env = volleyball.Volleyball(points=50, seconds=100)
     observations, _ = env.reset(seed=5)
     games = train.Games(3, np.random.default_rng(1))
@@ -158,7 +158,7 @@ def test_training_plays_by_the_packages_own_rules(volleyball: Any, train: Any) -
         seen = games.observations(1)[0], games.observations(0)[0]
         assert np.allclose(seen[0], observations[RIGHT], atol=1e-3)
         assert np.allclose(seen[1], observations[LEFT], atol=1e-3)
-        mirrored = volleyball.MIRRORED[left]  # the environment's are those of the screen
+        mirrored = volleyball.MIRRORED[left]  # the environment's actions are those of the screen
         reward = games.step(np.full(3, mirrored), np.full(3, right))[0]
         observations, rewards, *_ = env.step({LEFT: int(left), RIGHT: int(right)})
         assert reward == rewards[RIGHT]
@@ -168,7 +168,7 @@ def test_training_plays_by_the_packages_own_rules(volleyball: Any, train: Any) -
 
 
 def test_a_short_training_already_learns(tmp_path: Path) -> None:
-    """Two rounds: the largest of the six values is then the teacher's action three times in four."""
+    """After two rounds, the largest of the six values is the teacher's action three times in four."""
     said = subprocess.run(
         [sys.executable, "train.py", "--rounds", "2", "--into", tmp_path / "made"],
         cwd=EXAMPLE,
@@ -188,7 +188,7 @@ def agent(load_module: Callable[[str, str], ModuleType]) -> Any:
     return made
 
 
-def test_the_scene_has_no_flaw_and_shows_what_there_is(agent: Any) -> None:
+def test_the_scene_has_no_problems_and_shows_players_net_court_and_ball(agent: Any) -> None:
     agent.env.reset(seed=1)
     scene = as_scene(agent.render(LEFT))
     chance = np.random.default_rng(1)
@@ -204,7 +204,8 @@ def test_the_scene_has_no_flaw_and_shows_what_there_is(agent: Any) -> None:
     assert scene.permanent == {"court", "net", "net top"}
 
 
-def test_ready_is_asked_before_each_point_but_the_first_where_the_page_asks(agent: Any) -> None:
+def test_the_scene_asks_ready_before_each_point_but_the_first(agent: Any) -> None:
+    """Before the first point the page asks."""
     agent.env.reset(seed=1)
     scored = False
     while not scored:
@@ -217,7 +218,7 @@ def test_ready_is_asked_before_each_point_but_the_first_where_the_page_asks(agen
     ("right", "said"),
     [("policies/right.onnx", ["Red 0", "Red 0"]), ("human", ["You are red", "You are blue"])],
 )
-def test_two_people_read_who_they_are(
+def test_two_people_read_their_colours_above_the_game(
     load_module: Any, monkeypatch: pytest.MonkeyPatch, right: str, said: list[str]
 ) -> None:
     monkeypatch.setenv("TRIAL", json.dumps({"players": {LEFT: "human", RIGHT: right}}))

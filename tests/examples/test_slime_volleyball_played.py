@@ -37,7 +37,7 @@ def test_a_person_plays_against_the_policy(play_example: Any, load_module: Any) 
 
 
 def repeat(volleyball: Any, lines: list[dict[str, Any]]) -> None:
-    """With the seed and the actions of both, the environment gives the recorded rewards again."""
+    """Take the recorded seed and actions again; the environment must give the recorded rewards."""
     env = volleyball.Volleyball(points=1, seconds=20)
     (reset,) = (line for line in lines if line["kind"] == "reset")
     env.reset(seed=reset["seed"])

@@ -14,7 +14,7 @@ TO_THE_END = 200
 
 
 class Teacher:
-    """Looks at one step in twelve, and says 0.2 to 0.8 seconds later whether the car pushed the way it rolled."""
+    """A teacher who judges one step in twelve, 0.2 to 0.8 seconds later: did the car push the way that it rolled?"""
 
     def __init__(self, seed: int, rate: int, *, wrong: float = 0.1) -> None:
         self._chance, self._rate, self._wrong = np.random.default_rng(seed), rate, wrong
@@ -36,7 +36,7 @@ class Teacher:
 
 
 def lengths(agent: Any, seed: int, teacher: Teacher | None) -> list[int]:
-    """How many steps each episode takes."""
+    """Play the episodes; return how many steps each one took."""
     agent.start("MountainCar-v0")
     found, clock = [], 0
     for episode in range(EPISODES):
@@ -61,8 +61,8 @@ def test_without_a_teacher_the_car_never_reaches_the_flag(load_module: Any, seed
     assert lengths(load_module("tamer", "agent").Agent(), seed, None) == [TO_THE_END] * EPISODES
 
 
-def test_with_a_teacher_it_learns_to_reach_the_flag(load_module: Any) -> None:
-    """From a word in a second or less, of which one in ten is wrong: in four of five of the last tries of ten cars."""
+def test_with_a_teacher_the_car_learns_to_reach_the_flag(load_module: Any) -> None:
+    """The teacher says less than a word a second, one in ten wrong. Ten cars reach the flag in four of five last episodes."""
     module = load_module("tamer", "agent")
     last = []
     for seed in range(1, 11):
@@ -72,7 +72,7 @@ def test_with_a_teacher_it_learns_to_reach_the_flag(load_module: Any) -> None:
     assert sum(steps < TO_THE_END for steps in last) >= 0.8 * len(last)
 
 
-def test_from_a_teacher_who_is_always_wrong_it_does_not_learn_that(load_module: Any) -> None:
+def test_with_a_teacher_who_is_always_wrong_the_car_does_not_learn_the_way(load_module: Any) -> None:
     teacher = Teacher(1, rate=10, wrong=1.0)
     assert lengths(load_module("tamer", "agent").Agent(), 1, teacher)[-3:] == [TO_THE_END] * 3
     assert teacher.said > 20
@@ -84,8 +84,8 @@ def learner(load_module: Any, *, step_seconds: float) -> tuple[Any, Any]:
     return module.Tamer(features, 2, step_seconds, rate=0.5), np.linspace(0, 1, 11)[:, None]
 
 
-def test_a_word_is_about_the_steps_of_the_moment_before(load_module: Any) -> None:
-    """Of steps of 0.2 s, the three that were seen 0.2 to 0.8 s ago share a word; the newest has no part."""
+def test_a_word_counts_for_the_steps_shortly_before_it(load_module: Any) -> None:
+    """Of steps of 0.2 s, the three that were seen 0.2 to 0.8 s ago share a word. The newest gets nothing of it."""
     tamer, states = learner(load_module, step_seconds=0.2)
     credits = [tamer._credit(age) for age in range(6)]
     assert credits == pytest.approx([0, 1 / 3, 1 / 3, 1 / 3, 0, 0])
@@ -96,12 +96,12 @@ def test_a_word_is_about_the_steps_of_the_moment_before(load_module: Any) -> Non
     assert tamer.predict(states[10])[1] == 0
 
 
-def test_slow_steps_get_the_whole_word(load_module: Any) -> None:
+def test_the_newest_of_slow_steps_gets_the_whole_word(load_module: Any) -> None:
     tamer, _ = learner(load_module, step_seconds=1.0)
     assert [tamer._credit(age) for age in range(3)] == pytest.approx([1, 0, 0])
 
 
-def test_it_predicts_what_the_teacher_says_and_not_more(load_module: Any) -> None:
+def test_the_prediction_becomes_the_teachers_word_and_the_other_action_is_chosen(load_module: Any) -> None:
     tamer, states = learner(load_module, step_seconds=1.0)
     for _ in range(200):
         tamer.took(states[5], 1)
@@ -110,7 +110,7 @@ def test_it_predicts_what_the_teacher_says_and_not_more(load_module: Any) -> Non
     assert tamer.choose(states[5], last=1) == 0
 
 
-def test_an_episode_begins_without_words_about_the_last_one(load_module: Any) -> None:
+def test_a_word_in_a_new_episode_does_not_count_for_the_steps_of_the_last_one(load_module: Any) -> None:
     tamer, states = learner(load_module, step_seconds=1.0)
     tamer.took(states[5], 1)
     tamer.begin()
@@ -118,7 +118,7 @@ def test_an_episode_begins_without_words_about_the_last_one(load_module: Any) ->
     assert tamer.predict(states[5]).tolist() == [0, 0]
 
 
-def test_a_bot_plays_it_to_the_end(play_example: Any) -> None:
+def test_a_bot_plays_the_example_to_the_end(play_example: Any) -> None:
     played = play_example("tamer", startingFrameRate=90, maxEpisodes=2, betweenEpisodes=0)
     assert [lines[-1]["kind"] for lines in played.recordings] == ["end", "end"]
     assert {step["by"] for step in played.steps()} == {"agent"}

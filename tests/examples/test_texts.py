@@ -11,8 +11,8 @@ EXAMPLES = sorted(path.parent for path in (Path(__file__).resolve().parents[2] /
 
 
 @pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
-def test_the_buttons_are_named_as_they_are_labelled(folder: Path) -> None:
-    """Who plays on a phone has no keys."""
+def test_the_page_before_the_game_names_the_buttons_by_their_labels(folder: Path) -> None:
+    """A participant on a phone has buttons, and no keys."""
     config = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
     read = (folder / "steps" / f"{config['project']['steps'][2]}.html").read_text(encoding="utf-8")
     assert "button" in read
@@ -20,7 +20,7 @@ def test_the_buttons_are_named_as_they_are_labelled(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
-def test_what_the_number_above_the_game_counts_is_said(folder: Path) -> None:
+def test_the_page_before_the_game_mentions_the_score(folder: Path) -> None:
     config = yaml.safe_load((folder / "config.yml").read_text(encoding="utf-8"))
     read = (folder / "steps" / f"{config['project']['steps'][2]}.html").read_text(encoding="utf-8")
     assert "score" in read.lower()

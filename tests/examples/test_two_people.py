@@ -1,4 +1,4 @@
-"""The forms of examples in which two people play: with the lines that their README shows, played by two bots."""
+"""Examples that the lines in their README change for two people: two bots play them to the end."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from trial.recordings.recording import read
 pytestmark = pytest.mark.xdist_group("examples")
 
 SHORT = {"maxEpisodes": 1, "resetFreeze": 0, "countdown": 1, "absent": 10}
-PATIENCE = 150.0  # seconds in which both must have passed everything
+PATIENCE = 150.0  # seconds within which both bots must finish the study
 
 
 def lines_of_readme(folder: Path) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def lines_of_readme(folder: Path) -> dict[str, Any]:
     return found
 
 
-def held(name: str, place: Path, **options: Any) -> HeldStudy:
+def study_for_two(name: str, place: Path, **options: Any) -> HeldStudy:
     folder = place / name
     shutil.copytree(ROOT / "examples" / name, folder, ignore=LEFT_OUT)
     config, more = yaml.safe_load((folder / "config.yml").read_text()), lines_of_readme(folder)
@@ -52,8 +52,8 @@ def held(name: str, place: Path, **options: Any) -> HeldStudy:
         ("slime-volleyball", ("agent_left", "agent_right"), {"points": 1, "seconds": 8}),
     ],
 )
-def test_two_people_play(name: str, players: tuple[str, str], options: dict[str, Any], tmp_path: Path) -> None:
-    study = held(name, tmp_path, **options)
+def test_two_bots_play_together(name: str, players: tuple[str, str], options: dict[str, Any], tmp_path: Path) -> None:
+    study = study_for_two(name, tmp_path, **options)
     try:
         study.start()
         bots = [Bot(study.link, each, Random(each), play=0, patience=PATIENCE) for each in ("ada", "bo")]

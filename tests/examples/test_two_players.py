@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-STEPS = 6 * 60  # of a round
+STEPS = 6 * 60  # steps of a round
 
 
 @pytest.fixture
 def modules(load_module: Any) -> tuple[Any, Any, Any]:
-    """lanterns, helper and agent."""
+    """The modules lanterns, helper and agent."""
     return tuple(load_module("two-players", name) for name in ("lanterns", "helper", "agent"))  # type: ignore[return-value]
 
 
@@ -22,8 +22,8 @@ class Still:
         return 0
 
 
-def lit(modules: Any, seed: int, red: Any, blue: Any) -> tuple[int, int]:
-    """How many lanterns are lit in a round, and after how many steps it ended."""
+def lanterns_lit(modules: Any, seed: int, red: Any, blue: Any) -> tuple[int, int]:
+    """Play a round; return how many lanterns were lit, and after how many steps it ended."""
     agent = modules[2].Agent()
     agent.start("lanterns")
     observations, infos = agent.reset(seed)
@@ -47,16 +47,16 @@ def helper(modules: Any, player: str) -> Any:
 
 def test_two_helpers_light_all_lanterns_in_every_garden(modules: Any) -> None:
     for seed in range(40):
-        points, steps = lit(modules, seed, helper(modules, "red"), helper(modules, "blue"))
+        points, steps = lanterns_lit(modules, seed, helper(modules, "red"), helper(modules, "blue"))
         assert points == modules[0].LANTERNS
         assert steps < STEPS / 2
 
 
-def test_one_alone_lights_none(modules: Any) -> None:
-    assert [lit(modules, seed, helper(modules, "red"), Still())[0] for seed in range(5)] == [0] * 5
+def test_one_player_alone_lights_no_lantern(modules: Any) -> None:
+    assert [lanterns_lit(modules, seed, helper(modules, "red"), Still())[0] for seed in range(5)] == [0] * 5
 
 
-def test_a_lantern_is_lit_by_both_at_once_and_the_plates_move(modules: Any) -> None:
+def test_a_lantern_is_lit_when_both_stand_on_the_plates_which_then_move(modules: Any) -> None:
     garden = modules[0].Garden(1)
     first, second = before = garden.plates
     garden.places = {"red": first, "blue": first}
@@ -66,7 +66,7 @@ def test_a_lantern_is_lit_by_both_at_once_and_the_plates_move(modules: Any) -> N
     assert not set(garden.plates) & {first, second}
 
 
-def test_hedges_and_the_border_are_in_the_way_and_the_other_player_is_not(modules: Any) -> None:
+def test_players_walk_through_each_other_but_not_through_hedges_or_the_border(modules: Any) -> None:
     garden = modules[0].Garden(1)
     garden.hedges = frozenset({(1, 5)})
     garden.move({"red": 2, "blue": 1})

@@ -1,4 +1,4 @@
-"""examples/two-players, held by a real `make run` and played by bots: pairs, one left over, and a lost server."""
+"""examples/two-players, run by a real `make run` and played by bots: pairs, a third participant, lost servers, and `match`."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from trial.recordings.recording import read
 
 EXAMPLE = ROOT / "examples" / "two-players"
 PROJECT = "two-players"
-PATIENCE = 150.0  # seconds in which a bot must have passed everything
+PATIENCE = 150.0  # seconds within which a bot must finish the study
 
-Hold = Callable[..., HeldStudy]
+RunStudy = Callable[..., HeldStudy]
 
 
 @pytest.fixture
-def hold(tmp_path: Path) -> Iterator[Hold]:
-    """Hold the example with other keys of its sections: `hold(project={"patience": 10}, trial={…})`.
+def run_study(tmp_path: Path) -> Iterator[RunStudy]:
+    """Run the example with other keys of its sections: `run_study(project={"patience": 10}, trial={…})`.
 
     `more` are lines at the end of its agent.py.
     """
-    held: list[HeldStudy] = []
+    studies: list[HeldStudy] = []
 
     def start(project: dict[str, Any], trial: dict[str, Any], more: str = "", port: int = 0) -> HeldStudy:
         folder = tmp_path / "study"
@@ -47,12 +47,12 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
         (folder / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False))
         with (folder / "agent.py").open("a") as agent:
             agent.write(more)
-        held.append(HeldStudy(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log"))
-        held[-1].start()
-        return held[-1]
+        studies.append(HeldStudy(folder, tmp_path / "run" / "data", port=port, log=tmp_path / "local.log"))
+        studies[-1].start()
+        return studies[-1]
 
     yield start
-    for study in held:
+    for study in studies:
         study.clear()
 
 
@@ -60,11 +60,11 @@ def bots_of(study: HeldStudy, *names: str) -> list[Bot]:
     return [Bot(study.link, name, Random(name), play=0, patience=PATIENCE) for name in names]
 
 
-async def walk(bots: list[Bot]) -> list[BotReport]:
+async def run_bots(bots: list[Bot]) -> list[BotReport]:
     return list(await asyncio.gather(*(bot.run() for bot in bots)))
 
 
-def all_is_well(study: HeldStudy, reports: list[BotReport]) -> None:
+def assert_all_stored_and_stopped(study: HeldStudy, reports: list[BotReport]) -> None:
     assert [(report.errors, report.troubles, report.finished) for report in reports] == [([], [], True)] * len(reports)
     assert verify(study.data, PROJECT, reports).missing == []
     names = {report.user_id for report in reports}
@@ -77,34 +77,35 @@ def all_is_well(study: HeldStudy, reports: list[BotReport]) -> None:
     assert study.interrupt()
 
 
-def recorded(study: HeldStudy) -> list[list[dict[str, Any]]]:
+def recordings_of(study: HeldStudy) -> list[list[dict[str, Any]]]:
     files = sorted((study.data / PROJECT / "sessions").glob("*/trials/*/*.gz"))
     return [list(read(file.read_bytes())) for file in files]
 
 
-def test_two_find_each_other_and_a_third_goes_on_unmatched(hold: Hold) -> None:
-    study = hold({"patience": 10}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
-    reports = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo", "cy")), PATIENCE))
-    all_is_well(study, reports)
+def test_two_participants_are_matched_and_a_third_goes_on_unmatched(run_study: RunStudy) -> None:
+    study = run_study({"patience": 10}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
+    reports = asyncio.run(asyncio.wait_for(run_bots(bots_of(study, "ada", "bo", "cy")), PATIENCE))
+    assert_all_stored_and_stopped(study, reports)
     plays = {report.user_id: report.plays[0] for report in reports}
     (alone,) = (name for name, play in plays.items() if play.unmatched)
     one, other = (name for name in plays if name != alone)
     assert plays[one].addresses == plays[other].addresses
     assert [plays[name].outcome for name in (one, other, alone)] == ["finished", "finished", "unmatched"]
-    assert "back" in reports[["ada", "bo", "cy"].index(alone)].answers["4"]  # the survey asks them something else
-    (lines,) = recorded(study)
+    # The survey asks an unmatched participant another question.
+    assert "back" in reports[["ada", "bo", "cy"].index(alone)].answers["4"]
+    (lines,) = recordings_of(study)
     steps = [line["players"] for line in lines if line["kind"] == "step"]
     assert steps
     assert {step[who]["by"] for step in steps for who in ("red", "blue")} <= {"human", "none"}
     assert not {one, other} & set(str(lines).replace('"', "'").split("'"))
 
 
-def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
-    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 6, "countdown": 1})
+def test_a_lost_server_is_replaced_for_both(run_study: RunStudy) -> None:
+    study = run_study({}, {"maxEpisodes": 1, "episodeSeconds": 6, "countdown": 1})
 
-    async def lose_it() -> list[BotReport]:
+    async def lose_the_server() -> list[BotReport]:
         bots = bots_of(study, "ada", "bo")
-        walking = asyncio.ensure_future(walk(bots))
+        walking = asyncio.ensure_future(run_bots(bots))
         while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in bots):
             assert not walking.done()
             await asyncio.sleep(0.05)
@@ -115,31 +116,33 @@ def test_a_lost_server_is_replaced_for_both(hold: Hold) -> None:
             server.kill()
         return await walking
 
-    reports = asyncio.run(asyncio.wait_for(lose_it(), PATIENCE))
+    reports = asyncio.run(asyncio.wait_for(lose_the_server(), PATIENCE))
     assert [(report.errors, report.finished) for report in reports] == [([], True)] * 2
     assert [len(report.plays[0].addresses) for report in reports] == [2, 2]
     assert [report.plays[0].outcome for report in reports] == ["finished", "finished"]
     missing = verify(study.data, PROJECT, reports).missing  # the killed server's recording is cut off
     assert [line for line in missing if not line.endswith(" is cut off") and " frames seen but " not in line] == []
-    steps = sum(line["kind"] == "step" for lines in recorded(study) for line in lines)
-    # Of what was seen, half a second may be lost, and what was played until the kill.
+    steps = sum(line["kind"] == "step" for lines in recordings_of(study) for line in lines)
+    # Half a second of the frames that were seen may be lost, and what was played until the kill.
     assert all(steps > report.plays[0].frames - 12 for report in reports)
 
 
-def test_after_patience_one_may_play_with_the_helper_in_the_empty_place(hold: Hold) -> None:
-    study = hold({"patience": 10, "afterPatience": "policies"}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1})
-    (report,) = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada")), PATIENCE))
-    all_is_well(study, [report])
+def test_after_patience_a_participant_plays_with_the_helper_in_the_empty_place(run_study: RunStudy) -> None:
+    study = run_study(
+        {"patience": 10, "afterPatience": "policies"}, {"maxEpisodes": 1, "episodeSeconds": 4, "countdown": 1}
+    )
+    (report,) = asyncio.run(asyncio.wait_for(run_bots(bots_of(study, "ada")), PATIENCE))
+    assert_all_stored_and_stopped(study, [report])
     assert (report.plays[0].outcome, report.plays[0].members) == ("finished", 1)
-    (lines,) = recorded(study)
+    (lines,) = recordings_of(study)
     steps = [line["players"] for line in lines if line["kind"] == "step"]
     assert {step["red"]["by"] for step in steps} <= {"human", "none"}
     assert "policy" in {step["blue"]["by"] for step in steps}
 
 
-def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(hold: Hold) -> None:
+def test_if_one_participant_leaves_for_good_the_game_ends_and_the_other_goes_on(run_study: RunStudy) -> None:
     trial = {"maxEpisodes": 1, "episodeSeconds": 20, "countdown": 1, "absent": 3, "afterAbsent": "end"}
-    study = hold({}, trial)
+    study = run_study({}, trial)
 
     async def leave() -> BotReport:
         bots = bots_of(study, "ada", "bo")
@@ -156,8 +159,8 @@ def test_if_one_goes_away_for_good_the_game_ends_for_the_other_and_they_go_on(ho
     assert verify(study.data, PROJECT, [report]).missing == []
 
 
-def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -> None:
-    study = hold({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1}, port=ports.free())
+def test_make_run_may_be_killed_while_a_participant_waits_and_while_two_play(run_study: RunStudy) -> None:
+    study = run_study({}, {"maxEpisodes": 1, "episodeSeconds": 8, "countdown": 1}, port=ports.free())
 
     async def kill_twice() -> list[BotReport]:
         ada, bo = bots_of(study, "ada", "bo")
@@ -177,7 +180,7 @@ def test_make_run_may_be_killed_while_one_waits_and_while_two_play(hold: Hold) -
     assert [(report.errors, report.finished) for report in reports] == [([], True)] * 2
     assert [(report.plays[0].outcome, report.plays[0].members) for report in reports] == [("finished", 2)] * 2
     assert verify(study.data, PROJECT, reports).missing == []
-    assert len(recorded(study)) == 1
+    assert len(recordings_of(study)) == 1
 
 
 OPPOSITES = """
@@ -194,8 +197,8 @@ def match(waiting):
 """
 
 
-class Decided(Bot):
-    """A participant who answers the question on the page before the game in one way."""
+class AnsweringBot(Bot):
+    """A bot that gives the answer `plays` to the question on the page before the game."""
 
     plays = ""
 
@@ -206,20 +209,20 @@ class Decided(Bot):
         return await super().post(address, [(name, self.plays if name == "plays" else it) for name, it in pairs])
 
 
-def decided(study: HeldStudy, **plays: str) -> list[Bot]:
-    bots = [Decided(study.link, name, Random(name), play=0, patience=PATIENCE) for name in plays]
+def answering_bots(study: HeldStudy, **plays: str) -> list[Bot]:
+    bots = [AnsweringBot(study.link, name, Random(name), play=0, patience=PATIENCE) for name in plays]
     for bot in bots:
         bot.plays = plays[bot.report.user_id]
     return list[Bot](bots)
 
 
-def test_the_function_match_puts_opposites_together(hold: Hold) -> None:
-    study = hold(
+def test_the_function_match_puts_opposites_together(run_study: RunStudy) -> None:
+    study = run_study(
         {"patience": 40, "matching": "match"}, {"maxEpisodes": 1, "episodeSeconds": 3, "countdown": 1}, OPPOSITES
     )
-    bots = decided(study, ada="never", bo="never", cy="often", di="often")
-    reports = asyncio.run(asyncio.wait_for(walk(bots), PATIENCE))
-    all_is_well(study, reports)
+    bots = answering_bots(study, ada="never", bo="never", cy="often", di="often")
+    reports = asyncio.run(asyncio.wait_for(run_bots(bots), PATIENCE))
+    assert_all_stored_and_stopped(study, reports)
     assert [report.plays[0].outcome for report in reports] == ["finished"] * 4
     sessions = [document(file) for file in (study.data / PROJECT / "sessions").glob("*/session.json")]
     groups = [sorted(member["userId"] for member in session["members"]) for session in sessions]
@@ -227,10 +230,10 @@ def test_the_function_match_puts_opposites_together(hold: Hold) -> None:
     assert [len({"ada", "bo"}.intersection(group)) for group in groups] == [1, 1]
 
 
-def test_if_the_function_match_raises_people_go_on_unmatched_and_the_log_says_why(hold: Hold) -> None:
-    study = hold({"patience": 15, "matching": "match"}, {"maxEpisodes": 1}, FAILS)
-    reports = asyncio.run(asyncio.wait_for(walk(bots_of(study, "ada", "bo")), PATIENCE))
-    all_is_well(study, reports)
+def test_if_the_function_match_raises_participants_go_on_unmatched_and_the_log_says_why(run_study: RunStudy) -> None:
+    study = run_study({"patience": 15, "matching": "match"}, {"maxEpisodes": 1}, FAILS)
+    reports = asyncio.run(asyncio.wait_for(run_bots(bots_of(study, "ada", "bo")), PATIENCE))
+    assert_all_stored_and_stopped(study, reports)
     assert [report.plays[0].outcome for report in reports] == ["unmatched"] * 2
     logs = [file.read_text(errors="replace") for file in study.data.parent.rglob("*.log")]
     told = [log for log in logs if "match() failed, and nobody is matched" in log]

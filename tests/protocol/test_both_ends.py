@@ -43,8 +43,8 @@ ROOT = Path(__file__).parents[2]
 VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}
 
 
-def request(platform: FakePlatform, user: str = "alice") -> TaskRequest:
-    """The request to ECS for the participant's server."""
+def task_request(platform: FakePlatform, user: str = "alice") -> TaskRequest:
+    """Start a server; return the request to ECS for the participant's server."""
     Servers(platform).start(StartServer("maze", user))
     (found,) = platform.tasks.running.values()
     return found
@@ -62,7 +62,7 @@ def variables_of(found: TaskRequest) -> dict[str, str]:
 
 def test_a_trial_reads_what_the_control_plane_has_written() -> None:
     platform = installed(study())
-    found = request(platform)
+    found = task_request(platform)
     record = from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server)
     settings = TrialSettings.from_env(variables_of(found))
     assert (settings.project_id, settings.user_id, settings.server) == ("maze", "alice", record.name)
@@ -76,8 +76,8 @@ def test_a_trial_reads_what_the_control_plane_has_written() -> None:
     assert settings.trial == trial_section(study().trial)
 
 
-class Asked(dict[str, str]):
-    """An environment that records the names of the variables that were read."""
+class RecordingEnvironment(dict[str, str]):
+    """Environment variables that record the names of the variables that were read."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -92,8 +92,8 @@ class Asked(dict[str, str]):
         return super().__getitem__(key)
 
 
-def test_every_variable_that_either_end_names_is_in_the_protocol() -> None:
-    told = Asked(variables_of(request(installed(study()))))
+def test_the_protocol_names_every_variable_that_either_end_uses() -> None:
+    told = RecordingEnvironment(variables_of(task_request(installed(study()))))
     TrialSettings.from_env(told)
     assert set(told) <= VARIABLES
     assert told.names == VARIABLES
@@ -101,17 +101,17 @@ def test_every_variable_that_either_end_names_is_in_the_protocol() -> None:
     assert re.search(rf"^\s+{environment.AGENT_DIR}=", image, re.MULTILINE)
 
 
-def texts(path: Path) -> Iterator[str]:
+def string_constants(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
 
 
 @pytest.mark.parametrize("package", ["hippodrome", "lambdas", "local", "deploy", "trial"])
-def test_no_module_writes_the_name_of_a_variable_a_second_time(package: str) -> None:
+def test_only_the_protocol_writes_the_names_of_variables(package: str) -> None:
     modules = sorted((ROOT / package).rglob("*.py"))
     assert modules
-    found = {module.relative_to(ROOT).as_posix(): VARIABLES & set(texts(module)) for module in modules}
+    found = {module.relative_to(ROOT).as_posix(): VARIABLES & set(string_constants(module)) for module in modules}
     assert {module: names for module, names in found.items() if names} == {}
 
 
@@ -166,7 +166,7 @@ def test_a_handover_of_an_earlier_version_is_read() -> None:
 # ---- the answer
 
 
-def test_the_answer_of_a_trial_is_read_and_moves_its_author_on(tmp_path: Path) -> None:
+def test_the_control_plane_reads_a_trials_answer_and_the_participant_goes_on(tmp_path: Path) -> None:
     project, platform = study(), installed(study())
     played = {"episodes": 2, "score": 1.5, "outcome": "finished"}
 
@@ -211,7 +211,7 @@ DOCUMENTS = {
 }
 
 
-HELD = {"of a trial": {"score": 3}, "of a page": {"age": "30"}}
+ANSWERS = {"of a trial": {"score": 3}, "of a page": {"age": "30"}}
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
@@ -222,15 +222,15 @@ def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path
     env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
     settings = TrialSettings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
     recorder = Recorder(settings, "3", "the-trial", store, Spool(settings, store))
-    assert Answers(platform).read("maze", "alice", "3") == HELD.get(name, {})
-    assert asyncio.run(recorder.earlier_answers()) == HELD.get(name, {})
-    assert ("holds no answers" in log.getvalue()) is (name not in HELD)
+    assert Answers(platform).read("maze", "alice", "3") == ANSWERS.get(name, {})
+    assert asyncio.run(recorder.earlier_answers()) == ANSWERS.get(name, {})
+    assert ("holds no answers" in log.getvalue()) is (name not in ANSWERS)
 
 
 # ---- keys
 
 
-def test_a_server_may_create_and_read_just_the_documents_that_a_trial_does() -> None:
+def test_a_server_may_create_and_read_the_documents_of_its_trial() -> None:
     label = ids.server_label("maze", "alice")
     server_access = ServerAccess(f"{label}-2", "maze", "alice", label, 2, game_steps=("3",))
     recordings = recordings_folder("maze", "alice")

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from protocol import keyboard, trial, trial_check
 
 
-def found(**section: Any) -> trial.TrialSection:
+def accepted(**section: Any) -> trial.TrialSection:
     checked, problems = trial_check.check(section)
     assert problems == []
     return checked
 
 
-def said(**section: Any) -> list[str]:
+def problems_of(**section: Any) -> list[str]:
     _, problems = trial_check.check(section)
     return [f"{trial.values.path_text(problem.path)}: {problem.sentence}" for problem in problems]
 
@@ -42,7 +42,7 @@ def test_a_key_is_called_as_the_browser_calls_it(written: str, key: str) -> None
     assert keyboard.combination(key) == key
 
 
-def test_the_parts_of_a_combination() -> None:
+def test_a_combination_is_split_into_its_keys() -> None:
     assert keyboard.parts("ArrowLeft+ ") == ("ArrowLeft", " ")
     assert keyboard.parts("a++") == ("a", "+")
 
@@ -64,8 +64,8 @@ def test_the_parts_of_a_combination() -> None:
         ("a+b+c+d+e", "joins 5 keys; 4 at most, since few keyboards report more at once"),
     ],
 )  # fmt: skip
-def test_what_is_no_key_of_a_game_is_said_with_what_was_meant(written: str, why: str) -> None:
-    assert said(keys={written: "left"}) == [f"keys.{written}: {why}"]
+def test_a_wrong_key_gets_a_sentence_with_the_reason_or_the_right_name(written: str, why: str) -> None:
+    assert problems_of(keys={written: "left"}) == [f"keys.{written}: {why}"]
 
 
 @given(st.text(max_size=12))
@@ -79,65 +79,67 @@ def test_any_text_is_a_combination_or_a_sentence(text: str) -> None:
 
 
 def test_keys_are_for_all_players_or_by_player() -> None:
-    for_all = found(keys={"ArrowLeft": "Left", "a": "left", "ArrowLeft+ArrowUp": "leftup"})
+    for_all = accepted(keys={"ArrowLeft": "Left", "a": "left", "ArrowLeft+ArrowUp": "leftup"})
     assert for_all.keys_of("player_1") == {"ArrowLeft": "left", "a": "left", "ArrowLeft+ArrowUp": "leftup"}
-    by_player = found(keys={"player_0": {"a": "left"}, "player_1": {"Space": 1}})
+    by_player = accepted(keys={"player_0": {"a": "left"}, "player_1": {"Space": 1}})
     assert [by_player.keys_of(f"player_{number}") for number in range(3)] == [{"a": "left"}, {" ": "1"}, {}]
 
 
-def test_a_player_has_no_label_of_what_only_the_keys_of_others_do() -> None:
+def test_a_player_has_no_label_of_an_action_that_only_keys_of_others_take() -> None:
     labels = {"left": "Go left", "say": "Warm!", "both": "Wait", "touch": "No key"}
-    by_player = found(labels=labels, keys={"seeker": {"a": "left", "w": "both"}, "knower": {"h": "say", "w": "both"}})
+    by_player = accepted(
+        labels=labels, keys={"seeker": {"a": "left", "w": "both"}, "knower": {"h": "say", "w": "both"}}
+    )
     assert list(by_player.labels_of("seeker")) == ["left", "both", "touch"]
     assert list(by_player.labels_of("knower")) == ["say", "both", "touch"]
-    assert found(labels=labels, keys={"a": "left"}).labels_of("seeker") == labels
-    assert found(labels=labels).labels_of("seeker") == labels
+    assert accepted(labels=labels, keys={"a": "left"}).labels_of("seeker") == labels
+    assert accepted(labels=labels).labels_of("seeker") == labels
 
 
 def test_two_names_of_one_combination_are_refused() -> None:
-    assert said(keys={"a+b": "left", "b+A": "right"}) == ["keys.b+A: is the same as a+b; keep one of them"]
-    assert said(keys={"Space": "left", " ": "right"}) == ["keys. : is the same as Space; keep one of them"]
+    assert problems_of(keys={"a+b": "left", "b+A": "right"}) == ["keys.b+A: is the same as a+b; keep one of them"]
+    assert problems_of(keys={"Space": "left", " ": "right"}) == ["keys. : is the same as Space; keep one of them"]
 
 
-def test_keys_and_labels_of_actions_that_do_not_exist_are_said() -> None:
-    assert said(actionSpace=["left", "right"], keys={"a": "lef", "b": "Right"}, labels={"up": "Up"}) == [
+def test_keys_and_labels_of_actions_that_do_not_exist_are_reported() -> None:
+    assert problems_of(actionSpace=["left", "right"], keys={"a": "lef", "b": "Right"}, labels={"up": "Up"}) == [
         'keys.a: there is no action "lef" in actionSpace; did you mean left?',
         'labels.up: there is no action "up" in actionSpace; the actions are left, right',
     ]
-    assert said(actionSpace=["left"], keys={"p": {"a": "down"}}) == [
+    assert problems_of(actionSpace=["left"], keys={"p": {"a": "down"}}) == [
         'keys.p.a: there is no action "down" in actionSpace; the actions are left'
     ]
-    assert said(keys={"a": "anything"}) == []  # the environment may name its actions itself
+    assert problems_of(keys={"a": "anything"}) == []  # the environment may name its actions itself
 
 
-def test_keys_of_players_that_do_not_exist_are_said() -> None:
+def test_keys_of_players_that_do_not_exist_are_reported() -> None:
     players = {"player_0": "human", "player_1": "random"}
-    assert said(players=players, keys={"player_0": {"a": "left"}, "player_2": {"b": "left"}}) == [
+    assert problems_of(players=players, keys={"player_0": {"a": "left"}, "player_2": {"b": "left"}}) == [
         "keys.player_2: there is no such player in players; there are player_0, player_1"
     ]
-    assert said(keys={"player_2": {"b": "left"}}) == []  # the environment says which players there are
+    assert problems_of(keys={"player_2": {"b": "left"}}) == []  # the environment says which players there are
 
 
-def test_keys_are_a_map_of_names() -> None:
-    assert said(keys=["a"]) == [
+def test_keys_must_be_a_map_to_names_of_actions() -> None:
+    assert problems_of(keys=["a"]) == [
         'keys: must be a section: indented lines such as "ArrowLeft: left" below it, not a list'
     ]
-    assert said(keys={"a": "left", "player_1": {"a": "left"}})[-1] == (
+    assert problems_of(keys={"a": "left", "player_1": {"a": "left"}})[-1] == (
         "keys.player_1: must be the name of an action, not a map"
     )
-    assert said(keys={chr(200 + number): "left" for number in range(101)})[-1] == (
+    assert problems_of(keys={chr(200 + number): "left" for number in range(101)})[-1] == (
         "keys: must have at most 100 lines, not 101"
     )
 
 
-def test_a_page_of_the_game_is_a_file_of_the_folder_of_pages() -> None:
-    checked = found(instructions="rules.html", betweenEpisodes="pause")
+def test_a_page_of_the_game_is_a_file_in_the_steps_folder() -> None:
+    checked = accepted(instructions="rules.html", betweenEpisodes="pause")
     assert checked.pages == {"instructions": "rules", "betweenEpisodes": "pause"}
     assert checked.between_seconds == float("inf")
-    assert found(betweenEpisodes="2.5").between_seconds == 2.5
+    assert accepted(betweenEpisodes="2.5").between_seconds == 2.5
     where = "must be the name of a file in the steps folder, without folders"
-    assert said(instructions="../rules", betweenEpisodes="a/b") == [
+    assert problems_of(instructions="../rules", betweenEpisodes="a/b") == [
         f'betweenEpisodes: {where}, not "a/b"',
         f'instructions: {where}, not "../rules"',
     ]
-    assert said(instructions="game") == ["instructions: a page cannot be called game.html; rename it"]
+    assert problems_of(instructions="game") == ["instructions: a page cannot be called game.html; rename it"]

@@ -28,13 +28,13 @@ GOOD: dict[str, Any] = json.loads(PAIR.to_json())
 IDS = st.from_regex(NAME, fullmatch=True)
 
 
-def changed(**change: Any) -> bytes:
+def document_with(**change: Any) -> bytes:
     return json.dumps({**GOOD, **change}).encode()
 
 
-def with_member(**change: Any) -> bytes:
+def document_with_member(**change: Any) -> bytes:
     first, second = GOOD["members"]
-    return changed(members=[first, {**second, **change}])
+    return document_with(members=[first, {**second, **change}])
 
 
 HOSTILE = {
@@ -44,27 +44,27 @@ HOSTILE = {
     "too deep": b"[" * 100_000,
     "no text": b"\xff\xfe\x00",
     "a number without end": b'{"schema": 1' + b"0" * 10_000 + b"}",
-    "a later schema": changed(schema=2),
-    "no id": changed(id=None),
-    "a participant's id": changed(id="anna"),
-    "an id with a line more": changed(id=SID + "\n"),
-    "no players": changed(players=0),
-    "players like true": changed(players=True),
-    "too many players": changed(players=MAX_PLAYERS + 1),
-    "no members": changed(members=[]),
-    "members that are none": changed(members=["anna"]),
-    "members like a map": changed(members={"anna": 0}),
-    "a member like a path": with_member(userId="../anna"),
-    "a member like a session": with_member(userId=SID),
-    "a member without an id": with_member(userId=None),
-    "one member twice": with_member(userId="anna"),
-    "one seat twice": with_member(seat=0),
-    "a seat too far": with_member(seat=2),
-    "a seat below zero": with_member(seat=-1),
-    "a seat like true": with_member(seat=True),
-    "a seat like text": with_member(seat="1"),
-    "a group like text": with_member(group="1"),
-    "a group below zero": changed(group=-1),
+    "a later schema": document_with(schema=2),
+    "no id": document_with(id=None),
+    "a participant's id": document_with(id="anna"),
+    "an id with a line more": document_with(id=SID + "\n"),
+    "no players": document_with(players=0),
+    "players like true": document_with(players=True),
+    "too many players": document_with(players=MAX_PLAYERS + 1),
+    "no members": document_with(members=[]),
+    "members that are none": document_with(members=["anna"]),
+    "members like a map": document_with(members={"anna": 0}),
+    "a member like a path": document_with_member(userId="../anna"),
+    "a member like a session": document_with_member(userId=SID),
+    "a member without an id": document_with_member(userId=None),
+    "one member twice": document_with_member(userId="anna"),
+    "one seat twice": document_with_member(seat=0),
+    "a seat too far": document_with_member(seat=2),
+    "a seat below zero": document_with_member(seat=-1),
+    "a seat like true": document_with_member(seat=True),
+    "a seat like text": document_with_member(seat="1"),
+    "a group like text": document_with_member(group="1"),
+    "a group below zero": document_with(group=-1),
 }
 
 
@@ -82,14 +82,14 @@ HOSTILE = {
     ),
     st.none() | st.integers(0, 9),
 )
-def test_what_is_written_is_what_is_read(
+def test_a_written_document_is_read_unchanged(
     seats: tuple[int, list[tuple[str, int | None, int]]], group: int | None
 ) -> None:
     written = SessionDocument(SID, seats[0], tuple(Member(*each) for each in seats[1]), group, "now")
     assert parse(written.to_json()) == written
 
 
-def test_the_document_is_as_its_module_says() -> None:
+def test_the_document_has_the_form_that_its_module_describes() -> None:
     member = SessionDocument(SID, 2, (Member("anna", 1, 0),), 1, "now")
     assert member.to_json().decode().splitlines() == [
         "{",
@@ -116,10 +116,10 @@ def test_a_document_that_does_not_say_when_it_was_formed_is_read(formed: dict[st
     assert parse(json.dumps({**without, **formed}).encode()).formed == ""
 
 
-def test_sixteen_play_together_at_most() -> None:
-    assert parse(changed(players=16)).players == 16
+def test_a_session_has_at_most_sixteen_players() -> None:
+    assert parse(document_with(players=16)).players == 16
     with pytest.raises(BadSession):
-        parse(changed(players=17))
+        parse(document_with(players=17))
 
 
 def test_a_session_and_a_participant_have_folders_of_their_own() -> None:
@@ -128,14 +128,14 @@ def test_a_session_and_a_participant_have_folders_of_their_own() -> None:
 
 
 def test_a_member_whose_data_were_erased_keeps_their_seat_and_no_id() -> None:
-    found = parse(with_member(userId=""))
+    found = parse(document_with_member(userId=""))
     assert found.members[1] == Member("", None, 1)
     assert found.member("") is None
     assert found.member("anna") == Member("anna", None, 0)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_session_is_refused_without_a_word_of_it(name: str) -> None:
+def test_a_bad_document_is_refused_with_a_message_without_its_ids(name: str) -> None:
     with pytest.raises(BadSession) as raised:
         parse(HOSTILE[name])
     assert "anna" not in str(raised.value)
@@ -148,11 +148,11 @@ def test_what_is_no_session_is_refused_without_a_word_of_it(name: str) -> None:
         lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from([*GOOD, "userId", "seat"]), inner),
     ).map(lambda value: json.dumps(value).encode())
     | st.dictionaries(st.sampled_from([*GOOD]), st.none() | st.integers() | st.lists(st.integers())).map(
-        lambda change: changed(**change)
+        lambda change: document_with(**change)
     )
 )
 @example(PAIR.to_json())
-def test_whatever_stands_there_is_read_or_refused(body: bytes) -> None:
+def test_any_document_is_read_or_refused(body: bytes) -> None:
     try:
         found = parse(body)
     except BadSession:
@@ -162,7 +162,7 @@ def test_whatever_stands_there_is_read_or_refused(body: bytes) -> None:
 
 
 @given(IDS, IDS, st.text(min_size=1), st.text(min_size=1))
-def test_a_members_token_is_theirs_on_this_server_alone(one: str, other: str, token: str, another: str) -> None:
+def test_each_member_has_another_token_on_each_server(one: str, other: str, token: str, another: str) -> None:
     mine = member_token(token.encode("utf-8", "replace").decode(), one)
     assert re.fullmatch("[0-9a-f]{48}", mine)
     assert (mine == member_token(token.encode("utf-8", "replace").decode(), other)) is (one == other)
@@ -171,7 +171,7 @@ def test_a_members_token_is_theirs_on_this_server_alone(one: str, other: str, to
     assert mine != token
 
 
-def test_a_members_token_is_as_the_wires_page_says() -> None:
+def test_a_members_token_is_made_as_docs_wire_describes() -> None:
     """docs/wire.md describes the derivation, for clients in other languages."""
     import hmac
 
