@@ -238,7 +238,7 @@ def test_bots_are_never_among_people(project: Any, tmp_path: Path) -> None:
         assert process.returncode == 1
     (tmp_path / "file").write_text("")
     process = rehearsal(folder, "--bots", "1", "--data", tmp_path / "file")
-    assert "cannot be kept" in said(process)
+    assert "cannot be stored" in said(process)
 
 
 def test_a_broken_page_is_told_once_with_its_name(project: Any, tmp_path: Path) -> None:
