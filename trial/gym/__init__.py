@@ -1,4 +1,4 @@
-"""Environments over a WebSocket: Gymie's messages, and a binary subprotocol for training (docs/gym.md)."""
+"""Serves environments over a WebSocket: Gymie's messages, and a binary subprotocol for training (docs/gym.md)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CLIENTS = {"ConnectionLost": "client", "RemoteError": "client", "RemoteEnv": "r
 
 
 def __getattr__(name: str) -> Any:
-    """The clients, imported when they are asked for: the process that listens does without Gymnasium and numpy."""
+    """Import the clients when they are first used: the process that listens must not import Gymnasium and numpy."""
     if name not in _CLIENTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module  # noqa: PLC0415

@@ -15,30 +15,34 @@ from trial.gym.limits import Limits
 from trial.gym.processes import serve, tell
 
 _HELP = {
-    "connections": "connections at a time",
-    "workers": "connections at a time that have environments",
-    "environments": "environments of a connection",
-    "seconds": "for one request",
-    "idle_seconds": "without a request, until a connection with environments is closed; 0: never",
-    "megabytes": "of memory for the environments of a connection",
-    "processes": "that the environments of a connection may start",
-    "steps_per_second": "of a connection; 0: as many as it can take",
-    "message_bytes": "in one message of a client",
-    "reply_bytes": "in the observations of one reply",
+    "connections": "most connections at a time",
+    "workers": "most connections at a time that have sent a request",
+    "environments": "most environments of a connection",
+    "seconds": "most seconds for one request",
+    "idle_seconds": "seconds without a request after which a connection that has sent one is closed; 0: never",
+    "megabytes": "most memory for the environments of a connection",
+    "processes": "most processes that the environments of a connection start",
+    "steps_per_second": "most steps of a connection in a second; 0: no limit",
+    "message_bytes": "most bytes of a client's message",
+    "reply_bytes": "most bytes of the observations in one reply",
 }
-_MAY_BE_NONE = ("idle_seconds", "steps_per_second")
+_ZERO_ALLOWED = ("idle_seconds", "steps_per_second")
 _HIGHEST = 10**9
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until Ctrl-C; the exit status."""
+    """Serve environments until Ctrl-C or SIGTERM. Return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m trial.gym", description=__doc__)
     parser.add_argument("-l", "--host", default="127.0.0.1", help="the address to listen at (default: this machine)")
     parser.add_argument("-p", "--port", default=5000, type=int, help="the port (default 5000; 0: any)")
-    parser.add_argument("--import", action="append", default=[], metavar="MODULE", help="that registers environments")
-    parser.add_argument("--origin", action="append", default=[], help="whose pages may connect, as https://example.org")
+    parser.add_argument(
+        "--import", action="append", default=[], metavar="MODULE", help="import a module that registers environments"
+    )
+    parser.add_argument(
+        "--origin", action="append", default=[], help="let pages of this origin connect, such as https://example.org"
+    )
     parser.add_argument("--output", action="store_true", help="show what environments print")
-    parser.add_argument("--record", type=Path, metavar="FOLDER", help="record all steps there, for make data")
+    parser.add_argument("--record", type=Path, metavar="FOLDER", help="record all steps in this folder, for make data")
     group = parser.add_argument_group("limits")
     for field in fields(Limits):
         default = Limits.__dataclass_fields__[field.name].default
@@ -52,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = vars(parser.parse_args(arguments))
     limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
     for field in fields(Limits):
-        least = 0 if field.name in _MAY_BE_NONE else 1
+        least = 0 if field.name in _ZERO_ALLOWED else 1
         if not least <= given[field.name] <= _HIGHEST:
             parser.error(f"--{field.name.replace('_', '-')} must be a number from {least} to {_HIGHEST:g}")
     if not 0 <= given["port"] <= 65535:
@@ -79,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     if status == 0:
         where = f" Recordings are in {given['record']}." if given["record"] else ""
-        print(f"Ended.{where}", file=sys.stderr)  # where others of the same pipe may have ended already
+        print(f"Ended.{where}", file=sys.stderr)  # since the reader of a pipe at stdout may have ended before
     return status
 
 

@@ -1,4 +1,4 @@
-"""`start`: the server of environments within a program, as Gymie has it."""
+"""`start`, which runs the server of environments in a program, as Gymie's `start` does."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from trial.gym.errors import unusable
 
 
 def start(host: str = "127.0.0.1", port: int = 5000, **options: Any) -> None:
-    """Serve environments at ws://host:port/gym until Ctrl-C or SIGTERM. What `override` has replaced is used.
+    """Serve environments at ws://host:port/gym until Ctrl-C or SIGTERM, with the functions of `override`.
 
-    It prints where, once it listens. `options` are those of `trial.gym.processes.serve`, such as `limits`. Unlike Gymie
-    it listens at this machine alone if it is given no host. If the address cannot be used it says so and returns, as
-    Gymie does. Raises RuntimeError beside the main thread, where signals cannot be received.
+    It prints the address once it listens. Without a `host` it listens at this machine alone, unlike Gymie. If the
+    address cannot be used, it prints a sentence and returns, as Gymie does. `options` are those of
+    `trial.gym.processes.serve`, such as `limits`. Raises RuntimeError outside of the main thread, where signals cannot
+    be received.
     """
-    from trial.gym.processes import serve, tell  # noqa: PLC0415 - a program that is only a client does without
+    from trial.gym.processes import serve, tell  # noqa: PLC0415 - a program that is only a client needs no server
 
     if threading.current_thread() is not threading.main_thread():
         raise RuntimeError("The server must be started in the main thread of the program: signals end it.")

@@ -1,7 +1,7 @@
-"""What is answered to a request that cannot be carried out: the names and sentences of Gymie 0.5.4 where it has them.
+"""The errors of requests, with the names and sentences that Gymie 0.5.4 has for them.
 
 Gymie's server closes the connection with a code and the sentence (gymie/server.py, `message_handle`): 1003 if the
-message cannot be read, 1007 for all else. Its client hands that to the program as an exception.
+message cannot be read, 1007 for every other error. Its client gives them to the program as an exception.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ _LONGEST = 300  # characters of a sentence
 
 
 class GymError(Exception):
-    """A request that cannot be carried out. `str` is a sentence for the client."""
+    """A request cannot be carried out. `str` is a sentence for the client."""
 
     code = 1007
-    """With which the connection of a client of Gymie's is closed."""
+    """The close code for the connection of a client of Gymie's."""
 
     def __str__(self) -> str:
         return short(super().__str__(), _LONGEST)
 
     @property
     def brief(self) -> str:
-        """The sentence that Gymie's server has for it."""
+        """Gymie's sentence for the error, without further reasons."""
         return str(self)
 
 
@@ -33,11 +33,11 @@ class InvalidMessage(GymError):
 
 
 class MethodNotFound(GymError):
-    """There is no such method."""
+    """The request names a method that does not exist."""
 
 
 class WrongParameters(GymError):
-    """The parameters are not those of the method. Its arguments: a sentence, and what is wrong with them."""
+    """The parameters do not fit the method. The exception's arguments are a sentence and, if known, the reason."""
 
     def __str__(self) -> str:
         return short(": ".join(map(str, self.args)), _LONGEST)
@@ -48,9 +48,12 @@ class WrongParameters(GymError):
 
 
 class _Named(GymError):
-    """An error that a program's own `get_env` may raise as in Gymie: with the environment's id, or with nothing."""
+    """An error about an id or an action, which is its first argument; further arguments are reasons.
 
-    words = "{}"
+    A program's own `get_env` may raise it as in Gymie, also without arguments.
+    """
+
+    sentence = "{}"
 
     def __str__(self) -> str:
         return short(": ".join([self._named(), *map(str, self.args[1:])]), _LONGEST)
@@ -60,44 +63,44 @@ class _Named(GymError):
         return self._named()
 
     def _named(self) -> str:
-        return self.words.format(short(str(self.args[0]), 80) if self.args else "?")
+        return self.sentence.format(short(str(self.args[0]), 80) if self.args else "?")
 
 
 class EnvironmentNotFound(_Named):
     """There is no environment of this id."""
 
-    words = "Environment `{}` not found"
+    sentence = "Environment `{}` not found"
 
 
 class EnvironmentMalformed(_Named):
     """The environment's id is wrong, or the environment cannot be made."""
 
-    words = "Environment `{}` is malformed"
+    sentence = "Environment `{}` is malformed"
 
     @property
     def brief(self) -> str:
-        """With the reason: "malformed" is also what Gymie says of an environment that lacks a package."""
+        """Gymie's sentence with the reason, since Gymie says "malformed" also if a package is missing."""
         return str(self)
 
 
 class InstanceNotFound(_Named):
     """This connection has no environment of this id."""
 
-    words = "Instance `{}` not found"
+    sentence = "Instance `{}` not found"
 
 
 class WrongAction(_Named):
-    """The environment does not take this action, or raised while it took it."""
+    """The action does not fit the action space, or `step` of the environment raised an exception."""
 
-    words = "Action `{}` is wrong"
+    sentence = "Action `{}` is wrong"
 
 
 class EnvironmentFailed(GymError):
-    """The environment raised."""
+    """The environment raised an exception, or returned something that cannot be used."""
 
 
 class TooSlow(GymError):
-    """The environment did not come back in time."""
+    """The environment did not return in time."""
 
 
 class LimitReached(GymError):
@@ -105,13 +108,13 @@ class LimitReached(GymError):
 
 
 def short(text: str, most: int) -> str:
-    """At most `most` characters of `text`, in one line."""
+    """The text on one line, cut to `most` characters."""
     line = " ".join(text.split())
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def reason(text: str) -> str:
-    """`text` as a close frame can hold it: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
+    """The text, cut to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
     encoded = text.encode("utf-8", "replace")
     return text if len(encoded) <= 123 else encoded[:120].decode("utf-8", "ignore") + "…"
 
@@ -122,10 +125,10 @@ def unusable(error: OSError | UnicodeError) -> str:
     return os.strerror(number) if number > 0 else "there is no such host"  # getaddrinfo's numbers are negative
 
 
-def of(error: BaseException) -> str:
-    """An exception in words: its class and its text, if that can be had."""
+def described(error: BaseException) -> str:
+    """The class of an exception and its text; only the class if it has no text, or `str` of it raises."""
     try:
-        said = str(error)
+        text = str(error)
     except Exception:  # noqa: BLE001 - the exception is the researcher's
-        said = ""
-    return f"{type(error).__name__}: {said}" if said else type(error).__name__
+        text = ""
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -1,4 +1,4 @@
-"""How a connection is answered: as Gymie 0.5.4 really does, as its documentation says, or in Gymnasium's form. Pure.
+"""The forms of answers: those of Gymie 0.5.4, those of its documentation, Gymnasium's, and raw arrays. Pure.
 
 | form | chosen by | `make` | `step` | an error |
 |---|---|---|---|---|
@@ -7,14 +7,13 @@
 | gymnasium | `/gym?form=gymnasium` | `{"instance_id"}` | five values | the same |
 | arrays | subprotocol `hippodrome.gym.1` | an object with the spaces | five values, or arrays | the same |
 
-Gymie's client cannot read an error: whatever comes is its result. So an error closes the connection of such a
-client; all others keep theirs.
+Gymie's client cannot read an error: it takes every message for a result. So an error closes the connection of such a
+client. All other clients keep their connection.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from trial.gym import values
 from trial.gym.errors import GymError
@@ -22,25 +21,22 @@ from trial.gym.errors import GymError
 
 @dataclass(frozen=True, slots=True)
 class MessageForm:
-    """How results and errors become messages."""
+    """The form of the answers to one connection."""
 
     name: str
     five: bool
-    """`step` answers Gymnasium's five values, and `reset` observation and info."""
+    """Whether `step` answers with Gymnasium's five values, and `reset` with observation and info."""
     bare_id: bool = False
-    """`make` answers the id alone, which is no JSON."""
+    """Whether `make` answers with the id alone, which is no JSON."""
     closes: bool = False
-    """An error closes the connection."""
+    """Whether an error closes the connection."""
     arrays: bool = False
-    """`make` describes the environment, and binary messages are read."""
+    """Whether `make` answers with a description of the environment, and binary messages are read."""
 
-    def result(self, result: Any) -> str:
-        """The message for a result."""
-        return values.to_text(result)
 
-    def error(self, error: GymError) -> str:
-        """The message for an error."""
-        return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
+def error_message(error: GymError) -> str:
+    """The message for an error, in all forms but Gymie's."""
+    return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
 
 
 GYMIE = MessageForm("gymie", five=False, bare_id=True, closes=True)

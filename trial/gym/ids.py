@@ -1,7 +1,7 @@
-"""Ids of environments that Gymie's users wrote for gym 0.17, as Gymnasium and ALE have them now.
+"""Finds the present ids of environments whose ids Gymie's users wrote for gym 0.17.
 
-`trial/agent/old_gym` does the same for agents that import gym; it stands for a package of its own, and imports nothing
-of the trial.
+`trial/agent/old_gym` does the same for agents that import gym. That is a package of its own, which imports nothing of
+the trial, so it does not use this module.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ _OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<ram>-ram)?(?P<kind>Deterministi
 
 
 def present(env_id: str) -> tuple[str, dict[str, Any]]:
-    """The id under which the environment is registered now, and what it must be made with.
+    """The id under which the environment is registered now, and further arguments for `gymnasium.make`.
 
-    A version that Gymnasium has no more becomes the newest one; an id that is unknown stays as it is. Atari games are
-    registered if ALE is installed.
+    A version that Gymnasium does not have any more becomes the newest one. An unknown id stays as it is. For the id of
+    an Atari game, ALE's environments are registered first, if ALE is installed.
     """
-    import gymnasium  # noqa: PLC0415 - the process that listens does without
+    import gymnasium  # noqa: PLC0415 - the process that listens must not import it
 
     atari = _OLD_ATARI.fullmatch(env_id)
     if (env_id.startswith("ALE/") or atari) and env_id not in gymnasium.registry:
         with contextlib.suppress(ImportError):
-            import ale_py  # noqa: PLC0415 - a server without Atari games does without
+            import ale_py  # noqa: PLC0415 - only Atari games need it
 
             gymnasium.register_envs(ale_py)
     if env_id in gymnasium.registry:
@@ -40,6 +40,7 @@ def present(env_id: str) -> tuple[str, dict[str, Any]]:
 
 
 def _newest(env_id: str, known: list[str]) -> str:
+    """The newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
     asked = _ID.fullmatch(env_id)
     if asked is None:
         return env_id

@@ -1,4 +1,4 @@
-"""One environment of a connection, or a vector of them, behind one set of calls. What it raises becomes a GymError."""
+"""Calls one environment of a connection, or a vector of them. Exceptions of the environment become GymErrors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from trial.gym import overrides
-from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, of
+from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, described
 from trial.gym.recordings import ConnectionRecorder, Recorded
 
 CUT_OFF = "TimeLimit.truncated"
 """The key of an info by which gym's TimeLimit says that its limit ended the episode."""
 
 MODES = {mode.value: mode for mode in AutoresetMode}
+"""Gymnasium's autoreset modes by their names in requests."""
 
 
 class InstanceStep(NamedTuple):
@@ -31,23 +32,23 @@ class InstanceStep(NamedTuple):
 
 
 def guarded(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Call the researcher's code. Raises GymError for whatever it raises, SystemExit included."""
+    """Call the researcher's code. Raises a GymError for each exception that it raises, also for SystemExit."""
     try:
         return call(*arguments, **named)
     except GymError:
         raise
     except BaseException as error:
-        raise EnvironmentFailed(f"The environment raised {of(error)}") from error
+        raise EnvironmentFailed(f"The environment raised {described(error)}") from error
 
 
 class Instance:
-    """An environment, or a vector of them.
+    """A single environment. `VectorInstance` is a vector of environments.
 
-    `mode`: how `step_many` goes on after the end of an episode (Gymnasium's `AutoresetMode`).
+    `mode` is Gymnasium's `AutoresetMode`: how `steps` continues after the end of an episode.
     """
 
     num_envs = 0
-    """How many environments a vector has; 0 for a single one."""
+    """The number of environments of a vector; 0 for a single environment."""
 
     def __init__(self, env: Any, seed: int | None, mode: AutoresetMode = AutoresetMode.NEXT_STEP) -> None:
         self.env = env
@@ -57,7 +58,7 @@ class Instance:
         self._process = overrides.replaced("process_step")
         self._reset_takes_seed = _reset_takes_seed(env)
         if seed is not None:
-            guarded(self._seed, seed)
+            guarded(lambda: env.action_space.seed(seed))
 
     @property
     def processes(self) -> bool:
@@ -71,7 +72,7 @@ class Instance:
 
     @property
     def size(self) -> int:
-        """How many environments it counts for."""
+        """The number of environments: 1 for a single one."""
         return self.num_envs or 1
 
     @property
@@ -85,24 +86,26 @@ class Instance:
         return self.env.action_space
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        """The first observation and its info; the seed given to `make` is for the first reset, if that has none."""
-        first, self.seed = self.seed, None
-        seed = first if seed is None else seed
+        """Begin an episode. Return its first observation and info.
+
+        The first reset uses the seed of `make` if it has no `seed` itself. Raises EnvironmentFailed.
+        """
+        made_with, self.seed = self.seed, None
+        seed = made_with if seed is None else seed
         self._ended = False
         return guarded(self._reset, seed, options)  # type: ignore[no-any-return]
 
     def step(self, action: Any) -> InstanceStep:
-        """One step. Raises WrongAction, as Gymie does whatever the environment raises."""
+        """Take one step. Raises WrongAction if the environment raises anything, as Gymie does."""
         try:
-            found = self.env.step(action)
-            return InstanceStep(*_five(found))
+            return InstanceStep(*_five(self.env.step(action)))
         except GymError:
             raise
         except BaseException as error:
-            raise WrongAction(action, of(error)) from error
+            raise WrongAction(action, described(error)) from error
 
     def processed(self, step: InstanceStep) -> InstanceStep:
-        """The step after the program's own `process_step`, if it has one."""
+        """The step as the program's own `process_step` returns it; as it is, if there is none."""
         if self._process is None:
             return step
         observation, reward, terminated, truncated, info = step
@@ -110,55 +113,55 @@ class Instance:
         info = as_dict(info)
         if truncated:
             info = {**info, CUT_OFF: not terminated}
-        answered = guarded(self._process, (observation, reward, done, info))
+        processed = guarded(self._process, (observation, reward, done, info))
         try:
-            observation, reward, changed, info = answered
+            observation, reward, new_done, info = processed
         except (TypeError, ValueError):
             raise EnvironmentFailed("process_step must return observation, reward, done and info.") from None
-        if bool(changed) != bool(done):
-            terminated, truncated = changed, False
+        if bool(new_done) != bool(done):
+            terminated, truncated = new_done, False
         return InstanceStep(observation, reward, terminated, truncated, info)
 
     def steps(self, actions: Sequence[Any]) -> Iterator[Any]:
-        """Take a step for each action: their results. Raises GymError.
+        """Take a step for each action, and yield the five results of each. Raises GymError.
 
-        After an episode, the next one begins as `mode` says: with `NextStep` the step after its end resets, and its
-        action is not used; with `SameStep` the last step answers the first observation of the next episode, and its
-        info holds `final_obs` and `final_info`; with `Disabled` no step is taken after the end.
+        After an episode, the next one begins as `mode` says. With `NextStep` the step after the end resets, and its
+        action is not used. With `SameStep` the last step has the first observation of the next episode, and its info
+        has `final_obs` and `final_info`. With `Disabled` no step is taken after the end.
         """
         mode, step = self.mode, self.env.step
         at, action = 0, None
         try:
             for at, action in enumerate(actions):  # noqa: B007 - the except clause names it
                 if not self._ended:
-                    found = step(action)
-                    if type(found) is not tuple or len(found) != 5:
-                        found = _five(found)
-                    if found[2] or found[3]:
-                        found = self._end(found)
+                    results = step(action)
+                    if type(results) is not tuple or len(results) != 5:
+                        results = _five(results)
+                    if results[2] or results[3]:
+                        results = self._end(results)
                 elif mode is AutoresetMode.DISABLED:
                     return
                 else:
                     observation, info = self.reset()
-                    found = (observation, 0.0, False, False, info)
-                yield found
+                    results = (observation, 0.0, False, False, info)
+                yield results
         except (GymError, GeneratorExit):
             raise
         except BaseException as error:
             where = f" (step {at} of this request)" if len(actions) > 1 else ""
-            raise WrongAction(action, of(error) + where) from error
+            raise WrongAction(action, described(error) + where) from error
 
-    def _end(self, found: Any) -> Any:
-        """What the last step of an episode answers."""
-        observation, reward, terminated, truncated, last = found
+    def _end(self, results: Any) -> Any:
+        """The results of an episode's last step, as `mode` has them."""
+        observation, reward, terminated, truncated, last_info = results
         if self.mode is not AutoresetMode.SAME_STEP:
             self._ended = True
-            return found
+            return results
         first, info = self.reset()
-        return first, reward, terminated, truncated, {**info, "final_obs": observation, "final_info": last}
+        return first, reward, terminated, truncated, {**info, "final_obs": observation, "final_info": last_info}
 
     def render(self) -> Any:
-        """What the environment's `render` returns."""
+        """Call the environment's `render`. Raises WrongParameters if it was made without a render mode."""
         if getattr(self.env, "render_mode", None) is None and hasattr(self.env, "spec"):
             raise WrongParameters('It cannot be rendered; make it with "render_mode": "rgb_array".')
         return guarded(self.env.render)
@@ -167,22 +170,19 @@ class Instance:
         """Close the environment. Raises EnvironmentFailed."""
         guarded(self.env.close)
 
-    def _seed(self, seed: int) -> None:
-        self.env.action_space.seed(seed)
-
     def _reset(self, seed: int | None, options: Any) -> tuple[Any, Any]:
         if seed is not None and not self._reset_takes_seed:
             self.env.seed(seed)
             seed = None
         named = {name: value for name, value in (("seed", seed), ("options", options)) if value is not None}
-        found = self.env.reset(**named)
-        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], dict):
-            return found
-        return found, {}  # of gym's old kind
+        result = self.env.reset(**named)
+        if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict):
+            return result
+        return result, {}  # an environment of gym's old kind returns the observation alone
 
 
 class VectorInstance(Instance):
-    """Several environments of a kind that take their steps together (Gymnasium's `SyncVectorEnv`)."""
+    """A vector of equal environments that take their steps together (Gymnasium's `SyncVectorEnv`)."""
 
     def __init__(self, make: Callable[[], Any], count: int, seed: int | None, mode: AutoresetMode) -> None:
         super().__init__(guarded(SyncVectorEnv, [make] * count, autoreset_mode=mode), seed, mode)
@@ -218,11 +218,11 @@ def make(
 ) -> Instance:
     """Make an environment, or with `num_envs` a vector of that many, all recorded by `recorder`. Raises GymError."""
     own = overrides.replaced("get_env")
-    getter = overrides.get_env if own is None else own
+    get_env = overrides.get_env if own is None else own
 
     def single() -> Any:
-        given = {"seed": seed, **options} if own is not None and seed is not None else options
-        env = guarded(getter, env_id, **given)
+        arguments = {"seed": seed, **options} if own is not None and seed is not None else options
+        env = guarded(get_env, env_id, **arguments)
         if env is None:
             raise EnvironmentFailed("get_env returned no environment.")
         return env if recorder is None else recorder.record(env, env_id, seed)
@@ -233,7 +233,7 @@ def make(
 
 
 def _reset_takes_seed(env: Any) -> bool:
-    """False for an environment of gym's old kind, which has a method `seed` for that."""
+    """Whether `reset` takes a seed. An environment of gym's old kind has a method `seed` instead."""
     env = env.env if isinstance(env, Recorded) else env
     if not callable(getattr(env, "seed", None)):
         return True
@@ -243,34 +243,32 @@ def _reset_takes_seed(env: Any) -> bool:
         return True
     if any(parameter.name == "seed" for parameter in parameters):
         return True
-    # gym's old wrappers hand on whatever they are given, to a reset that takes nothing.
+    # gym's old wrappers pass all keyword arguments on, to a reset that takes none.
     return isinstance(env, gymnasium.Env) and any(one.kind is one.VAR_KEYWORD for one in parameters)
 
 
-def _five(found: Any) -> Any:
-    """What `step` returned, of gym's old kind too. Raises EnvironmentFailed for what is neither."""
-    if isinstance(found, tuple | list) and len(found) in (4, 5):
-        return found if len(found) == 5 else _old(found)
-    raise EnvironmentFailed("step() must return five values: observation, reward, terminated, truncated and info.")
-
-
-def _old(found: Any) -> InstanceStep:
-    observation, reward, done, info = found
-    cut = bool(info.get(CUT_OFF)) if isinstance(info, dict) else False
-    return InstanceStep(observation, reward, bool(done) and not cut, bool(done) and cut, info)
+def _five(results: Any) -> Any:
+    """The five results of a step, also of the four of gym's old kind. Raises EnvironmentFailed for anything else."""
+    if not isinstance(results, tuple | list) or len(results) not in (4, 5):
+        raise EnvironmentFailed("step() must return five values: observation, reward, terminated, truncated and info.")
+    if len(results) == 5:
+        return results
+    observation, reward, done, info = results
+    cut_off = bool(info.get(CUT_OFF)) if isinstance(info, dict) else False
+    return InstanceStep(observation, reward, bool(done) and not cut_off, bool(done) and cut_off, info)
 
 
 def number(reward: Any) -> float:
-    """The reward of one environment as a number of Python's. Raises EnvironmentFailed."""
+    """The reward of one environment as a float. Raises EnvironmentFailed if it is no number."""
     if type(reward) is float:
         return reward
     try:
         return float(reward.item() if isinstance(reward, np.ndarray) else reward)
     except (TypeError, ValueError):
-        words = f"step() returned a reward that is no number: {type(reward).__name__}."
-        raise EnvironmentFailed(words) from None
+        sentence = f"step() returned a reward that is no number: {type(reward).__name__}."
+        raise EnvironmentFailed(sentence) from None
 
 
 def as_dict(info: Any) -> Any:
-    """An info as Gymnasium has it: what is none is the value of `info` in one."""
+    """The info as a dict: {} for None; anything else that is no dict becomes the value of the key `info`."""
     return info if isinstance(info, Mapping) else {} if info is None else {"info": info}

@@ -1,4 +1,4 @@
-"""What one connection may use. Pure."""
+"""The limits of a server of environments. Pure."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from trial.gym.errors import LimitReached
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of a server; 0 stands for none, where a limit may be left out."""
+    """The limits of a server. Each is the highest value that is allowed."""
 
     connections: int = 1000
-    """Connections of the whole server."""
+    """Connections at a time."""
     workers: int = 64
-    """Connections of the whole server that have a process, since they have made a request."""
+    """Connections at a time that have a process (a worker), since they have sent a request."""
     environments: int = 256
-    """Environments of a connection, those of vectors counted one by one."""
+    """Environments of a connection. Those of a vector are counted one by one."""
     seconds: float = 60.0
-    """For one request."""
+    """Seconds for one request."""
     idle_seconds: float = 3600.0
-    """Without a request, until a connection with environments is closed."""
+    """Seconds without a request after which a connection with a worker is closed; 0: no limit."""
     megabytes: int = 2048
-    """Of memory, for each process of a connection beyond what it begins with, and for all of them together."""
+    """Memory of each process of a connection beyond what it begins with, and of all of them together."""
     processes: int = 64
-    """That the environments of a connection start."""
+    """Processes that the environments of a connection start."""
     steps_per_second: int = 0
-    """Of a connection; 0: as many as it can take."""
+    """Steps of a connection in a second; 0: no limit."""
     message_bytes: int = 4 * 2**20
-    """In one message of a client."""
+    """Bytes of a client's message."""
     reply_bytes: int = 256 * 2**20
-    """In the observations of one reply."""
+    """Bytes of the observations in one reply."""
 
 
 class Rate:
-    """Counts the steps of a connection by the second."""
+    """Limits the steps of a connection to `most` in a second."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -42,7 +42,7 @@ class Rate:
         self._count = 0
 
     def take(self, steps: int, now: float) -> None:
-        """Count `steps` at the moment `now`, in seconds. Raises LimitReached if they are too many."""
+        """Count `steps` at the time `now`, in seconds. Raises LimitReached if they are too many."""
         if now - self._since >= 1.0:
             self._since, self._count = now, 0
         if self._count + steps > self._most:

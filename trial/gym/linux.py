@@ -1,4 +1,4 @@
-"""What Linux offers to keep a process and its children together; elsewhere these do what they can, or nothing."""
+"""Calls of Linux by which a process and its descendants are watched, limited and ended. Elsewhere they do nothing."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _SET_PDEATHSIG, _SET_CHILD_SUBREAPER = 1, 36  # prctl(2), linux/prctl.h
 
 
 def become_subreaper() -> None:
-    """Processes that lose their parent, below this one, become its children (PR_SET_CHILD_SUBREAPER, prctl(2))."""
+    """Let descendants of this process that lose their parent become its children (PR_SET_CHILD_SUBREAPER, prctl(2))."""
     _prctl(_SET_CHILD_SUBREAPER, 1)
 
 
 def die_with_parent() -> None:
-    """Have this process killed when the one that forked it ends (PR_SET_PDEATHSIG, prctl(2))."""
+    """Let the system kill this process when its parent ends (PR_SET_PDEATHSIG, prctl(2))."""
     _prctl(_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def limit_memory(megabytes: int) -> None:
-    """Let this process and its children each have so much private memory beyond what this one has now.
+    """Limit the private memory of this process, and of each child, to its present size and `megabytes` more.
 
-    On Linux: RLIMIT_DATA, which counts private writable mappings since Linux 4.7 (setrlimit(2)).
+    By RLIMIT_DATA, which counts private writable mappings since Linux 4.7 (setrlimit(2)).
     """
     if not _LINUX:
         return
@@ -40,7 +40,7 @@ def limit_memory(megabytes: int) -> None:
 
 
 def children(pid: int) -> list[int]:
-    """The children of a process (/proc/PID/task/TID/children, proc(5)); none where the system does not tell."""
+    """The children of a process (/proc/PID/task/TID/children, proc(5)); empty if the system has no such file."""
     found: list[int] = []
     with contextlib.suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):
@@ -50,7 +50,7 @@ def children(pid: int) -> list[int]:
 
 
 def descendants(pid: int) -> list[int]:
-    """The children of a process, theirs and so on."""
+    """The children of a process, their children, and so on."""
     found: list[int] = []
     waiting = [pid]
     while waiting:
@@ -61,14 +61,14 @@ def descendants(pid: int) -> list[int]:
 
 
 def runs(pid: int) -> bool:
-    """Whether a process is there and no zombie (the state in /proc/PID/stat)."""
+    """Whether a process exists and is no zombie (by the state in /proc/PID/stat)."""
     with contextlib.suppress(OSError, IndexError):
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     return False
 
 
 def private_megabytes(pid: int) -> float:
-    """The memory that the process shares with no file (resident less shared of /proc/PID/statm); 0 if it has ended."""
+    """The resident memory of a process without its shared pages (/proc/PID/statm); 0 if it has ended."""
     try:
         _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
     except (OSError, ValueError):

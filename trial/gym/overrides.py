@@ -1,4 +1,4 @@
-"""The two functions that a program may replace, as in Gymie: how an environment is made, and what a step becomes."""
+"""The functions that a program may replace, as in Gymie: `get_env` makes an environment, `process_step` changes a step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from trial.gym import ids
-from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, of
+from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, described
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -16,11 +16,11 @@ _NAMES = ("get_env", "process_step")
 
 
 def override(func_name: str) -> Callable[[F], F]:
-    """Decorator: the function takes the place of `get_env` or `process_step`.
+    """Replace `get_env` or `process_step` by the decorated function.
 
-    `get_env(env_id, **params)` gets the parameters of `make` and returns an environment, of Gymnasium's kind or of
-    gym's old one. `process_step((observation, reward, done, info))` returns what `step` answers. Raises AssertionError
-    for another name, as Gymie does.
+    `get_env(env_id, **params)` gets the parameters of `make`. It returns an environment of Gymnasium's kind or of gym's
+    old kind. `process_step((observation, reward, done, info))` returns these four values as `step` is to answer them.
+    Raises AssertionError for another name, as Gymie does.
     """
     assert func_name in _NAMES, "Error overriding. Functions available: `get_env`, `process_step`"
 
@@ -32,18 +32,18 @@ def override(func_name: str) -> Callable[[F], F]:
 
 
 def replaced(func_name: str) -> Callable[..., Any] | None:
-    """The program's own function, if it has one."""
+    """The function by which the program has replaced this one; None if it has not."""
     return _replaced.get(func_name)
 
 
 def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
-    """Make an environment of Gymnasium's registry; `seed` is for its first reset.
+    """Make an environment of Gymnasium's registry. `seed` is not used here: the first reset uses it.
 
-    An id that gym 0.17 had and Gymnasium has not becomes its successor's (`ids.py`). An id with a module
-    (`module:Name-v0`) is refused: Gymnasium would import that module. Raises EnvironmentNotFound,
-    and EnvironmentMalformed with what Gymnasium says.
+    An id of gym 0.17 that Gymnasium does not have becomes the newest one (`ids.py`). An id with a module
+    (`module:Name-v0`) is refused, since Gymnasium would import that module. Raises EnvironmentNotFound, and
+    EnvironmentMalformed with Gymnasium's reason.
     """
-    import gymnasium  # noqa: PLC0415 - the process that listens does without
+    import gymnasium  # noqa: PLC0415 - the process that listens must not import it
 
     if ":" in env_id:
         raise EnvironmentMalformed(env_id, "a client cannot name a module; the server imports it with --import")
@@ -53,6 +53,6 @@ def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
     try:
         return gymnasium.make(now, **(more | options))
     except gymnasium.error.UnregisteredEnv as error:
-        raise EnvironmentNotFound(env_id, of(error)) from error
+        raise EnvironmentNotFound(env_id, described(error)) from error
     except Exception as error:
-        raise EnvironmentMalformed(env_id, of(error)) from error
+        raise EnvironmentMalformed(env_id, described(error)) from error

@@ -1,6 +1,6 @@
-"""Starts what serves environments: the spawner is forked, then this process listens (`server.py`) until it is ended.
+"""Starts a server of environments: forks the spawner (`spawner.py`), then listens in this process (`server.py`).
 
-`python -m trial.gym`, or `start` in a program.
+`python -m trial.gym` and `start` (`embedded.py`) call it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ def serve(
     record: Path | None = None,
     ready: Callable[[int], None] = lambda _: None,
 ) -> int:
-    """Serve environments until SIGINT or SIGTERM; the exit status. `ready` is called with the port.
+    """Serve environments until SIGINT or SIGTERM. Return the exit status.
 
-    Raises OSError or UnicodeError if the address cannot be used. `modules` are imported where environments are made;
-    `record` is a folder for recordings.
+    `modules` are imported in the spawner, before environments are made. Pages of `origins` may connect. `output` shows
+    what environments print. `record` is a folder for recordings. `ready` is called with the port once it listens.
+    Raises OSError or UnicodeError if the address cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=512) as listener:
@@ -57,7 +58,7 @@ def serve_from(
     record: Path | None = None,
     ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """As `serve`, to the connections that `listener` accepts."""
+    """As `serve`, for the connections that `listener` accepts. `ready` is called without the port."""
     _allow_files(limits.connections + 2 * WITHOUT_HANDSHAKE)
     control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
     with control:
@@ -89,7 +90,7 @@ def tell(host: str, port: int) -> None:
 
 
 def _allow_files(count: int) -> None:
-    """Let this process have so many open files, as far as the system allows."""
+    """Let this process open `count` files, or as many as the system allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < count:
         most = count if hard == resource.RLIM_INFINITY else min(count, hard)
@@ -99,7 +100,7 @@ def _allow_files(count: int) -> None:
 def _fork_spawner(
     listener: ListeningSocket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
 ) -> tuple[socket.socket, int]:
-    """Start the spawner; our end of its socket, and its process id."""
+    """Start the spawner. Return our end of the socket to it, and its process id."""
     ours, theirs = socket.socketpair()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -111,7 +112,7 @@ def _fork_spawner(
     try:
         ours.close()
         listener.close()
-        from trial.gym import spawner  # noqa: PLC0415 - numpy and gymnasium stay out of the process that listens
+        from trial.gym import spawner  # noqa: PLC0415 - the process that listens must not import numpy and gymnasium
 
         status = spawner.main(theirs, limits, modules, output=output, record=record)
     except KeyboardInterrupt:
@@ -122,12 +123,13 @@ def _fork_spawner(
 
 
 def _is_ready(control: socket.socket) -> bool:
-    told = bytearray()
-    while handover.read_ended(told) is None:
+    """Wait for the spawner's first message. Return False if it has ended instead."""
+    received = bytearray()
+    while handover.read_ended(received) is None:
         data = control.recv(4096)
         if not data:
             return False
-        told += data
+        received += data
     return True
 
 

@@ -1,8 +1,7 @@
-"""The process that listens: it shakes hands, holds the connections that have asked for nothing yet, and tells clients
-when the process of their environments had to be ended. `processes.py` starts it.
+"""The process that listens. It does the handshakes, and holds connections until their first request.
 
-A connection costs little until its first request. Then its socket goes to a process of its own (`spawner.py`,
-`worker.py`). This process only keeps a descriptor, by which it tells the client if that process dies.
+Then the spawner (`spawner.py`) gets the connection's socket, and starts a process for it (`worker.py`). This process
+keeps a descriptor of the socket. If the worker had to be ended, it closes the connection with a sentence.
 """
 
 from __future__ import annotations
@@ -33,46 +32,46 @@ from trial.gym.wakeup import Wakeup
 PATH = "/gym"
 SUBPROTOCOL = "hippodrome.gym.1"
 FORMS = ("gymie", "documented", "gymnasium")
-_HANDSHAKE_SECONDS = 10.0
-_HANDSHAKE_BYTES = 16 * 1024
-_CLOSE_SECONDS = 2.0
-_NO_FILES_SECONDS = 0.05
+_HANDSHAKE_SECONDS = 10.0  # for a handshake
+_HANDSHAKE_BYTES = 16 * 1024  # of a handshake
+_CLOSE_SECONDS = 2.0  # for a client to close its end
+_NO_FILES_SECONDS = 0.05  # to wait if no file can be opened
 WITHOUT_HANDSHAKE = 100
-"""So many connections beyond the limit are told that it is reached."""
+"""Connections beyond the limit that are accepted, so that their handshakes can be answered with a refusal."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 class ListeningSocket(Protocol):
-    """What connections are accepted from: a listening socket, or what stands for one."""
+    """A listening socket, or an object that accepts connections in another way."""
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection. Raises OSError if there is none, and KeyboardInterrupt if there will be none."""
+        """The next connection. Raises OSError if there is none, and KeyboardInterrupt if there will be no more."""
 
     def fileno(self) -> int:
-        """What can be read when there is a connection."""
+        """The descriptor that becomes readable when there is a connection."""
 
     def setblocking(self, flag: bool, /) -> None:
-        """Whether `accept` waits."""
+        """Set whether `accept` waits for a connection."""
 
     def close(self) -> None:
-        """Accept no more."""
+        """Accept no more connections."""
 
 
 @dataclass(slots=True, eq=False)
 class _Connection:
     socket: socket.socket
     deadline: float | None
-    """Until when the handshake, or after a close the client's end, must have come; None: it may stay."""
+    """When the connection is dropped: if its handshake, or the client's close, has not come by then; None: never."""
     received: bytes = b""
     form: str = ""
-    """Empty until the handshake is done."""
+    """The name of its form; empty until the handshake is done."""
     number: int = 0
-    """Under which a worker serves it; 0 without one."""
+    """Its number for the spawner; 0 if it has no worker."""
     closing: bool = False
 
 
 class GymServer:
-    """Listens until `run` is interrupted."""
+    """Serves connections until `run` is interrupted."""
 
     def __init__(
         self, listener: ListeningSocket, control: socket.socket, limits: Limits, origins: Sequence[str]
@@ -83,12 +82,12 @@ class GymServer:
         self._origins = frozenset(origins)
         self._selector = selectors.DefaultSelector()
         self._connections: set[_Connection] = set()
-        self._served: dict[int, _Connection] = {}
-        self._numbers = 0
-        self._told = bytearray()
+        self._with_worker: dict[int, _Connection] = {}
+        self._last_number = 0
+        self._from_spawner = bytearray()  # of a message that is not complete yet
 
     def run(self) -> None:
-        """Serve. Raises KeyboardInterrupt as it comes, and EOFError if the spawner has ended."""
+        """Serve until a signal raises KeyboardInterrupt. Raises that, and EOFError if the spawner has ended."""
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._control, selectors.EVENT_READ, self._listen_to_spawner)
@@ -102,7 +101,7 @@ class GymServer:
     def _serve(self) -> None:
         checked = time.monotonic()
         while True:
-            for key, _ in self._selector.select(1.0 if any(self._timed()) else None):
+            for key, _ in self._selector.select(1.0 if self._timed() else None):
                 if isinstance(key.data, _Connection):
                     self._readable(key.data)
                 else:
@@ -114,7 +113,7 @@ class GymServer:
                     self._drop(connection)
 
     def close(self) -> None:
-        """Tell all clients that the server ends."""
+        """Close all connections, and tell the clients that the server ends."""
         for connection in list(self._connections):
             if connection.form and not connection.closing:
                 self._send_close(connection, 1001, "The server ends.")
@@ -122,6 +121,7 @@ class GymServer:
         self._selector.close()
 
     def _timed(self) -> list[_Connection]:
+        """The connections with a deadline."""
         return [connection for connection in self._connections if connection.deadline is not None]
 
     # ---- connections without a worker
@@ -131,7 +131,7 @@ class GymServer:
             accepted, _ = self._listener.accept()
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE):
-                time.sleep(_NO_FILES_SECONDS)  # it would be tried again at once
+                time.sleep(_NO_FILES_SECONDS)  # or else this would be tried again and again without a pause
             return
         if len(self._connections) >= self._limits.connections + WITHOUT_HANDSHAKE:
             accepted.close()
@@ -174,7 +174,7 @@ class GymServer:
             try:
                 form = _form(request)
                 response = self._refused(request) or protocol.accept(request)
-            except (ValueError, LookupError):  # an address or an origin that is none, a header that is there twice
+            except (ValueError, LookupError):  # a malformed address or origin, or a header that is there twice
                 response = _response(http.HTTPStatus.BAD_REQUEST, "This is no handshake of a WebSocket.\n")
         connection.received = rest
         if not self._send(connection, response.serialize()):
@@ -189,7 +189,7 @@ class GymServer:
             _keep_alive(connection.socket)
 
     def _refused(self, request: Request) -> Response | None:
-        """The HTTP answer to a request that is no handshake, or whose client may not connect; None for all others."""
+        """The HTTP answer that refuses the request; None if it is a handshake, and the client may connect."""
         path, origin = urlsplit(request.path).path, request.headers.get("Origin")
         if "websocket" not in request.headers.get("Upgrade", "").lower():
             return _response(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
@@ -208,7 +208,7 @@ class GymServer:
         return None
 
     def _between_requests(self, connection: _Connection) -> None:
-        """Answer pings and closes; the first data frame gets a worker."""
+        """Answer pings and closes. At the first data frame, hand the connection over to a worker."""
         while len(connection.received) >= 2:
             first, second = connection.received[:2]
             opcode, length = first & 0x0F, second & 0x7F
@@ -219,7 +219,7 @@ class GymServer:
                 or not second & 0x80
                 or length > 125
             ):
-                self._hand_over(connection)  # also what is wrong: the worker answers it as the protocol says
+                self._hand_over(connection)  # also for a malformed frame: the worker answers as the protocol demands
                 return
             if len(connection.received) < 6 + length:
                 return
@@ -235,9 +235,9 @@ class GymServer:
 
     def _hand_over(self, connection: _Connection) -> None:
         self._selector.unregister(connection.socket)
-        self._numbers += 1
-        connection.number = self._numbers
-        self._served[connection.number] = connection
+        self._last_number += 1
+        connection.number = self._last_number
+        self._with_worker[connection.number] = connection
         received, connection.received = connection.received, b""
         handover.send(
             self._control, handover.NewConnection(connection.number, connection.form, received, connection.socket)
@@ -249,9 +249,9 @@ class GymServer:
         data = self._control.recv(65536)
         if not data:
             raise EOFError("the process that starts workers has ended")
-        self._told += data
-        while (ended := handover.read_ended(self._told)) is not None:
-            connection = self._served.pop(ended.number, None)
+        self._from_spawner += data
+        while (ended := handover.read_ended(self._from_spawner)) is not None:
+            connection = self._with_worker.pop(ended.number, None)
             if connection is None:
                 continue
             connection.number = 0
@@ -260,22 +260,22 @@ class GymServer:
                 continue
             connection.socket.setblocking(False)
             self._selector.register(connection.socket, selectors.EVENT_READ, connection)
-            self._send_close(connection, ended.code, ended.words)
+            self._send_close(connection, ended.code, ended.sentence)
 
-    def _send_close(self, connection: _Connection, code: int, words: str) -> None:
-        close = Close(code, reason(words)).serialize()
+    def _send_close(self, connection: _Connection, code: int, sentence: str) -> None:
+        close = Close(code, reason(sentence)).serialize()
         if self._send(connection, Frame(Opcode.CLOSE, close).serialize(mask=False)):
             self._close_soon(connection)
 
     def _close_soon(self, connection: _Connection) -> None:
-        """Send no more, and give the client a moment to read what it was sent."""
+        """Send nothing more, and give the client time to read what it was sent."""
         connection.closing = True
         connection.deadline = time.monotonic() + _CLOSE_SECONDS
         with contextlib.suppress(OSError):
             connection.socket.shutdown(socket.SHUT_WR)
 
     def _send(self, connection: _Connection, data: bytes) -> bool:
-        """Send a little; a client that does not even take that is dropped."""
+        """Send a few bytes. Drop the client and return False if they cannot be sent at once."""
         try:
             if connection.socket.send(data, socket.MSG_DONTWAIT) == len(data):
                 return True
@@ -289,7 +289,7 @@ class GymServer:
             return
         self._connections.discard(connection)
         if connection.number:
-            self._served.pop(connection.number, None)
+            self._with_worker.pop(connection.number, None)
         else:
             with contextlib.suppress(KeyError, ValueError):
                 self._selector.unregister(connection.socket)
@@ -298,7 +298,7 @@ class GymServer:
 
 
 def _close_answer(payload: bytes) -> bytes:
-    """What a client's close is answered with: the same, or what is wrong with it (RFC 6455, 7.4.1)."""
+    """The payload that answers a client's close: the same, or the code for a malformed one (RFC 6455, 7.4.1)."""
     try:
         Close.parse(payload)
     except ProtocolError:
@@ -309,12 +309,12 @@ def _close_answer(payload: bytes) -> bytes:
 
 
 def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Ours if it is offered; without one, a client of Gymie's or another that speaks JSON."""
+    """Our subprotocol if the client offers it; None for Gymie's clients and others that speak JSON."""
     return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in offered else None
 
 
 def _form(request: Request) -> str | None:
-    """The form that the address asks for; None if there is no such form."""
+    """The form that the address asks for, by default Gymie's; None if there is no such form."""
     asked = parse_qs(urlsplit(request.path).query).get("form", [FORMS[0]])[0]
     return asked if asked in FORMS else None
 
@@ -328,7 +328,7 @@ def _response(status: http.HTTPStatus, text: str) -> Response:
 
 
 def _keep_alive(connection: socket.socket) -> None:
-    """Let the system find out within some minutes that a client is gone without a close."""
+    """Let the system find out within about two minutes that a client has gone without a close."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, name):

@@ -1,4 +1,4 @@
-"""The methods of one connection, and its environments. No I/O but what the environments do."""
+"""Answers the requests of one connection, and holds its environments. Does no I/O itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gymnasium.spaces import Tuple
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from trial.gym import arrays, instance, spaces, values
+from trial.gym import arrays, spaces, values
 from trial.gym.arrays import ArrayLayout
 from trial.gym.errors import (
     EnvironmentFailed,
@@ -28,42 +28,43 @@ from trial.gym.errors import (
     short,
 )
 from trial.gym.forms import MessageForm
-from trial.gym.instance import Instance, InstanceStep, as_dict, guarded, number
+from trial.gym.instance import CUT_OFF, MODES, Instance, InstanceStep, as_dict, guarded, number
+from trial.gym.instance import make as make_instance
 from trial.gym.limits import Limits, Rate
 from trial.gym.recordings import ConnectionRecorder
 from trial.gym.spaces import CodecError
 
 _read = json.JSONDecoder().decode
-_ENDS = ("false,{}]", "true,{}]")
-_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")
+_ENDS = ("false,{}]", "true,{}]")  # of an answer: done and info, by `terminated`
+_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")  # terminated, truncated and info
 
 
 class HeldEnvironment:
-    """An environment and what is made once for it."""
+    """An environment of a connection, under its id (in JSON) and its handle (in binary messages)."""
 
-    def __init__(self, made: Instance, instance_id: str, handle: int) -> None:
-        self.instance = made
+    def __init__(self, instance: Instance, instance_id: str, handle: int) -> None:
+        self.instance = instance
         self.instance_id = instance_id
         self.handle = handle
-        env = made.env
-        self.decode = guarded(_decoder, env.action_space)
-        self.bytes = _bytes(made.single_observation_space) * made.size
+        self.decode = guarded(values.decoder, instance.env.action_space, action=True)
+        """Reads an action from JSON data. Raises CodecError."""
+        self.bytes = _bytes(instance.single_observation_space) * instance.size
+        """The bytes of the observations of one step; 0 if their size varies."""
         self._layouts: tuple[ArrayLayout, ArrayLayout] | None = None
 
     @property
     def layouts(self) -> tuple[ArrayLayout, ArrayLayout]:
-        """How observations and actions lie in binary messages. Raises CodecError."""
+        """The layouts of observations and of actions in binary messages. Raises CodecError."""
         if self._layouts is None:
-            made = self.instance
             self._layouts = (
-                arrays.layout(made.single_observation_space),
-                arrays.layout(made.single_action_space, action=True),
+                arrays.layout(self.instance.single_observation_space),
+                arrays.layout(self.instance.single_action_space, action=True),
             )
         return self._layouts
 
 
 class GymSession:
-    """Answers the requests of one connection. Its environments are closed with it."""
+    """Answers the requests of one connection, in its form and within its limits."""
 
     def __init__(self, form: MessageForm, limits: Limits, recorder: ConnectionRecorder | None = None) -> None:
         self.form = form
@@ -89,7 +90,7 @@ class GymSession:
         }
 
     def answer(self, text: str) -> str:
-        """The reply to a request. Raises GymError."""
+        """The reply to a request in JSON. Raises GymError."""
         try:
             message = _read(text)
         except (ValueError, RecursionError):
@@ -108,8 +109,8 @@ class GymSession:
         except TypeError as error:
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
                 raise
-            why = str(error).partition("() ")[2] if isinstance(params, dict) else "they must be an object"
-            raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong", why) from None
+            reason = str(error).partition("() ")[2] if isinstance(params, dict) else "they must be an object"
+            raise WrongParameters(f"Parameters `{short(str(params), 80)}` are wrong", reason) from None
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
 
@@ -125,9 +126,9 @@ class GymSession:
         if held is None:
             raise InstanceNotFound(str(request.handle))
         try:
-            return (
-                self._reset_arrays(held, request) if request.kind == arrays.RESET else self._step_arrays(held, request)
-            )
+            if request.kind == arrays.RESET:
+                return self._reset_arrays(held, request)
+            return self._step_arrays(held, request)
         except CodecError as error:
             raise EnvironmentFailed(str(error)) from error
 
@@ -147,60 +148,19 @@ class GymSession:
         return arrays.reset_reply(held.handle, observations, held.instance.size, batch, [(0, info)])
 
     def _step_arrays(self, held: HeldEnvironment, request: arrays.ArrayRequest) -> bytes:
-        made, count = held.instance, request.steps
-        self.allow(held, count)
+        instance, count = held.instance, request.steps
+        self._allow(held, count)
         observations, actions = held.layouts
         try:
-            batch = arrays.read_actions(request, actions, made.size)
+            batch = arrays.read_actions(request, actions, instance.size)
         except CodecError as error:
-            raise WrongAction(arrays.refused(request, made.single_action_space, made.size), str(error)) from None
-        steps = self._vector_steps(held, batch, count) if made.num_envs else self._single_steps(held, batch, count)
-        return arrays.steps_reply(request.kind, held.handle, observations, steps)
-
-    def _single_steps(self, held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
-        observations, actions = held.layouts
-        found = observations.empty(count)
-        put, made = observations.put, held.instance
-        rewards: list[float] = []
-        terminated: list[Any] = []
-        truncated: list[Any] = []
-        infos: arrays.Infos = []
-        steps = made.steps(actions.rows(batch, count))
-        if made.processes:
-            steps = (made.processed(InstanceStep(*step)) for step in steps)
-        for at, (observation, reward, end, cut, info) in enumerate(steps):
-            put(found, at, observation)
-            rewards.append(reward)
-            terminated.append(end)
-            truncated.append(cut)
-            if info:
-                infos.append((at, as_dict(info)))
-        return arrays.StepRows(found, _numbers(rewards), _flags(terminated), _flags(truncated), infos)
-
-    def _vector_steps(self, held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
-        observations, actions = held.layouts
-        made = held.instance
-        each = list(actions.rows(batch, count * made.size))
-        found = observations.empty(count * made.size)
-        rewards: list[Any] = []
-        terminated: list[Any] = []
-        truncated: list[Any] = []
-        infos: arrays.Infos = []
-
-        together = [_together(made, each[at : at + made.size]) for at in range(0, len(each), made.size)]
-        for at, (observation, reward, end, cut, info) in enumerate(made.steps(together)):
-            observations.put_batch(found, at * made.size, observation, made.size)
-            rewards.append(reward)
-            terminated.append(end)
-            truncated.append(cut)
-            if info:
-                infos.append((at, info))
-        return arrays.StepRows(
-            found, np.concatenate(rewards), np.concatenate(terminated), np.concatenate(truncated), infos
-        )
+            action = arrays.refused(request, instance.single_action_space, instance.size)
+            raise WrongAction(action, str(error)) from None
+        take = _vector_steps if instance.num_envs else _single_steps
+        return arrays.steps_reply(request.kind, held.handle, observations, take(held, batch, count))
 
     def end(self) -> None:
-        """Close all environments; what they raise is ignored."""
+        """Close all environments. Exceptions that they raise are ignored."""
         while self._held:
             _, held = self._held.popitem()
             try:
@@ -208,7 +168,7 @@ class GymSession:
             except GymError:
                 continue
 
-    # ---- the methods of a request; their parameters are those of the message
+    # ---- the methods that a request may name, with the parameters of the request; each returns the answer
 
     def make(
         self,
@@ -218,47 +178,46 @@ class GymSession:
         autoreset_mode: str = AutoresetMode.NEXT_STEP.value,
         **options: Any,
     ) -> str:
-        """Make an environment, or a vector of `num_envs`; its id. `options` are the environment's own."""
+        """Make an environment, or a vector of `num_envs`. Answer its id. `options` go to `gymnasium.make`."""
         _check(type(env_id) is str, "env_id must be a text")
         _check(_is_seed(seed), "seed must be a whole number of 0 or more")
         _check(num_envs is None or (type(num_envs) is int and num_envs > 0), "num_envs must be 1 or more")
         _check(
-            type(autoreset_mode) is str and autoreset_mode in instance.MODES,
-            f"autoreset_mode must be one of {', '.join(instance.MODES)}",
+            type(autoreset_mode) is str and autoreset_mode in MODES,
+            f"autoreset_mode must be one of {', '.join(MODES)}",
         )
         used = sum(held.instance.size for held in self._held.values())
         if used + (num_envs or 1) > self._limits.environments:
             raise LimitReached(
                 f"A connection may have {self._limits.environments} environments; it has {used}. Close some."
             )
-        made = instance.make(
-            env_id, seed, num_envs or 0, instance.MODES[autoreset_mode], options, recorder=self._recorder
-        )
+        mode = MODES[autoreset_mode]
+        instance = make_instance(env_id, seed, num_envs or 0, mode, options, recorder=self._recorder)
         self._handles += 1
-        held = HeldEnvironment(made, uuid.uuid4().hex, self._handles)
+        held = HeldEnvironment(instance, uuid.uuid4().hex, self._handles)
         self._held[held.instance_id] = self._by_handle[held.handle] = held
         if self.form.bare_id:
             return held.instance_id
-        return self.form.result(self._described(held) if self.form.arrays else {"instance_id": held.instance_id})
+        return values.to_text(_description(held) if self.form.arrays else {"instance_id": held.instance_id})
 
     def step(self, instance_id: str, action: Any, render: bool = False) -> str:
-        """One step of an environment, or of all environments of a vector."""
+        """Take one step of an environment, or of all environments of a vector."""
         held = self._find(instance_id)
-        made = held.instance
+        instance = held.instance
         if self._rate is not None:
-            self._rate.take(made.size, time.monotonic())
+            self._rate.take(instance.size, time.monotonic())
         if render:
-            made.render()
-        found = made.step(self._action(held, action))
-        if made.processes:
-            found = made.processed(found)
-        return self._plain(found) or self.form.result(self._shaped(found, made))
+            instance.render()
+        step = instance.step(self._action(held, action))
+        if instance.processes:
+            step = instance.processed(step)
+        return self._quick_answer(step) or values.to_text(self._shaped(step, instance))
 
     def step_many(self, instance_id: str, actions: Any) -> str:
-        """A step for each action, with the next episode begun after each end; five lists."""
+        """Take a step for each action; after the end of an episode begin the next one. Answer five lists."""
         held = self._find(instance_id)
         _check(isinstance(actions, list), "actions must be a list")
-        self.allow(held, len(actions))
+        self._allow(held, len(actions))
         decoded = [self._action(held, action) for action in actions]
         steps = [held.instance.processed(InstanceStep(*step)) for step in held.instance.steps(decoded)]
         columns = [[step[at] for step in steps] for at in range(5)]
@@ -266,10 +225,10 @@ class GymSession:
             columns[1] = [number(reward) for reward in columns[1]]
         columns[4] = [as_dict(info) for info in columns[4]]
         columns[2:4] = [[_truth(flag) for flag in column] for column in columns[2:4]]
-        return self.form.result(columns)
+        return values.to_text(columns)
 
     def reset(self, instance_id: str, seed: Any = None, options: Any = None) -> str:
-        """Begin an episode: its first observation, or observation and info."""
+        """Begin an episode. Answer its first observation, or with `form.five` its first observation and info."""
         held = self._find(instance_id)
         _check(
             _is_seed(seed) or (isinstance(seed, list) and held.instance.num_envs > 0 and all(map(_is_seed, seed))),
@@ -277,35 +236,35 @@ class GymSession:
         )
         _check(options is None or isinstance(options, dict), "options must be an object")
         observation, info = held.instance.reset(seed, options)
-        return self.form.result([observation, info] if self.form.five else observation)
+        return values.to_text([observation, info] if self.form.five else observation)
 
     def close(self, instance_id: str) -> str:
         """Close an environment."""
         held = self._find(instance_id)
         del self._held[instance_id], self._by_handle[held.handle]
         held.instance.close()
-        return self.form.result(True)
+        return values.to_text(True)
 
     def observation_space(self, instance_id: str) -> str:
-        """The description of the observation space; of a vector, for all of its environments together."""
-        return self.form.result(spaces.describe(self._find(instance_id).instance.env.observation_space))
+        """Answer the description of the observation space; of a vector, that of all its environments together."""
+        return values.to_text(spaces.describe(self._find(instance_id).instance.env.observation_space))
 
     def action_space(self, instance_id: str) -> str:
-        """The description of the action space; of a vector, for all of its environments together."""
-        return self.form.result(spaces.describe(self._find(instance_id).instance.env.action_space))
+        """Answer the description of the action space; of a vector, that of all its environments together."""
+        return values.to_text(spaces.describe(self._find(instance_id).instance.env.action_space))
 
     def action_sample(self, instance_id: str) -> str:
-        """A random action."""
-        return self.form.result(guarded(self._find(instance_id).instance.env.action_space.sample))
+        """Answer a random action of the action space."""
+        return values.to_text(guarded(self._find(instance_id).instance.env.action_space.sample))
 
     def render(self, instance_id: str) -> str:
-        """What the environment's `render` returns, pictures as PNG."""
-        return self.form.result(values.picture(self._find(instance_id).instance.render()))
+        """Answer what the environment's `render` returns, a picture as PNG."""
+        return values.to_text(values.picture(self._find(instance_id).instance.render()))
 
-    # ---- what the methods share
+    # ---- shared by these methods
 
-    def allow(self, held: HeldEnvironment, steps: int) -> None:
-        """Check the limits of a request for so many steps. Raises LimitReached."""
+    def _allow(self, held: HeldEnvironment, steps: int) -> None:
+        """Raise LimitReached if a request for `steps` steps exceeds a limit."""
         if steps > arrays.MAX_STEPS:
             raise LimitReached(f"One request may ask for {arrays.MAX_STEPS} steps, not for {steps}.")
         if steps * held.bytes > self._limits.reply_bytes:
@@ -327,59 +286,108 @@ class GymSession:
         except CodecError as error:
             raise WrongAction(json.dumps(action), str(error)) from None
 
-    def _plain(self, found: InstanceStep) -> str:
-        """The answer to the usual step, as fast as can be: numbers in an array, and no info. Empty for another one."""
-        observation, reward, terminated, truncated, info = found
+    def _quick_answer(self, step: InstanceStep) -> str:
+        """The answer to a usual step, with an array of numbers and no info, made quickly; empty for any other step."""
+        observation, reward, terminated, truncated, info = step
         if info or type(observation) is not np.ndarray or observation.dtype.kind not in "fiu":
             return ""
         if type(reward) is not float or type(terminated) is not bool or type(truncated) is not bool or truncated:
             return ""
-        end = _ENDS[terminated] if not self.form.five else _ENDS_OF_FIVE[terminated]
-        said = f"[{observation.tolist()!r},{reward!r},{end}"  # Python writes finite numbers as JSON has them
-        return "" if "n" in said else said  # but nan and inf
+        numbers = f"[{observation.tolist()!r},{reward!r},"  # Python writes finite numbers as JSON has them
+        if "n" in numbers:  # nan or inf
+            return ""
+        return numbers + (_ENDS_OF_FIVE[terminated] if self.form.five else _ENDS[terminated])
 
-    def _shaped(self, found: InstanceStep, made: Instance) -> list[Any]:
-        observation, reward, terminated, truncated, info = found
+    def _shaped(self, step: InstanceStep, instance: Instance) -> list[Any]:
+        """The step's results as the form of the connection has them."""
+        observation, reward, terminated, truncated, info = step
         if type(observation) is np.ndarray and not self.form.arrays:
             observation = observation.tolist()
-        if not made.num_envs:
+        if not instance.num_envs:
             reward = number(reward)
         info = as_dict(info)
         if self.form.five:
             return [observation, reward, _truth(terminated), _truth(truncated), info]
         if type(terminated) is np.ndarray:
             return [observation, reward, terminated | truncated, info]
-        if truncated and not made.processes:  # a program has been told, and answers what it wants
-            info = {**info, instance.CUT_OFF: not terminated}
+        if truncated and not instance.processes:  # a program's `process_step` got this in the info, and may remove it
+            info = {**info, CUT_OFF: not terminated}
         return [observation, reward, bool(terminated or truncated), info]
 
-    def _described(self, held: HeldEnvironment) -> dict[str, Any]:
-        made = held.instance
-        return {
-            "instance_id": held.instance_id,
-            "handle": held.handle,
-            "num_envs": made.num_envs,
-            "autoreset_mode": made.mode.value,
-            "render_mode": getattr(made.env, "render_mode", None),
-            "metadata": _metadata(made.env),
-            "spec": _spec(made.first),
-            "observation_space": spaces.describe(made.single_observation_space, compact=True),
-            "action_space": spaces.describe(made.single_action_space, compact=True),
-        }
+
+def _description(held: HeldEnvironment) -> dict[str, Any]:
+    """The answer to `make` in the form of arrays."""
+    instance = held.instance
+    return {
+        "instance_id": held.instance_id,
+        "handle": held.handle,
+        "num_envs": instance.num_envs,
+        "autoreset_mode": instance.mode.value,
+        "render_mode": getattr(instance.env, "render_mode", None),
+        "metadata": _metadata(instance.env),
+        "spec": _spec(instance.first),
+        "observation_space": spaces.describe(instance.single_observation_space, compact=True),
+        "action_space": spaces.describe(instance.single_action_space, compact=True),
+    }
 
 
-def _together(made: Instance, actions: Sequence[Any]) -> Any:
+def _single_steps(held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
+    """Take `count` steps of a single environment, with a batch of actions."""
+    observations, actions = held.layouts
+    taken = observations.empty(count)
+    put, instance = observations.put, held.instance
+    rewards: list[float] = []
+    terminated: list[Any] = []
+    truncated: list[Any] = []
+    infos: arrays.Infos = []
+    steps = instance.steps(actions.rows(batch, count))
+    if instance.processes:
+        steps = (instance.processed(InstanceStep(*step)) for step in steps)
+    for at, (observation, reward, is_terminated, is_truncated, info) in enumerate(steps):
+        put(taken, at, observation)
+        rewards.append(reward)
+        terminated.append(is_terminated)
+        truncated.append(is_truncated)
+        if info:
+            infos.append((at, as_dict(info)))
+    return arrays.StepRows(
+        taken, _numbers(rewards), np.array(terminated, np.bool_), np.array(truncated, np.bool_), infos
+    )
+
+
+def _vector_steps(held: HeldEnvironment, batch: Any, count: int) -> arrays.StepRows:
+    """Take `count` steps of all environments of a vector, with a batch of actions."""
+    observations, actions = held.layouts
+    instance, size = held.instance, held.instance.size
+    each = list(actions.rows(batch, count * size))
+    taken = observations.empty(count * size)
+    rewards: list[Any] = []
+    terminated: list[Any] = []
+    truncated: list[Any] = []
+    infos: arrays.Infos = []
+    together = [_together(instance, each[at : at + size]) for at in range(0, len(each), size)]
+    for at, (observation, reward, are_terminated, are_truncated, info) in enumerate(instance.steps(together)):
+        observations.put_batch(taken, at * size, observation, size)
+        rewards.append(reward)
+        terminated.append(are_terminated)
+        truncated.append(are_truncated)
+        if info:
+            infos.append((at, info))
+    return arrays.StepRows(taken, np.concatenate(rewards), np.concatenate(terminated), np.concatenate(truncated), infos)
+
+
+def _together(instance: Instance, actions: Sequence[Any]) -> Any:
     """The actions of a vector's environments as one action of the vector."""
-    if isinstance(made.env.action_space, Tuple):
+    if isinstance(instance.env.action_space, Tuple):
         return tuple(actions)
-    empty: Any = create_empty_array(made.single_action_space, made.size)
-    return concatenate(made.single_action_space, actions, empty)
+    empty: Any = create_empty_array(instance.single_action_space, instance.size)
+    return concatenate(instance.single_action_space, actions, empty)
 
 
 def _metadata(env: Any) -> Any:
-    found = dict(getattr(env, "metadata", None) or {})
-    found.pop("autoreset_mode", None)  # an enumeration; it stands beside
-    return values.plain(found)
+    metadata = dict(getattr(env, "metadata", None) or {})
+    metadata.pop("autoreset_mode", None)  # it is an enumeration, and has a field of its own
+    return values.plain(metadata)
 
 
 def _spec(env: Any) -> Any:
@@ -389,25 +397,18 @@ def _spec(env: Any) -> Any:
 
 
 def _numbers(rewards: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The rewards as an array. Raises EnvironmentFailed if one is no number."""
     try:
-        found = np.array(rewards, np.float64)
-        if found.ndim == 1 and not np.isnan(found).any():  # numpy makes NaN of None
-            return found
+        array = np.array(rewards, np.float64)
+        if array.ndim == 1 and not np.isnan(array).any():  # NumPy turns None into NaN
+            return array
     except (TypeError, ValueError):
         pass
     return np.array([number(reward) for reward in rewards], np.float64)
 
 
-def _flags(said: list[Any]) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    return np.array(said, np.bool_)
-
-
-def _decoder(space: Any) -> Callable[[Any], Any]:
-    return values.decoder(space, action=True)
-
-
-def _check(right: bool, words: str) -> None:
-    if not right:
+def _check(condition: bool, words: str) -> None:
+    if not condition:
         raise WrongParameters(f"{words}.")
 
 
@@ -416,6 +417,7 @@ def _is_seed(seed: Any) -> bool:
 
 
 def _truth(flag: Any) -> Any:
+    """The flag as a bool; those of a vector stay an array."""
     return flag if isinstance(flag, np.ndarray) else bool(flag)
 
 

@@ -1,7 +1,7 @@
-"""The process that starts a worker for each connection, watches all workers, and leaves nothing of them behind.
+"""The process that starts a worker for each connection, watches the workers, and ends all that they leave behind.
 
-It imports what environments need once, so that a worker begins with it: a fork costs milliseconds and shares memory.
-It holds no connection and runs no environment. The server hands it sockets over a Unix socket (`handover.py`).
+It imports the modules for environments once. A worker is a fork of it, so it has them after milliseconds, in shared
+memory. The spawner holds no connection and runs no environment. The server sends it sockets (`handover.py`).
 """
 
 from __future__ import annotations
@@ -29,20 +29,24 @@ from trial.gym.worker import WorkerState
 from trial.gym.worker import main as work
 
 TICK_SECONDS = 0.25
+"""The time between two looks at how long the workers have been busy or idle."""
 _GRACE_SECONDS = 2.0  # between the interruption of Python code and the end of the process
 _ROUNDS = 1000  # of waiting for killed processes, at a time
-_LOOK_SECONDS = 1.0  # between two looks at memory and processes
+_USAGE_SECONDS = 1.0  # between two looks at memory and processes
 
 _AWAY, _FAILED = 1001, 1011  # close codes
 
 
 @dataclass(slots=True)
 class _Watched:
+    """A worker, by the number of its connection and its slot in the shared memory."""
+
     number: int
     slot: int
     state: WorkerState
     interrupted: bool = False
     verdict: tuple[int, str] | None = None
+    """The close code and the sentence for its client, if the spawner has killed it."""
 
 
 class Spawner:
@@ -54,14 +58,14 @@ class Spawner:
         self._output = output
         self._record = record
         self._memory = memoryview(mmap.mmap(-1, 8 * limits.workers)).cast("d")
-        self._free = set(range(limits.workers))
+        self._free = set(range(limits.workers))  # slots
         self._workers: dict[int, _Watched] = {}  # by process id
-        self._untold = bytearray()  # what the server has not read yet
-        self._looked = 0.0
+        self._unsent = bytearray()  # messages for which the socket to the server has no room yet
+        self._usage_checked = 0.0
         self._own_megabytes = 0.0
 
     def run(self) -> None:
-        """Serve; returns when the server is gone, with all workers killed."""
+        """Start and watch workers until the server has ended. Then kill all workers, and return."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the server, which ends this process
         signal.signal(signal.SIGCHLD, lambda *_: None)
         wakeup = Wakeup()
@@ -78,12 +82,13 @@ class Spawner:
             self._reap()
 
     def _once(self, wakeup: Wakeup) -> bool:
-        to_tell = [self._control] if self._untold else []
+        """Wait for the next event and handle it. Return False if the server has ended."""
+        to_write = [self._control] if self._unsent else []
         wait = TICK_SECONDS if self._workers else None
-        awaited: list[socket.socket | Wakeup] = [self._control, wakeup]
-        readable, writable, _ = select.select(awaited, to_tell, [], wait)
+        to_read: list[socket.socket | Wakeup] = [self._control, wakeup]
+        readable, writable, _ = select.select(to_read, to_write, [], wait)
         if writable:
-            self._send_untold()
+            self._send_unsent()
         if wakeup in readable:
             wakeup.clear()
         if self._control in readable:
@@ -97,7 +102,7 @@ class Spawner:
 
     def _start(self, start: NewConnection, wakeup: Wakeup) -> None:
         if not self._free:
-            self._reap()  # one may have ended since
+            self._reap()  # a worker may have ended meanwhile
         if not self._free:
             start.connection.close()
             self._tell(start.number, 1013, f"{self._limits.workers} connections use environments already; try later.")
@@ -117,7 +122,7 @@ class Spawner:
         self._workers[pid] = _Watched(start.number, slot, state)
 
     def _become_worker(self, start: NewConnection, state: WorkerState, wakeup: Wakeup) -> None:
-        """In the new process. Does not return."""
+        """Be the worker, in the new process. Does not return."""
         status = 1
         try:
             wakeup.close()
@@ -131,7 +136,7 @@ class Spawner:
             os._exit(status)
 
     def _reap(self) -> None:
-        """Take note of the processes that have ended, and end what they have left."""
+        """Collect the processes that have ended, and kill the processes that they have left."""
         for _ in range(_ROUNDS):
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -151,35 +156,32 @@ class Spawner:
         ended = self._workers.pop(pid, None)
         if ended is None:
             return
-        with contextlib.suppress(OSError):  # children in its group; on Linux the others become ours
+        with contextlib.suppress(OSError):  # its children in its group; on Linux the others become our children
             os.killpg(pid, signal.SIGKILL)
         self._free.add(ended.slot)
-        code, words = ended.verdict or (0, "")
+        code, sentence = ended.verdict or (0, "")
         if ended.verdict is None and status != 0:
-            code, words = _FAILED, f"The environment ended its process ({_how(status)})."
-        self._tell(ended.number, code, words)
+            code, sentence = _FAILED, f"The environment ended its process ({_how(status)})."
+        self._tell(ended.number, code, sentence)
 
     def _strays(self) -> list[int]:
-        """Processes that have lost their worker."""
+        """The processes that have lost their worker: they are children of the spawner now."""
         children = linux.children(os.getpid())
         return [pid for pid in children if pid not in self._workers]
 
     def _watch(self, now: float) -> None:
-        look = now - self._looked >= _LOOK_SECONDS
-        if look:
-            self._looked = now
+        """Interrupt or kill workers that are beyond a limit."""
+        check_usage = now - self._usage_checked >= _USAGE_SECONDS
+        if check_usage:
+            self._usage_checked = now
         limits = self._limits
         for pid, worker in self._workers.items():
             if worker.verdict is not None:
                 continue
             busy = worker.state.busy(now)
             if busy > limits.seconds + _GRACE_SECONDS:
-                self._condemn(
-                    pid,
-                    worker,
-                    _FAILED,
-                    f"The environment took longer than {limits.seconds:g} s; its process was ended.",
-                )
+                sentence = f"The environment took longer than {limits.seconds:g} s; its process was ended."
+                _kill_worker(pid, worker, _FAILED, sentence)
             elif busy > limits.seconds:
                 if not worker.interrupted:
                     worker.interrupted = True
@@ -188,43 +190,41 @@ class Spawner:
             else:
                 worker.interrupted = False
                 if limits.idle_seconds and worker.state.idle(now) > limits.idle_seconds:
-                    self._condemn(pid, worker, _AWAY, f"There was no request for {limits.idle_seconds:g} s.")
-                elif look:
-                    self._look(pid, worker)
+                    sentence = f"There was no request for {limits.idle_seconds:g} s."
+                    _kill_worker(pid, worker, _AWAY, sentence)
+                elif check_usage:
+                    self._check_usage(pid, worker)
 
-    def _look(self, pid: int, worker: _Watched) -> None:
+    def _check_usage(self, pid: int, worker: _Watched) -> None:
+        """Kill a worker whose environments have too many processes, or use too much memory."""
         limits = self._limits
         started = [one for one in linux.descendants(pid) if linux.runs(one)]
         if len(started) > limits.processes:
-            self._condemn(
-                pid,
-                worker,
-                _FAILED,
-                f"The environments started more than {limits.processes} processes; all were ended.",
-            )
+            sentence = f"The environments started more than {limits.processes} processes; all were ended."
+            _kill_worker(pid, worker, _FAILED, sentence)
             return
         used = sum(linux.private_megabytes(one) - self._own_megabytes for one in (pid, *started))
         if used > limits.megabytes:
-            self._condemn(
-                pid, worker, _FAILED, f"The environments used more than {limits.megabytes} MB; their process was ended."
-            )
+            sentence = f"The environments used more than {limits.megabytes} MB; their process was ended."
+            _kill_worker(pid, worker, _FAILED, sentence)
 
-    def _condemn(self, pid: int, worker: _Watched, code: int, words: str) -> None:
-        worker.verdict = (code, words)
-        _kill(pid)
+    def _tell(self, number: int, code: int, sentence: str) -> None:
+        """Tell the server, but do not wait for it: it may be waiting until this process takes a connection."""
+        self._unsent += Ended(number, code, sentence).packed()
+        self._send_unsent()
 
-    def _tell(self, number: int, code: int, words: str) -> None:
-        """Tell the server without waiting for it: it may be waiting for this process to take its next connection."""
-        self._untold += Ended(number, code, words).packed()
-        self._send_untold()
-
-    def _send_untold(self) -> None:
+    def _send_unsent(self) -> None:
         try:
-            del self._untold[: self._control.send(self._untold, socket.MSG_DONTWAIT)]
+            del self._unsent[: self._control.send(self._unsent, socket.MSG_DONTWAIT)]
         except BlockingIOError:
             pass
-        except OSError:  # the server is gone, as its end of the socket says
-            self._untold.clear()
+        except OSError:  # the server has ended; `handover.receive` notices it
+            self._unsent.clear()
+
+
+def _kill_worker(pid: int, worker: _Watched, code: int, sentence: str) -> None:
+    worker.verdict = (code, sentence)
+    _kill(pid)
 
 
 def _kill(pid: int) -> None:
@@ -241,7 +241,7 @@ def _how(status: int) -> str:
 
 
 def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None) -> int:
-    """Be the spawner; the exit status. `modules` are imported first: they register environments."""
+    """Be the spawner. Return the exit status. First import `modules`, which register environments."""
     sys.path.insert(0, os.getcwd())
     try:
         for module in modules:

@@ -1,4 +1,4 @@
-"""A socket that is readable once a signal has come, so that a wait for sockets ends with it."""
+"""A socket that becomes readable at a signal, so that a signal ends a wait for sockets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import socket
 
 
 class Wakeup:
-    """Lets a signal end a wait also if it comes just before, or reaches another thread. For the main thread.
+    """Ends a wait in the main thread at a signal, also if the signal comes just before, or reaches another thread.
 
-    Python runs a signal's handler between two steps of the main thread, and a system call that waits is none. So wait
-    for this object too, as for a socket, and `clear` it once it is readable.
+    Python runs a signal's handler between two bytecode instructions of the main thread, so not while a system call
+    waits. So wait for this object too, as for a socket, and `clear` it once it is readable.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Wakeup:
             self._awake.recv(4096)
 
     def close(self) -> None:
-        """Let signals wake what they woke before."""
+        """Restore the wakeup descriptor of before, and close the sockets."""
         signal.set_wakeup_fd(self._before)
         self._awake.close()
         self._wake.close()

@@ -1,7 +1,7 @@
-"""The process of one connection: it owns the socket, and steps the connection's environments in place.
+"""The process of one connection: it owns the connection's socket, and runs its environments.
 
-No other thread or process takes part in a request: receive, step, send. What limits it stands in `spawner.py`, which
-watches from outside; `WorkerState` is what both know about the moment.
+One thread receives a request, takes the step and sends the answer. The spawner (`spawner.py`) watches this process from
+outside, by the `WorkerState` that they share, and enforces the limits.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from websockets.protocol import Protocol, Side
 from websockets.protocol import State as Connected
 
 from trial.gym import linux
-from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, of, reason
-from trial.gym.forms import MessageForm
+from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, described, reason
+from trial.gym.forms import MessageForm, error_message
 from trial.gym.limits import Limits
 from trial.gym.recordings import ConnectionRecorder
 from trial.gym.session import GymSession
 from trial.wire import websocket_frames as frames
 
-_READ = 256 * 1024
-_SEND_SECONDS = 30  # that a client may leave a reply unread
-_CLOSE_SECONDS = 2  # that a client has to answer a close
+_READ = 256 * 1024  # bytes of one read
+_SEND_SECONDS = 30  # for which a client may leave a reply unread
+_CLOSE_SECONDS = 2  # in which a client must answer a close
 
 
 class WorkerState:
-    """A number that worker and spawner share: since when the worker is busy or, negative, has nothing to do."""
+    """A number that worker and spawner share: the time since which the worker has been busy, or negative, idle."""
 
     def __init__(self, memory: Any, at: int) -> None:
         self._memory = memory
@@ -50,16 +50,16 @@ class WorkerState:
         self._memory[self._at] = time.monotonic()
 
     def rest(self) -> None:
-        """No request is being answered."""
+        """A request has been answered."""
         self._memory[self._at] = -time.monotonic()
 
     def busy(self, now: float) -> float:
-        """For how many seconds the present request has been going on; 0 without one."""
+        """The seconds since the present request began; 0 if there is none."""
         since: float = self._memory[self._at]
         return now - since if since > 0 else 0.0
 
     def idle(self, now: float) -> float:
-        """For how many seconds there has been no request; 0 with one."""
+        """The seconds since the last request was answered; 0 during a request."""
         since: float = self._memory[self._at]
         return now + since if since < 0 else 0.0
 
@@ -92,7 +92,7 @@ class ConnectionWorker:
         self._in_request = False
 
     def run(self, received: bytes) -> None:
-        """Answer requests until the client goes; `received` is what it has sent already."""
+        """Answer requests until the connection ends. `received` are the bytes that the client has sent already."""
         signal.signal(signal.SIGALRM, self._too_slow)
         try:
             self._receive(received)
@@ -104,7 +104,7 @@ class ConnectionWorker:
             if error.errno == errno.EBADF:  # the environment has closed the socket; the server tells the client
                 raise
         finally:
-            self._state.work()  # closing environments has a limit of time, too
+            self._state.work()  # so that the limit of time holds for closing environments, too
             self._session.end()
             with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)
@@ -116,14 +116,14 @@ class ConnectionWorker:
         return data
 
     def _receive(self, data: bytes) -> None:
-        """Take what was read: requests that came as one frame here, every other frame by `websockets`."""
+        """Handle the bytes that were read: here requests of one frame, by `websockets` all other frames."""
         if self._incomplete:
             data = self._incomplete + data
         while data:
             start, length = frames.extent(data)
             end = start + length
             if start and length > self._most:
-                self._other_frames(data)  # refuses it
+                self._other_frames(data)  # `websockets` refuses it
                 raise ConnectionGone
             if not start or len(data) < end:
                 break
@@ -165,9 +165,9 @@ class ConnectionWorker:
             self._protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
             self._flush()
             return
-        except BaseException as error:  # noqa: BLE001 - in what the environment returned; it must not end the process
+        except BaseException as error:  # noqa: BLE001 - raised by a value that the environment returned
             self._in_request = False
-            self._failed(EnvironmentFailed(f"What the environment returned cannot be sent: {of(error)}"))
+            self._failed(EnvironmentFailed(f"What the environment returned cannot be sent: {described(error)}"))
             return
         finally:
             self._state.rest()
@@ -178,7 +178,7 @@ class ConnectionWorker:
             self._protocol.send_close(error.code, reason(error.brief))
             self._flush()
         else:
-            self._send(self._form.error(error))
+            self._send(error_message(error))
 
     def _send(self, reply: str | bytes) -> None:
         if isinstance(reply, str):
@@ -187,7 +187,7 @@ class ConnectionWorker:
             self._socket.sendall(frames.framed(frames.BINARY, reply))
 
     def _flush(self) -> None:
-        """Send what `websockets` has to say. Raises Gone after a close."""
+        """Send the frames that `websockets` has made. Raises ConnectionGone after a close."""
         for part in self._protocol.data_to_send():
             if part:
                 self._socket.sendall(part)
@@ -196,7 +196,7 @@ class ConnectionWorker:
             raise ConnectionGone
 
     def _drain(self) -> None:
-        """Read on for a moment after a close: the system discards what it has sent if there is something unread."""
+        """Read on for a moment after a close: if bytes stay unread, the system discards those that it is sending."""
         self._socket.shutdown(socket.SHUT_WR)
         self._socket.settimeout(_CLOSE_SECONDS)
         until = time.monotonic() + _CLOSE_SECONDS
@@ -204,7 +204,7 @@ class ConnectionWorker:
             self._read()
 
     def _too_slow(self, _: int, __: FrameType | None) -> None:
-        """The spawner's first warning: interrupts Python code; code in C is killed a little later."""
+        """Interrupt Python code, at the spawner's SIGALRM. The spawner kills code in C two seconds later."""
         if self._in_request:
             self._in_request = False
             raise TooSlow(
@@ -222,7 +222,7 @@ def main(
     output: bool,
     record: Path | None,
 ) -> None:
-    """Be the worker of this connection; `record` is a folder. To be called in a new process, which must end then."""
+    """Be the worker of this connection, in a new process, which must end afterwards. `record` is a folder."""
     os.setsid()
     linux.become_subreaper()
     linux.die_with_parent()
