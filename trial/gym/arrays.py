@@ -1,8 +1,8 @@
-"""The messages of the subprotocol `hippodrome.gym.1`: raw arrays behind a small header (docs/gym.md). Pure.
+"""Writes and reads the messages of the subprotocol `hippodrome.gym.1`: a header and raw arrays (docs/gym.md). Pure.
 
-A `ArrayLayout` is made once for each space. Values travel in batches, in Gymnasium's own form of a batch
+An `ArrayLayout` is made once for each space. Values are sent in batches, which have Gymnasium's form
 (`gymnasium.vector.utils.concatenate`): one array for all values of a Box, a dict of batches for a Dict. So a batch of
-64 costs one call of numpy for each part of the space, not one for each value.
+64 values takes one call of numpy for each part of the space, and not one for each value.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ STEP, STEP_MANY, RESET = 1, 2, 3
 """Kinds of messages. A reply has the kind of its request."""
 
 MAX_STEPS = 65_536
-"""Steps in one message."""
+"""The most steps of one message."""
 
-_REQUEST = struct.Struct("<BxHI")  # kind, handle, count of steps
+_REQUEST = struct.Struct("<BxHI")  # kind, handle, number of steps
 _REPLY = struct.Struct("<BxHIII")  # kind, handle, rows, bytes of columns, bytes of infos
 _LENGTH = struct.Struct("<I")
 _DOUBLE = 8  # bytes of a reward
 
 Infos = list[tuple[int, dict[str, Any]]]
-"""The steps that have an info, by their number from 0 on, and the infos. A reset has one, numbered 0."""
+"""Pairs of a step's number, from 0 on, and its info, for the steps that have one. The info of a reset has number 0."""
 
 
 class ArrayRequest(NamedTuple):
-    """A message of the client. `steps` is how many it asks for; 0 for RESET."""
+    """A message of the client. `steps` is the number of steps that it asks for, 0 for RESET."""
 
     kind: int
     handle: int
@@ -45,10 +45,10 @@ class ArrayRequest(NamedTuple):
 
 
 class StepRows(NamedTuple):
-    """What steps led to: a row for each of them; of a vector, one for each environment, those of the first step first.
+    """The results of steps, with a row for each step. A vector has a row for each environment, the first step's first.
 
-    `observations` is a batch, the others have one axis. `infos` has the steps that have an info, by their number; that
-    of a vector's step is as `gymnasium.vector.VectorEnv.step` has it.
+    `observations` is a batch. The other arrays have one axis. An info of a vector is as `VectorEnv.step` of Gymnasium
+    returns it.
     """
 
     observations: Any
@@ -59,10 +59,10 @@ class StepRows(NamedTuple):
 
 
 class ArrayLayout:
-    """How values of one space lie in a message."""
+    """Writes and reads batches of values of one space."""
 
     def empty(self, count: int) -> Any:
-        """A batch of `count` values, to be filled by `put`."""
+        """A new batch of `count` values, which `put` fills."""
         raise NotImplementedError
 
     def put(self, batch: Any, row: int, value: Any) -> None:
@@ -70,7 +70,7 @@ class ArrayLayout:
         raise NotImplementedError
 
     def put_batch(self, batch: Any, row: int, part: Any, count: int) -> None:
-        """Set `count` values of a batch from `row` on to those of another one, such as a vector's observations."""
+        """Set `count` values of a batch, from `row` on, to those of the batch `part`."""
         for at, value in enumerate(self.rows(part, count)):
             self.put(batch, row + at, value)
 
@@ -79,18 +79,18 @@ class ArrayLayout:
         raise NotImplementedError
 
     def unpack(self, data: memoryview, at: int, count: int) -> tuple[Any, int]:
-        """The batch of `count` values that lies in `data` from `at` on, and where it ends. Raises CodecError."""
+        """Read the batch of `count` values that begins at `at`. Return it and its end in `data`. Raises CodecError."""
         raise NotImplementedError
 
     def rows(self, batch: Any, count: int) -> Sequence[Any]:
-        """The `count` values of a batch, one by one."""
+        """The `count` values of a batch as a sequence."""
         raise NotImplementedError
 
 
 def layout(space: Space, *, action: bool = False) -> ArrayLayout:
-    """The layout of `space`. With `action`, `unpack` refuses what `values.decoder` refuses of an action.
+    """The layout of `space`. With `action`, `unpack` refuses the same actions as `values.decoder`.
 
-    Raises CodecError for a space that is none of Gymnasium's own.
+    Raises CodecError for a class of space that Gymnasium does not have.
     """
     if isinstance(space, spaces.Discrete):
         return _Discrete(space, action)
@@ -124,16 +124,16 @@ class _Numbers(ArrayLayout):
 
     def _converted(self, value: Any) -> Any:
         try:
-            found = np.asarray(value)
+            array = np.asarray(value)
         except ValueError:
             raise CodecError(f"Lists of different lengths are not in {self._space}.") from None
-        if found.dtype.kind not in "biuf" or (self._dtype.kind != "f" and found.dtype.kind == "f"):
-            raise CodecError(f"A value of {found.dtype} is not in {self._space}.")
+        if array.dtype.kind not in "biuf" or (self._dtype.kind != "f" and array.dtype.kind == "f"):
+            raise CodecError(f"A value of {array.dtype} is not in {self._space}.")
         if self._dtype.kind == "f":
             with np.errstate(over="ignore"):
-                return found.astype(self._dtype)
-        converted = found.astype(self._dtype)
-        if not np.array_equal(converted, found):
+                return array.astype(self._dtype)
+        converted = array.astype(self._dtype)
+        if not np.array_equal(converted, array):
             raise CodecError(f"A number of the value does not fit into {self._dtype}.")
         return converted
 
@@ -151,7 +151,7 @@ class _Numbers(ArrayLayout):
             raise CodecError("The message is too short for its values.")
         if self._dtype.kind == "b" and max(data[at:end], default=0) > 1:
             raise CodecError("True and false are sent as 1 and 0.")
-        # A copy, since environments and agents may write into what they are given.
+        # A copy, since environments and agents may write into their arguments.
         batch = np.frombuffer(data, self._wire, count * self._elements, at).astype(self._dtype)
         batch = batch.reshape((count, *self._shape))
         if self._action:
@@ -178,7 +178,7 @@ class _Discrete(_Numbers):
 
 
 class _Json(ArrayLayout):
-    """A column of values whose size varies: the length of the text, and the text, a list in JSON as in `values`."""
+    """A column of values whose size varies, as JSON: the length of the text, then the text of a list (`values`)."""
 
     def __init__(self, decode: values.Decode) -> None:
         self._decode = decode
@@ -200,10 +200,10 @@ class _Json(ArrayLayout):
         end = start + _LENGTH.unpack_from(data, at)[0]
         if end > len(data):
             raise CodecError("The message is too short for its values.")
-        said = values.from_text(bytes(data[start:end]))
-        if not isinstance(said, list) or len(said) != count:
+        parsed = values.from_text(bytes(data[start:end]))
+        if not isinstance(parsed, list) or len(parsed) != count:
             raise CodecError(f"A list of {count} values is needed.")
-        return tuple(self._decode(value) for value in said), end
+        return tuple(self._decode(value) for value in parsed), end
 
     def rows(self, batch: Any, count: int) -> Sequence[Any]:
         return list(batch)
@@ -275,7 +275,7 @@ class _Tuple(ArrayLayout):
 
 
 def batch_of(layout: ArrayLayout, rows: Sequence[Any]) -> Any:
-    """`rows`, values of the layout's space, as one batch. Raises CodecError if one does not have its shape or kind."""
+    """The values `rows` as one batch. Raises CodecError if one does not have the space's shape and kind of numbers."""
     batch = layout.empty(len(rows))
     for row, value in enumerate(rows):
         layout.put(batch, row, value)
@@ -283,19 +283,19 @@ def batch_of(layout: ArrayLayout, rows: Sequence[Any]) -> Any:
 
 
 def step_request(kind: int, handle: int, steps: int, actions: ArrayLayout, batch: Any, *, num_envs: int = 1) -> bytes:
-    """STEP or STEP_MANY: steps of an environment, or of each one of a vector, with a batch of actions."""
+    """The request STEP or STEP_MANY, with a batch of actions of an environment or a vector."""
     parts: list[bytes] = [_REQUEST.pack(kind, handle, steps)]
     actions.pack(batch, steps * num_envs, parts)
     return b"".join(parts)
 
 
 def reset_request(handle: int, seed: Any, options: Any) -> bytes:
-    """RESET: `seed` is None, a number, or for a vector a list; `options` a dict or None."""
+    """The request RESET. `seed` is None, a number, or for a vector a list; `options` is a dict or None."""
     return _REQUEST.pack(RESET, handle, 0) + exact.to_text({"seed": seed, "options": options}).encode()
 
 
 def read_request(data: bytes) -> ArrayRequest:
-    """The header of a client's message, and the body unread. Raises CodecError."""
+    """Read the header of a client's message. Raises CodecError."""
     if len(data) < _REQUEST.size:
         raise CodecError("The message is too short for its header.")
     kind, handle, count = _REQUEST.unpack_from(data)
@@ -307,12 +307,12 @@ def read_request(data: bytes) -> ArrayRequest:
 
 
 def read_actions(request: ArrayRequest, actions: ArrayLayout, num_envs: int = 1) -> Any:
-    """The batch of actions of a STEP or STEP_MANY: `steps * num_envs` rows. Raises CodecError."""
+    """Read the batch of actions of a STEP or STEP_MANY, of `steps * num_envs` rows. Raises CodecError."""
     return _whole(actions, request.body, request.steps * num_envs)
 
 
 def refused(request: ArrayRequest, space: Space, num_envs: int = 1) -> Any:
-    """The first action for which `read_actions` refuses a request; the size of its body if that cannot be read."""
+    """The first action for which `read_actions` refuses a request. If it cannot be read, the size of the body."""
     unchecked, checked = layout(space), layout(space, action=True)
     count = request.steps * num_envs
     with contextlib.suppress(CodecError):
@@ -327,11 +327,11 @@ def refused(request: ArrayRequest, space: Space, num_envs: int = 1) -> Any:
 
 
 def read_reset(request: ArrayRequest) -> tuple[Any, dict[str, Any] | None]:
-    """The seed and the options of a RESET. Raises CodecError."""
-    said = exact.from_text(bytes(request.body)) if len(request.body) else {}
-    if not isinstance(said, dict) or not said.keys() <= {"seed", "options"}:
+    """Read the seed and the options of a RESET. Raises CodecError."""
+    parsed = exact.from_text(bytes(request.body)) if len(request.body) else {}
+    if not isinstance(parsed, dict) or not parsed.keys() <= {"seed", "options"}:
         raise CodecError("A reset has a seed and options, and nothing else.")
-    seed, options = said.get("seed"), said.get("options")
+    seed, options = parsed.get("seed"), parsed.get("options")
     if not all(one is None or (type(one) is int and one >= 0) for one in (seed if isinstance(seed, list) else [seed])):
         raise CodecError("A seed is a whole number from 0 on.")
     if options is not None and not isinstance(options, dict):
@@ -357,26 +357,26 @@ def reset_reply(handle: int, observations: ArrayLayout, rows: int, batch: Any, i
 
 def _reply(kind: int, handle: int, rows: int, columns: list[bytes], infos: Infos) -> bytes:
     length = sum(map(len, columns))
-    said = [[step, info] for step, info in infos if info]
-    text = exact.to_text(said).encode() if said else b""
+    pairs = [[step, info] for step, info in infos if info]
+    text = exact.to_text(pairs).encode() if pairs else b""
     return b"".join((_REPLY.pack(kind, handle, rows, length, len(text)), *columns, text))
 
 
 def check_reply(data: bytes, kind: int, handle: int, steps: int, num_envs: int = 1) -> None:
-    """Raise CodecError if `data` does not answer a request of this kind for so many steps.
+    """Raise CodecError if `data` does not answer a request of this kind for `steps` steps.
 
-    STEP_MANY may be answered with fewer steps than were asked for: without autoreset they end with the episode.
+    The answer to STEP_MANY may have fewer steps: without autoreset they end with the episode.
     """
     if len(data) < _REPLY.size:
         raise CodecError("The message is too short for its header.")
-    found, to, rows, *_ = _REPLY.unpack_from(data)
+    reply_kind, reply_handle, rows, *_ = _REPLY.unpack_from(data)
     fits = rows <= steps * num_envs and rows % num_envs == 0 if kind == STEP_MANY else rows == num_envs
-    if (found, to) != (kind, handle) or not fits:
+    if (reply_kind, reply_handle) != (kind, handle) or not fits:
         raise CodecError(f"It has {rows} rows for {steps} steps, or answers something else.")
 
 
 def read_steps(data: bytes, observations: ArrayLayout) -> StepRows:
-    """What `steps_reply` was given. Raises CodecError."""
+    """Read the answer to STEP or STEP_MANY. Raises CodecError."""
     kind, rows, columns, infos = _opened(data)
     if kind not in (STEP, STEP_MANY):
         raise CodecError("The server has answered something else than a step.")
@@ -390,7 +390,7 @@ def read_steps(data: bytes, observations: ArrayLayout) -> StepRows:
 
 
 def read_reset_reply(data: bytes, observations: ArrayLayout) -> tuple[Any, Infos]:
-    """The batch of observations of a RESET, and the infos. Raises CodecError."""
+    """Read the answer to RESET: the batch of observations, and the infos. Raises CodecError."""
     kind, rows, columns, infos = _opened(data)
     if kind != RESET:
         raise CodecError("The server has answered something else than a reset.")
@@ -398,6 +398,7 @@ def read_reset_reply(data: bytes, observations: ArrayLayout) -> tuple[Any, Infos
 
 
 def _opened(data: bytes) -> tuple[int, int, memoryview, Infos]:
+    """The kind of a reply, the number of its rows, its columns and its infos. Raises CodecError."""
     if len(data) < _REPLY.size:
         raise CodecError("The message is too short for its header.")
     kind, _, rows, length, after = _REPLY.unpack_from(data)
@@ -406,10 +407,10 @@ def _opened(data: bytes) -> tuple[int, int, memoryview, Infos]:
     end = _REPLY.size + length
     infos: Infos = []
     if after:
-        said = exact.from_text(bytes(data[end:]))
-        if not isinstance(said, list) or not all(_is_info(one, rows) for one in said):
+        parsed = exact.from_text(bytes(data[end:]))
+        if not isinstance(parsed, list) or not all(_is_info(one, rows) for one in parsed):
             raise CodecError("The infos are no list of steps and objects.")
-        infos = [(step, info) for step, info in said]
+        infos = [(step, info) for step, info in parsed]
     return kind, rows, memoryview(data)[_REPLY.size : end], infos
 
 
@@ -428,6 +429,7 @@ def _flags(columns: memoryview, at: int, rows: int) -> np.ndarray[Any, np.dtype[
 
 
 def _whole(layout: ArrayLayout, data: memoryview, rows: int) -> Any:
+    """The batch of `rows` values of which `data` consists. Raises CodecError if `data` is longer."""
     batch, end = layout.unpack(data, 0, rows)
     if end != len(data):
         raise CodecError("The message is longer than its values.")

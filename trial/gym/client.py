@@ -1,4 +1,4 @@
-"""A connection to a server of environments by the subprotocol `hippodrome.gym.1`: requests and their answers."""
+"""A connection to a server of environments by the subprotocol `hippodrome.gym.1`: sends requests, receives answers."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from trial.gym.arrays import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
 TIMEOUT = 90.0
-"""Seconds for an answer: more than a server allows a request by default, so that its sentence arrives first."""
+"""Seconds for an answer: more than a server by default allows for a request, so that its sentence arrives first."""
 
-_CLOSE_SECONDS = 2.0  # that the server has to answer a close
+_CLOSE_SECONDS = 2.0  # in which the server must answer a close
 _LARGEST_REPLY = 2**30  # bytes
 
 
 class RemoteError(RuntimeError):
-    """The server could not do what it was asked to do. The message is the server's sentence; the connection remains."""
+    """The server could not carry out a request. The text is the server's sentence, and the connection remains."""
 
 
 class ConnectionLost(RemoteError):
-    """There is no connection any more, and its environments are closed. The message says why."""
+    """The connection has ended, and its environments are closed. The text says why."""
 
 
 class GymClient:
-    """One connection. Each request waits for its answer; threads take turns.
+    """One connection. Each request waits for its answer. Only one thread at a time has a request.
 
-    `url` is `ws://` or `wss://`, its path `/gym` if it has none. `timeout` is in seconds, for connecting and for each
-    answer. `ca` is a file of certificates in PEM that are trusted beside the system's. Raises ConnectionLost if there
-    is no server, or none with this subprotocol.
+    `url` begins with `ws://` or `wss://`; without a path it gets `/gym`. `timeout` is in seconds, for connecting and
+    for each answer. `ca` is a file of certificates in PEM that are trusted beside the system's. Raises ConnectionLost
+    if there is no server, or if it does not speak this subprotocol.
     """
 
     def __init__(self, url: str, *, token: str | None = None, ca: str | None = None, timeout: float = TIMEOUT) -> None:
@@ -60,11 +60,11 @@ class GymClient:
                 open_timeout=timeout,
                 close_timeout=_CLOSE_SECONDS,
                 proxy=None if _is_this_machine(address) else True,
-                ping_interval=None,  # an environment may take longer for a step than a ping may for its answer
+                ping_interval=None,  # a step of an environment may take longer than the answer to a ping may
             )
-            self._connection: ClientConnection = opened.__enter__()  # `close` is what leaves it
+            self._connection: ClientConnection = opened.__enter__()  # until `close`
         except (OSError, InvalidHandshake, InvalidURI, TimeoutError, ValueError) as error:
-            # Not from the error: what it holds may show the token.
+            # `from None`, since the error may show the token.
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
         if self._connection.subprotocol != SUBPROTOCOL:
             self._end("it does not speak hippodrome.gym.1")
@@ -72,24 +72,24 @@ class GymClient:
 
     @property
     def closed(self) -> bool:
-        """Whether there is no connection any more."""
+        """Whether the connection has ended."""
         return self._over is not None
 
     def call(self, method: str, **params: Any) -> Any:
-        """The result of a request in JSON. Raises RemoteError, and ConnectionLost."""
+        """Send a request in JSON. Return its result. Raises RemoteError, and ConnectionLost."""
         answer = self._exchange(values.to_text({"method": method, "params": params}))
         return self.read(_result, answer) if isinstance(answer, str) else self._confused()
 
     def send(self, message: bytes) -> bytes:
-        """The binary answer to a binary request. Raises RemoteError, and ConnectionLost."""
+        """Send a binary request. Return its binary answer. Raises RemoteError, and ConnectionLost."""
         answer = self._exchange(message)
         if isinstance(answer, str):
-            self.read(_result, answer)  # an error, which is raised
+            self.read(_result, answer)  # raises the error that a text should be
             self._confused()
         return answer  # type: ignore[return-value]
 
     def read(self, reader: Callable[..., Any], *arguments: Any) -> Any:
-        """What `reader` makes of an answer. Raises ConnectionLost if it cannot be read."""
+        """Call `reader`, which reads an answer. If that raises CodecError, end the connection, raise ConnectionLost."""
         try:
             return reader(*arguments)
         except CodecError as error:
@@ -97,7 +97,7 @@ class GymClient:
             raise ConnectionLost(f"The answer of {self.url} cannot be read: {error}") from error
 
     def close(self) -> None:
-        """Close the connection; the server closes its environments. May be called again."""
+        """Close the connection. The server then closes its environments. May be called again."""
         self._end("it was closed")
 
     def _exchange(self, message: str | bytes) -> str | bytes:
@@ -114,11 +114,12 @@ class GymClient:
             except ConnectionClosed as error:
                 self._end(_reason(error))
             except BaseException:
-                self._end("a request was interrupted")  # its answer would be taken for the next one's
+                self._end("a request was interrupted")  # its answer would be taken for that of the next request
                 raise
             raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 
     def _confused(self) -> None:
+        """End the connection, and raise ConnectionLost: the server's answer does not fit the request."""
         self._end("it answered something else than what it was asked")
         raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 
@@ -129,10 +130,11 @@ class GymClient:
                 if os.getpid() == self._process:
                     self._connection.close()
                 else:
-                    self._connection.socket.close()  # this process's descriptor, and nothing is sent
+                    self._connection.socket.close()  # the descriptor of this forked process; nothing is sent
 
 
 def _address(url: str, token: str | None) -> str:
+    """The address to connect to, with a path and the token."""
     parts = urlsplit(url)
     path = parts.path if parts.path not in ("", "/") else "/gym"
     query = "&".join(part for part in (parts.query, f"token={quote(token, safe='')}" if token else "") if part)
@@ -140,7 +142,7 @@ def _address(url: str, token: str | None) -> str:
 
 
 def _shown(url: str) -> str:
-    """The address for messages: without what may be a secret."""
+    """The address for messages, without its password and query, which may be secrets."""
     parts = urlsplit(url)
     return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
@@ -160,6 +162,7 @@ def _trusting(ca: str) -> ssl.SSLContext:
 
 
 def _reason(error: BaseException) -> str:
+    """Why there is no connection, for the end of a sentence."""
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"the server closed it with code {error.rcvd.code}"
     if isinstance(error, InvalidStatus):
@@ -170,13 +173,14 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return "it took too long"
     if isinstance(error, ConnectionClosed):
-        return "the server is gone"
+        return "the server has ended"
     return str(error).rstrip(".") or type(error).__name__
 
 
 def _result(answer: str) -> Any:
-    said = values.from_text(answer)
-    error = said.get("error") if isinstance(said, dict) else None
+    """The result in an answer. Raises RemoteError if the answer is an error, and CodecError if it is no JSON."""
+    result = values.from_text(answer)
+    error = result.get("error") if isinstance(result, dict) else None
     if isinstance(error, dict):
         raise RemoteError(str(error.get("message")))
-    return said
+    return result

@@ -1,7 +1,7 @@
-"""JSON that brings back what Python had: infos and options between RemoteEnv and the server. Pure.
+"""Writes Python's values as JSON, and reads equal values from it: infos and options of RemoteEnv. Pure.
 
-Plain JSON loses numpy's types, tuples, and keys that are no text. Here each such value is an object with a single key,
-whose name begins with `$`; `docs/gym.md` ("The binary subprotocol") lists them.
+Plain JSON loses numpy's types, tuples, and keys that are no text. Here each such value is an object with one key, which
+begins with `$`. `docs/gym.md` ("The binary subprotocol") lists these objects.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _encoder = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
 def to_text(value: Any) -> str:
-    """`value` as text for `from_text`; an object of another kind becomes the name of its class."""
+    """Write `value` as text for `from_text`. An object of an unknown kind becomes the name of its class."""
     return _encoder.encode(_tagged(value, 0))
 
 
 def from_text(text: str | bytes) -> Any:
-    """What `to_text` was given. Raises CodecError."""
+    """Read the value that `to_text` has written. Raises CodecError."""
     try:
         return _untagged(json.loads(text))
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
@@ -36,6 +36,7 @@ def from_text(text: str | bytes) -> Any:
 
 
 def _tagged(value: Any, depth: int) -> Any:
+    """The value as JSON data."""
     kind = type(value)
     if value is None or kind in (bool, int, str):
         return value
@@ -72,16 +73,17 @@ def _tagged_rare(value: Any, depth: int) -> Any:
     return type(value).__name__
 
 
-def _untagged(said: Any) -> Any:
-    if isinstance(said, list):
-        return [_untagged(part) for part in said]
-    if not isinstance(said, dict):
-        return said
-    if len(said) == 1:
-        ((name, content),) = said.items()
+def _untagged(data: Any) -> Any:
+    """The value of which `_tagged` has made this JSON data."""
+    if isinstance(data, list):
+        return [_untagged(part) for part in data]
+    if not isinstance(data, dict):
+        return data
+    if len(data) == 1:
+        ((name, content),) = data.items()
         if name.startswith("$"):
             return _TAGS[name](content)
-    return {key: _untagged(part) for key, part in said.items()}
+    return {key: _untagged(part) for key, part in data.items()}
 
 
 def _array(content: Any) -> Any:
@@ -89,18 +91,18 @@ def _array(content: Any) -> Any:
     dtype = np.dtype(str(written))
     if dtype.kind not in _KINDS:
         raise CodecError(f"An array of {dtype} is never sent.")
-    found = np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
-    if list(found.shape) != shape:
+    array = np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
+    if list(array.shape) != shape:
         raise CodecError("The shape of an array is a list of whole numbers.")
-    return found
+    return array
 
 
 def _objects(content: Any) -> Any:
     shape, parts = content
-    found = np.empty(len(parts), object)
+    array = np.empty(len(parts), object)
     for at, part in enumerate(parts):
-        found[at] = _untagged(part)
-    return found.reshape(shape)
+        array[at] = _untagged(part)
+    return array.reshape(shape)
 
 
 _TAGS: dict[str, Any] = {

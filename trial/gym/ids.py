@@ -41,9 +41,9 @@ def present(env_id: str) -> tuple[str, dict[str, Any]]:
 
 def _newest(env_id: str, known: list[str]) -> str:
     """The newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
-    asked = _ID.fullmatch(env_id)
-    if asked is None:
+    given = _ID.fullmatch(env_id)
+    if given is None:
         return env_id
-    same = [found for key in known if (found := _ID.fullmatch(key)) and found["name"] == asked["name"]]
-    newest = max(same, key=lambda found: int(found["version"]), default=asked)
-    return newest[0] if int(newest["version"]) > int(asked["version"]) else env_id
+    same = [match for key in known if (match := _ID.fullmatch(key)) and match["name"] == given["name"]]
+    newest = max(same, key=lambda match: int(match["version"]), default=given)
+    return newest[0] if int(newest["version"]) > int(given["version"]) else env_id

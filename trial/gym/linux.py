@@ -41,23 +41,23 @@ def limit_memory(megabytes: int) -> None:
 
 def children(pid: int) -> list[int]:
     """The children of a process (/proc/PID/task/TID/children, proc(5)); empty if the system has no such file."""
-    found: list[int] = []
+    pids: list[int] = []
     with contextlib.suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):
             text = Path(f"/proc/{pid}/task/{thread}/children").read_text(encoding="ascii")
-            found += map(int, text.split())
-    return found
+            pids += map(int, text.split())
+    return pids
 
 
 def descendants(pid: int) -> list[int]:
     """The children of a process, their children, and so on."""
-    found: list[int] = []
+    pids: list[int] = []
     waiting = [pid]
     while waiting:
         below = children(waiting.pop())
-        found += below
+        pids += below
         waiting += below
-    return found
+    return pids
 
 
 def runs(pid: int) -> bool:

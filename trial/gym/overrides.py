@@ -1,4 +1,4 @@
-"""The functions that a program may replace, as in Gymie: `get_env` makes an environment, `process_step` changes a step."""
+"""The functions that a program may replace, as in Gymie: `get_env` makes environments, `process_step` changes steps."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Recordings of environments, in the form and under the keys of a study's (docs/data.md), for `make data`.
+"""Records environments in the form of a study's recordings, and under the same keys, for `make data` (docs/data.md).
 
-The project is called `gym`; each connection is a participant of it, each environment a server, and the environment's id
-the step: `gym/users/{connection}/trials/{environment}/{id}-trial.jsonl.gz`.
+The project's id is `gym`. Each connection stands for a participant, each environment for a server, and the id of the
+environment for the step: `gym/users/{connection}/trials/{environment}/{id}-trial.jsonl.gz`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trial.recordings.recording import Recording
 
 PROJECT = "gym"
 FLUSH_SECONDS = 1.0
-"""Steps that may be lost if a process is killed."""
+"""The seconds between two writes to the disk. The steps of that time are lost if the process is killed."""
 
 
 class ConnectionRecorder:
@@ -34,7 +34,7 @@ class ConnectionRecorder:
         self._user = f"{began}-{uuid.uuid4().hex[:12]}"
 
     def record(self, env: Any, env_id: str, seed: int | None) -> Recorded:
-        """The environment, recorded from now on. Raises EnvironmentFailed if no file can be written."""
+        """Begin a recording. Return the environment as one that is recorded. Raises EnvironmentFailed if it cannot."""
         server = uuid.uuid4().hex
         step = re.sub("[^A-Za-z0-9_-]", "-", env_id)[:64] or "environment"
         key = f"{recordings_folder(PROJECT, self._user)}{server}/{step}-trial.jsonl.gz"
@@ -42,9 +42,9 @@ class ConnectionRecorder:
             file = Recording(self._folder / key, key)
         except OSError as error:
             raise _not_written(error) from error
-        kept = Recorded(env, file, {"v": recording.SCHEMA, "session": server, "trial": server})
+        recorded = Recorded(env, file, {"v": recording.SCHEMA, "session": server, "trial": server})
         count = getattr(env.action_space, "n", None)
-        kept.write(
+        recorded.write(
             "header",
             project=PROJECT,
             user=self._user,
@@ -55,11 +55,11 @@ class ConnectionRecorder:
             seed=seed,
             versions=recording.versions(),
         )
-        return kept
+        return recorded
 
 
 class Recorded:
-    """An environment whose steps are written into a recording. Everything else is the environment's own."""
+    """An environment whose steps are written into a recording. It has all attributes of the environment."""
 
     def __init__(self, env: Any, file: Recording, stamp: dict[str, Any]) -> None:
         self.env = env
@@ -69,18 +69,18 @@ class Recorded:
         self._episode = 0
         self._steps = 0
         self._score = 0.0
-        self._open = False  # an episode has begun and not ended
+        self._open = False  # an episode has begun and has not ended
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
 
     def reset(self, **named: Any) -> Any:
-        """As the environment's own; begins an episode."""
-        found = self.env.reset(**named)
+        """Reset the environment, and record the reset."""
+        result = self.env.reset(**named)
         if self._open:
             self._end("reset")
         self._episode, self._steps, self._score, self._open = self._episode + 1, 0, 0.0, True
-        first, info = found if isinstance(found, tuple) and len(found) == 2 else (found, {})
+        first, info = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
         self.write(
             "reset",
             episode=self._episode,
@@ -88,24 +88,24 @@ class Recorded:
             info=recording.plain(info),
             observation=recording.observation(first),
         )
-        return found
+        return result
 
     def step(self, action: Any) -> Any:
-        """As the environment's own; writes the step, and the end of an episode."""
-        found = self.env.step(action)
-        if not isinstance(found, tuple | list) or len(found) not in (4, 5):
-            return found  # it is refused
-        observation, reward, *ends, info = found
+        """Take a step of the environment. Record the step, and the end of the episode."""
+        results = self.env.step(action)
+        if not isinstance(results, tuple | list) or len(results) not in (4, 5):
+            return results  # `Instance` refuses it
+        observation, reward, *ends, info = results
         terminated, truncated = (ends[0], ends[1]) if len(ends) == 2 else (ends[0], False)
         self._steps += 1
         self._score += float(reward)
-        taken = recording.plain(action)
+        plain_action = recording.plain(action)
         self.write(
             "step",
             episode=self._episode,
             step=self._steps,
-            action=taken,
-            actionName=str(taken),
+            action=plain_action,
+            actionName=str(plain_action),
             by="agent",
             human=None,
             reward=float(reward),
@@ -116,7 +116,7 @@ class Recorded:
         )
         if (terminated or truncated) and self._open:
             self._end("terminated" if terminated else "truncated")
-        return found
+        return results
 
     def close(self) -> None:
         """Close the environment and the recording."""
@@ -130,7 +130,7 @@ class Recorded:
             self.env.close()
 
     def write(self, kind: str, **fields: Any) -> None:
-        """Write a line. Raises EnvironmentFailed."""
+        """Write a line of the recording. Raises EnvironmentFailed if the file cannot be written."""
         now = datetime.now(UTC)
         self._file.add(recording.line(kind, **self._stamp, time=now, ns=time.monotonic_ns(), **fields))
         if time.monotonic() >= self._flushed + FLUSH_SECONDS or kind == "header":

@@ -1,4 +1,4 @@
-"""Environments of a server, as Gymnasium's own: `RemoteEnv` and `RemoteVectorEnv` (docs/gym.md)."""
+"""`RemoteEnv` and `RemoteVectorEnv`: environments that run on a server, with Gymnasium's interface (docs/gym.md)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from trial.gym.spaces import CodecError
 Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
 
 
-class _Made:
-    """An environment on the server: its description and its messages."""
+class _RemoteInstance:
+    """An environment on the server, or a vector, with its description; sends its requests and reads the answers."""
 
     def __init__(self, client: GymClient, env_id: str, **params: Any) -> None:
         self.client = client
@@ -33,20 +33,20 @@ class _Made:
             self.closer()
             raise
 
-    def _read(self, said: Any) -> None:
+    def _read(self, description: Any) -> None:
         try:
-            self.instance_id = str(said["instance_id"])
-            self._handle, self.num_envs = int(said["handle"]), int(said["num_envs"])
+            self.instance_id = str(description["instance_id"])
+            self._handle, self.num_envs = int(description["handle"]), int(description["num_envs"])
             if not 0 <= self._handle <= 0xFFFF or self.num_envs < 0:
                 raise ValueError("a number is out of range")
-            self.observation_space = spaces.build(said["observation_space"])
-            self.action_space = spaces.build(said["action_space"])
+            self.observation_space = spaces.build(description["observation_space"])
+            self.action_space = spaces.build(description["action_space"])
             self._actions = arrays.layout(self.action_space)
             self.observations = arrays.layout(self.observation_space)
-            self.render_mode: str | None = said.get("render_mode")
-            self.metadata = dict(said.get("metadata") or {})
-            self.spec: Mapping[str, Any] = said.get("spec") or {}
-            # A server's window is of no use here; Gymnasium's wrapper HumanRendering shows pictures in one of ours.
+            self.render_mode: str | None = description.get("render_mode")
+            self.metadata = dict(description.get("metadata") or {})
+            self.spec: Mapping[str, Any] = description.get("spec") or {}
+            # The mode human would open a window on the server. Gymnasium's wrapper HumanRendering opens one here.
             modes = self.metadata.get("render_modes") or []
             self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
         except CodecError:
@@ -58,16 +58,16 @@ class _Made:
         size = self.num_envs or 1
         batch = self._batch(actions, steps * size)
         message = arrays.step_request(kind, self._handle, steps, self._actions, batch, num_envs=size)
-        found: arrays.StepRows = self.client.read(self._read_steps, self.client.send(message), kind, steps)
-        return found
+        rows: arrays.StepRows = self.client.read(self._read_steps, self.client.send(message), kind, steps)
+        return rows
 
     def _read_steps(self, reply: bytes, kind: int, steps: int) -> arrays.StepRows:
         size = self.num_envs or 1
         arrays.check_reply(reply, kind, self._handle, steps, size)
-        found = arrays.read_steps(reply, self.observations)
-        if any(step >= len(found.rewards) // size for step, _ in found.infos):
+        rows = arrays.read_steps(reply, self.observations)
+        if any(step >= len(rows.rewards) // size for step, _ in rows.infos):
             raise CodecError("It has an info of a step that was not taken.")
-        return found
+        return rows
 
     def reset(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
         reply = self.client.send(arrays.reset_request(self._handle, seed, options))
@@ -79,14 +79,13 @@ class _Made:
         return arrays.read_reset_reply(reply, self.observations)
 
     def render(self) -> Any:
-        said = self.client.call("render", instance_id=self.instance_id)
-        return self.client.read(values.rendered, said)
+        return self.client.read(values.rendered, self.client.call("render", instance_id=self.instance_id))
 
     def close(self) -> None:
         self.closer()
 
     def _batch(self, actions: Any, rows: int) -> Any:
-        """A batch of the layout, of a list of actions or of one array of them."""
+        """The actions, a list or an array of them, as a batch of the layout. Raises CodecError."""
         if len(actions) != rows:
             raise CodecError(f"{rows} actions are needed, not {len(actions)}.")
         space = self.action_space
@@ -97,7 +96,7 @@ class _Made:
 
 @dataclass(frozen=True)
 class _Maker:
-    """What `spec.make` calls: it makes a RemoteEnv on a connection of its own."""
+    """The entry point of a RemoteEnv's spec: makes another RemoteEnv, with a connection of its own."""
 
     url: str
     env_id: str
@@ -109,19 +108,19 @@ class _Maker:
 
 
 class RemoteEnv(gymnasium.Env[Any, Any]):
-    """An environment that a server plays: `RemoteEnv("ws://127.0.0.1:5000/", "CartPole-v1")`.
+    """An environment that runs on a server: `RemoteEnv("ws://127.0.0.1:5000/", "CartPole-v1")`.
 
     It has a connection of its own, which ends with `close`, with a `with` block, or when the object is no longer used.
-    `render_mode` and `options` are what `gymnasium.make` takes; `token` goes into the address (`?token=`), for a
-    trial's server, or a proxy that asks for one; `timeout` is in seconds, for connecting and for each answer; `ca` is
-    a file of certificates to trust (PEM), for `wss://`.
-    `np_random` is the client's own: the environment draws its random numbers on the server, by the seed of `reset`.
+    `render_mode` and `options` are those of `gymnasium.make`. `token` is put into the address (`?token=`), for a
+    trial's server, or for a proxy that asks for one. `timeout` is in seconds, for connecting and for each answer. `ca`
+    is a file of certificates to trust (PEM), for `wss://`. `np_random` is a generator of the client: the environment
+    draws its random numbers on the server, by the seed of `reset`.
 
-    Raises `RemoteError` with the server's sentence, and `ConnectionLost`, which is one, when the connection has ended:
-    the environment is gone then, and a new RemoteEnv makes a new one.
+    Its methods raise RemoteError with the server's sentence. They raise ConnectionLost, a RemoteError, if the
+    connection has ended: then the environment is closed, and a new RemoteEnv makes a new one.
     """
 
-    # Of any environment; an instance has those of its own. `gymnasium.make` reads the class's.
+    # Those of any environment, for `gymnasium.make`, which reads the class's. An instance has its own.
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"]}  # noqa: RUF012
 
     def __init__(
@@ -138,62 +137,63 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
         _refuse_window(render_mode)
         connection = {"token": token, "ca": ca, "timeout": timeout}
         given = options if render_mode is None else options | {"render_mode": render_mode}
-        made = _Made(GymClient(url, token=token, ca=ca, timeout=timeout), env_id, **given)
-        self._made = made
-        self.observation_space = made.observation_space
-        self.action_space = made.action_space
-        self.metadata = made.metadata
-        self.render_mode = made.render_mode
+        remote = _RemoteInstance(GymClient(url, token=token, ca=ca, timeout=timeout), env_id, **given)
+        self._remote = remote
+        self.observation_space = remote.observation_space
+        self.action_space = remote.action_space
+        self.metadata = remote.metadata
+        self.render_mode = remote.render_mode
         self.spec = EnvSpec(
             env_id,
-            entry_point=_Maker(url, env_id, made.metadata, connection),
-            reward_threshold=made.spec.get("reward_threshold"),
-            nondeterministic=bool(made.spec.get("nondeterministic", False)),
-            max_episode_steps=made.spec.get("max_episode_steps"),
+            entry_point=_Maker(url, env_id, remote.metadata, connection),
+            reward_threshold=remote.spec.get("reward_threshold"),
+            nondeterministic=bool(remote.spec.get("nondeterministic", False)),
+            max_episode_steps=remote.spec.get("max_episode_steps"),
             kwargs=given,
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: the first observation and its info."""
+        """Begin an episode. Return its first observation and info."""
         super().reset(seed=seed)
-        batch, info = self._made.reset(seed if seed is None else int(seed), options)
-        return self._made.observations.rows(batch, 1)[0], info
+        batch, info = self._remote.reset(seed if seed is None else int(seed), options)
+        return self._remote.observations.rows(batch, 1)[0], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one step. Raises CodecError if `action` does not have the shape and kind of the action space."""
-        made = self._made
-        found = made.steps(arrays.STEP, 1, [action])
-        observation = made.observations.rows(found.observations, 1)[0]
-        info = found.infos[0][1] if found.infos else {}
-        return observation, float(found.rewards[0]), bool(found.terminated[0]), bool(found.truncated[0]), info
+        remote = self._remote
+        rows = remote.steps(arrays.STEP, 1, [action])
+        observation = remote.observations.rows(rows.observations, 1)[0]
+        info = rows.infos[0][1] if rows.infos else {}
+        return observation, float(rows.rewards[0]), bool(rows.terminated[0]), bool(rows.truncated[0]), info
 
     def step_many(self, actions: Any) -> Columns:
-        """Take a step for each action, with one message: observations, rewards, terminated, truncated and infos.
+        """Take a step for each action, with one message. Return observations, rewards, terminated, truncated, infos.
 
-        `actions` is a list of actions, or an array of them. The observations come as one batch, in the form of
-        Gymnasium's vector environments; infos as a list. After an episode the next one begins, as Gymnasium's vector
-        environments do it: by default (`autoreset_mode="NextStep"`) the step after the end does not use its action; it
-        resets the environment, and its reward is 0. With `"SameStep"`, the last step of an episode has the next one's
-        first observation, and `final_obs` and `final_info` in its info; with `"Disabled"`, no further step is taken, so
+        `actions` is a list of actions, or an array of them. The observations are one batch, in the form of Gymnasium's
+        vector environments, and the infos a list. After an episode the next one begins, as in Gymnasium's vector
+        environments. By default (`autoreset_mode="NextStep"`) the step after the end does not use its action: it resets
+        the environment, and its reward is 0. With `"SameStep"`, the last step of an episode has the next episode's
+        first observation, and `final_obs` and `final_info` in its info. With `"Disabled"`, no further step is taken, so
         there are fewer results than actions. `autoreset_mode` is an option of the constructor.
         """
-        found = self._made.steps(arrays.STEP_MANY, len(actions), actions)
-        return *found[:4], _infos(found.infos, len(found.rewards))
+        rows = self._remote.steps(arrays.STEP_MANY, len(actions), actions)
+        return *rows[:4], _infos(rows.infos, len(rows.rewards))
 
     def render(self) -> Any:
-        """What the environment's `render` returns; pictures exactly."""
-        return self._made.render()
+        """Return what the environment's `render` returns. Pictures come without loss."""
+        return self._remote.render()
 
     def close(self) -> None:
         """Close the environment and the connection. May be called again."""
-        if hasattr(self, "_made"):
-            self._made.close()
+        if hasattr(self, "_remote"):
+            self._remote.close()
 
 
 class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
-    """Several environments of a kind that a server plays together: what `SyncVectorEnv` is, over a connection.
+    """A vector of equal environments that run on a server: a `SyncVectorEnv` over a connection.
 
-    `RemoteVectorEnv("ws://127.0.0.1:5000/", "CartPole-v1", num_envs=8)`; the other parameters are those of `RemoteEnv`.
+    `RemoteVectorEnv("ws://127.0.0.1:5000/", "CartPole-v1", num_envs=8)` makes one. `autoreset_mode` is as in
+    `RemoteEnv.step_many`. The other parameters are those of `RemoteEnv`.
     """
 
     def __init__(
@@ -214,44 +214,43 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
         mode = AutoresetMode(autoreset_mode)
         given = options if render_mode is None else options | {"render_mode": render_mode}
         client = GymClient(url, token=token, ca=ca, timeout=timeout)
-        made = _Made(client, env_id, num_envs=num_envs, autoreset_mode=mode.value, **given)
-        self._made = made
-        self.num_envs = made.num_envs
-        self.metadata = made.metadata | {"autoreset_mode": mode}
-        self.render_mode = made.render_mode
-        self.single_observation_space = made.observation_space
-        self.single_action_space = made.action_space
-        self.observation_space = batch_space(made.observation_space, self.num_envs)
-        self.action_space = batch_space(made.action_space, self.num_envs)
+        remote = _RemoteInstance(client, env_id, num_envs=num_envs, autoreset_mode=mode.value, **given)
+        self._remote = remote
+        self.num_envs = remote.num_envs
+        self.metadata = remote.metadata | {"autoreset_mode": mode}
+        self.render_mode = remote.render_mode
+        self.single_observation_space = remote.observation_space
+        self.single_action_space = remote.action_space
+        self.observation_space = batch_space(remote.observation_space, self.num_envs)
+        self.action_space = batch_space(remote.action_space, self.num_envs)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in each environment, or in those of `options["reset_mask"]`, as `SyncVectorEnv` does."""
         seeds = [None if one is None else int(one) for one in seed] if isinstance(seed, list | tuple) else seed
-        return self._made.reset(seeds if seeds is None or isinstance(seeds, list) else int(seeds), options)
+        return self._remote.reset(seeds if seeds is None or isinstance(seeds, list) else int(seeds), options)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """A step of each environment."""
-        found = self._made.steps(arrays.STEP, 1, self._rows(actions))
-        return *found[:4], found.infos[0][1] if found.infos else {}
+        """Take a step of each environment. Return observations, rewards, terminated, truncated and the info."""
+        results = self._remote.steps(arrays.STEP, 1, self._rows(actions))
+        return *results[:4], results.infos[0][1] if results.infos else {}
 
     def step_many(self, actions: Any) -> Columns:
-        """A step of each environment for each element of `actions`, with one message.
+        """Take a step of each environment for each element of `actions`, with one message.
 
-        Observations, rewards, terminated and truncated have one axis more than those of `step`, the steps; infos is a
-        list of what `step` has.
+        Return observations, rewards, terminated and truncated with the steps as the first axis, and a list of infos.
         """
         rows = [row for one in actions for row in self._rows(one)]
-        found = self._made.steps(arrays.STEP_MANY, len(actions), rows)
-        taken = len(found.rewards) // self.num_envs
-        rewards, terminated, truncated = (column.reshape(taken, self.num_envs) for column in found[1:4])
-        observations = _by_step(self.single_observation_space, found.observations, taken, self.num_envs)
-        return observations, rewards, terminated, truncated, _infos(found.infos, taken)
+        results = self._remote.steps(arrays.STEP_MANY, len(actions), rows)
+        taken = len(results.rewards) // self.num_envs
+        rewards, terminated, truncated = (column.reshape(taken, self.num_envs) for column in results[1:4])
+        observations = _by_step(self.single_observation_space, results.observations, taken, self.num_envs)
+        return observations, rewards, terminated, truncated, _infos(results.infos, taken)
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture of each environment."""
-        pictures = self._made.render()
+        """Return a picture of each environment."""
+        pictures = self._remote.render()
         return None if pictures is None else tuple(pictures)
 
     def __enter__(self) -> Self:
@@ -262,8 +261,8 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **_: Any) -> None:
         """Close the environments and the connection."""
-        if hasattr(self, "_made"):
-            self._made.close()
+        if hasattr(self, "_remote"):
+            self._remote.close()
 
     def _rows(self, actions: Any) -> Any:
         space = self.action_space
@@ -272,15 +271,16 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
         return list(iterate(space, actions))
 
 
-def _infos(found: arrays.Infos, steps: int) -> list[dict[str, Any]]:
+def _infos(pairs: arrays.Infos, steps: int) -> list[dict[str, Any]]:
+    """The infos of all steps; {} for the steps without one."""
     infos: list[dict[str, Any]] = [{} for _ in range(steps)]
-    for at, info in found:
-        infos[at] = info
+    for step, info in pairs:
+        infos[step] = info
     return infos
 
 
 def _by_step(space: Any, batch: Any, steps: int, num_envs: int) -> Any:
-    """A batch of the rows of several steps, with one axis for the steps and one for the environments."""
+    """A batch of the rows of several steps, with a first axis for the steps and a second for the environments."""
     if isinstance(space, Dict):
         return {key: _by_step(part, batch[key], steps, num_envs) for key, part in space.spaces.items()}
     if isinstance(space, Tuple):

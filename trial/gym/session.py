@@ -49,7 +49,7 @@ class HeldEnvironment:
         self.decode = guarded(values.decoder, instance.env.action_space, action=True)
         """Reads an action from JSON data. Raises CodecError."""
         self.bytes = _bytes(instance.single_observation_space) * instance.size
-        """The bytes of the observations of one step; 0 if their size varies."""
+        """The bytes of the observations of one step, without parts whose size varies."""
         self._layouts: tuple[ArrayLayout, ArrayLayout] | None = None
 
     @property
@@ -422,7 +422,7 @@ def _truth(flag: Any) -> Any:
 
 
 def _bytes(space: Any) -> int:
-    """The bytes of one observation; 0 for a space whose values differ in size."""
+    """The bytes of one observation, without parts whose size varies."""
     shape, dtype = getattr(space, "shape", None), getattr(space, "dtype", None)
     if shape is None or dtype is None:
         inner = getattr(space, "spaces", None)

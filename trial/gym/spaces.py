@@ -1,8 +1,9 @@
-"""Spaces of Gymnasium as JSON: the form of Gymie 0.5.4, with further fields from which an equal space is built. Pure.
+"""Describes Gymnasium's spaces in JSON data, and builds equal spaces from it. Pure.
 
-Gymie's server sends `{"name": "Discrete", "n": 4}`, `{"name": "Box", "shape": [2], "low": [-1.0, -1.0], "high": [1.0,
-1.0]}` and `{"name": "MultiBinary", "n": 5, "shape": [5]}` (gymie/api.py, `space_info`), and of every other space its
-name alone. "Discreate" stands only in its documentation.
+The descriptions have the fields of Gymie 0.5.4, and further ones. Gymie's server sends `{"name": "Discrete", "n": 4}`,
+`{"name": "Box", "shape": [2], "low": [-1.0, -1.0], "high": [1.0, 1.0]}` and `{"name": "MultiBinary", "n": 5, "shape":
+[5]}` (gymie/api.py, `space_info`), and the name alone of every other space. Its documentation has "Discreate", but its
+server does not.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from gymnasium import spaces
 Space = spaces.Space[Any]
 
 MAX_ELEMENTS = 2**27
-"""Numbers in one Box, MultiBinary or MultiDiscrete that is built from a description."""
+"""The most numbers of one Box, MultiBinary or MultiDiscrete that is built from a description."""
 
 
 class CodecError(ValueError):
-    """A space or a value that cannot be sent, or a message that does not hold one. The message is a sentence."""
+    """A space or a value cannot be sent, or cannot be read from a message. The exception's text is a sentence."""
 
 
 def describe(space: Space, *, compact: bool = False) -> dict[str, Any]:
-    """The description of `space`: a dict of what JSON can carry, and of infinities (`values.to_text` writes them).
+    """Describe `space` as JSON data, which may contain infinities (`values.to_text` writes them).
 
-    With `compact`, a Box whose bounds are the same everywhere has two numbers as `low` and `high`; Gymie's clients
-    expect lists. Raises CodecError for a space that is none of Gymnasium's own, and for a Dict with keys that are no
-    text.
+    With `compact`, `low` of a Box is one number if it is the same everywhere, and so is `high`. Without, they are
+    lists, as Gymie's clients expect. Raises CodecError for a class of space that Gymnasium does not have, and for a
+    Dict with keys that are no text.
     """
     for kind, form in _FORMS.items():
         if isinstance(space, kind):
@@ -38,9 +39,10 @@ def describe(space: Space, *, compact: bool = False) -> dict[str, Any]:
 
 
 def build(description: Any) -> Space:
-    """A space equal to the one that `describe` was given. Raises CodecError if `description` is none.
+    """Build a space from its description. It equals the space that was described.
 
-    Takes Gymie's own descriptions too; what they do not say has Gymnasium's default.
+    Takes Gymie's own descriptions too. A field that they do not have gets Gymnasium's default. Raises CodecError if the
+    description is wrong.
     """
     if not isinstance(description, Mapping):
         raise CodecError("The description of a space must be an object.")
@@ -62,16 +64,16 @@ def _dtype_name(dtype: np.dtype[Any]) -> str:
 
 
 def _box(space: spaces.Box[Any], compact: bool) -> dict[str, Any]:
-    said: dict[str, Any] = {"shape": list(space.shape), "dtype": _dtype_name(space.dtype)}
+    fields: dict[str, Any] = {"shape": list(space.shape), "dtype": _dtype_name(space.dtype)}
     for name, bound in (("low", space.low), ("high", space.high)):
         numbers = bound.astype(np.uint8) if space.dtype.kind == "b" else bound
         same = compact and numbers.size > 0 and bool((numbers == numbers.flat[0]).all())
-        said[name] = numbers.flat[0].item() if same else numbers.tolist()
-    if space.dtype.kind == "i":  # an integer has no infinity, but sampling asks whether a bound was one
+        fields[name] = numbers.flat[0].item() if same else numbers.tolist()
+    if space.dtype.kind == "i":  # integers have no infinity, but `sample` needs to know which bounds were infinite
         for name, bounded in (("unboundedBelow", space.bounded_below), ("unboundedAbove", space.bounded_above)):
             if not bounded.all():
-                said[name] = (~bounded).tolist()
-    return said
+                fields[name] = (~bounded).tolist()
+    return fields
 
 
 def _discrete(space: spaces.Discrete[Any], _: bool) -> dict[str, Any]:
@@ -99,8 +101,8 @@ def _text(space: spaces.Text, _: bool) -> dict[str, Any]:
 def _dict(space: spaces.Dict, compact: bool) -> dict[str, Any]:
     if not all(isinstance(key, str) for key in space.spaces):
         raise CodecError("A Dict space whose keys are not all text cannot be sent.")
-    said: dict[str, Any] = {"spaces": {key: describe(part, compact=compact) for key, part in space.spaces.items()}}
-    return said if space.sort_keys else said | {"sort_keys": False}
+    fields: dict[str, Any] = {"spaces": {key: describe(part, compact=compact) for key, part in space.spaces.items()}}
+    return fields if space.sort_keys else fields | {"sort_keys": False}
 
 
 def _parts(space: Any, compact: bool) -> dict[str, Any]:
@@ -130,61 +132,63 @@ _FORMS: dict[type[Any], Callable[[Any, bool], dict[str, Any]]] = {
 }
 
 
-def _built_box(said: Mapping[str, Any]) -> Space:
-    shape = _shape(said["shape"])
-    dtype = _dtype(said, "float32")
-    low, high = (_bound(said[name], shape, dtype) for name in ("low", "high"))
+def _built_box(description: Mapping[str, Any]) -> Space:
+    shape = _shape(description["shape"])
+    dtype = _dtype(description, "float32")
+    low, high = (_bound(description[name], shape, dtype) for name in ("low", "high"))
     box: spaces.Box[Any] = spaces.Box(low, high, shape, dtype=dtype)
     for name in ("Below", "Above"):
-        if f"unbounded{name}" in said:
-            unbounded = np.asarray(said[f"unbounded{name}"], bool).reshape(shape)
+        if f"unbounded{name}" in description:
+            unbounded = np.asarray(description[f"unbounded{name}"], bool).reshape(shape)
             setattr(box, f"bounded_{name.lower()}", ~unbounded)
     return box
 
 
-def _bound(said: Any, shape: tuple[int, ...], dtype: Any) -> Any:
-    numbers = np.asarray(said, None if dtype.kind == "f" else dtype)
+def _bound(bound: Any, shape: tuple[int, ...], dtype: Any) -> Any:
+    numbers = np.asarray(bound, None if dtype.kind == "f" else dtype)
     if numbers.ndim == 0:
         return np.full(shape, numbers, dtype)
     return numbers.astype(dtype).reshape(shape)
 
 
-def _built_discrete(said: Mapping[str, Any]) -> Space:
-    return spaces.Discrete(_whole(said["n"]), start=_whole(said.get("start", 0)), dtype=_dtype(said, "int64"))
+def _built_discrete(description: Mapping[str, Any]) -> Space:
+    return spaces.Discrete(
+        _whole(description["n"]), start=_whole(description.get("start", 0)), dtype=_dtype(description, "int64")
+    )
 
 
-def _built_multi_binary(said: Mapping[str, Any]) -> Space:
-    n = said["n"]
+def _built_multi_binary(description: Mapping[str, Any]) -> Space:
+    n = description["n"]
     shape = _shape(n if isinstance(n, list) else [n])
     return spaces.MultiBinary(shape if isinstance(n, list) else shape[0])
 
 
-def _built_multi_discrete(said: Mapping[str, Any]) -> Space:
-    dtype = _dtype(said, "int64")
-    nvec = np.asarray(said["nvec"], dtype)
-    shape = _shape(said["shape"]) if "shape" in said else nvec.shape
-    start = np.asarray(said["start"], dtype).reshape(shape) if "start" in said else None
+def _built_multi_discrete(description: Mapping[str, Any]) -> Space:
+    dtype = _dtype(description, "int64")
+    nvec = np.asarray(description["nvec"], dtype)
+    shape = _shape(description["shape"]) if "shape" in description else nvec.shape
+    start = np.asarray(description["start"], dtype).reshape(shape) if "start" in description else None
     return spaces.MultiDiscrete(nvec.reshape(shape), dtype=dtype, start=start)
 
 
-def _built_text(said: Mapping[str, Any]) -> Space:
-    alphabet: dict[str, Any] = {"charset": str(said["charset"])} if "charset" in said else {}
-    shortest, longest = _whole(said.get("min_length", 1)), _whole(said["max_length"])
+def _built_text(description: Mapping[str, Any]) -> Space:
+    alphabet: dict[str, Any] = {"charset": str(description["charset"])} if "charset" in description else {}
+    shortest, longest = _whole(description.get("min_length", 1)), _whole(description["max_length"])
     return spaces.Text(longest, min_length=shortest, **alphabet)
 
 
-def _built_dict(said: Mapping[str, Any]) -> Space:
-    parts = [(str(key), build(part)) for key, part in said["spaces"].items()]
-    return spaces.Dict(parts, sort_keys=said.get("sort_keys") is not False)
+def _built_dict(description: Mapping[str, Any]) -> Space:
+    parts = [(str(key), build(part)) for key, part in description["spaces"].items()]
+    return spaces.Dict(parts, sort_keys=description.get("sort_keys") is not False)
 
 
-def _built_sequence(said: Mapping[str, Any]) -> Space:
-    return spaces.Sequence(build(said["space"]), stack=said.get("stack") is True)
+def _built_sequence(description: Mapping[str, Any]) -> Space:
+    return spaces.Sequence(build(description["space"]), stack=description.get("stack") is True)
 
 
-def _built_graph(said: Mapping[str, Any]) -> Space:
-    edges = said.get("edge_space")
-    return spaces.Graph(build(said["node_space"]), None if edges is None else build(edges))
+def _built_graph(description: Mapping[str, Any]) -> Space:
+    edges = description.get("edge_space")
+    return spaces.Graph(build(description["node_space"]), None if edges is None else build(edges))
 
 
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], Space]] = {
@@ -194,28 +198,28 @@ _BUILDERS: dict[str, Callable[[Mapping[str, Any]], Space]] = {
     "MultiDiscrete": _built_multi_discrete,
     "Text": _built_text,
     "Dict": _built_dict,
-    "Tuple": lambda said: spaces.Tuple(build(part) for part in said["spaces"]),
+    "Tuple": lambda description: spaces.Tuple(build(part) for part in description["spaces"]),
     "Sequence": _built_sequence,
     "Graph": _built_graph,
-    "OneOf": lambda said: spaces.OneOf([build(part) for part in said["spaces"]]),
+    "OneOf": lambda description: spaces.OneOf([build(part) for part in description["spaces"]]),
 }
 
 
-def _dtype(said: Mapping[str, Any], default: str) -> np.dtype[Any]:
-    dtype = np.dtype(str(said.get("dtype", default)))
+def _dtype(description: Mapping[str, Any], default: str) -> np.dtype[Any]:
+    dtype = np.dtype(str(description.get("dtype", default)))
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
         raise CodecError(f"A space of {dtype} cannot be built.")
     return dtype
 
 
-def _shape(said: Any) -> tuple[int, ...]:
-    shape = tuple(_whole(side) for side in said)
+def _shape(sides: Any) -> tuple[int, ...]:
+    shape = tuple(_whole(side) for side in sides)
     if min(shape, default=0) < 0 or len(shape) > 32 or math.prod(max(1, side) for side in shape) > MAX_ELEMENTS:
         raise CodecError(f"A space has at most 32 axes and {MAX_ELEMENTS} numbers.")
     return shape
 
 
-def _whole(said: Any) -> int:
-    if not isinstance(said, int) or isinstance(said, bool):
-        raise CodecError(f"{str(said)[:40]!r} stands where the description of a space needs a whole number.")
-    return said
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise CodecError(f"{str(value)[:40]!r} stands where the description of a space needs a whole number.")
+    return value

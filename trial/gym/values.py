@@ -1,8 +1,8 @@
-"""Values of spaces as JSON, as Gymie sends them: arrays as lists, a Dict as an object, a Tuple as a list. Pure.
+"""Writes and reads values of spaces in Gymie's JSON: arrays as lists, a Dict as an object, a Tuple as a list. Pure.
 
-JSON has no word for infinity; Gymie's server sends `Infinity`, at which its client's JSON.parse fails. Here an infinity
-is `1e999`: JSON by its grammar, and infinite in every reader of IEEE numbers, JavaScript's and Python's among them. NaN
-is `null`, as JSON.stringify has it.
+JSON has no infinity. Gymie's server sends `Infinity`, at which its client's JSON.parse fails. Here an infinity is
+written as `1e999`: JSON's grammar allows that, and each reader with IEEE numbers, such as JavaScript's and Python's,
+reads it as infinity. NaN is written as `null`, as JSON.stringify does it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from gymnasium import spaces
 from trial.gym.spaces import CodecError, Space
 
 Decode = Callable[[Any], Any]
+"""Reads a value of a space from JSON data. Raises CodecError."""
 
 MAX_DEPTH = 100
-"""Levels of lists and objects in a value that is sent."""
+"""The most levels of lists and objects in a value that is sent."""
 
-_MOST_LISTS = 3  # of pictures in lists; a vector's are a list, and each may be one
+_MOST_LISTS = 3  # levels of lists around pictures: a vector returns a list, and each of its elements may be a list
 
 _SPECIAL = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 
 
 def to_text(value: Any) -> str:
-    """`value` as JSON, numpy's types included; an object that JSON has no form for becomes the name of its class."""
+    """Write `value` as JSON, numpy's types too. An object for which JSON has no form becomes the name of its class."""
     try:
         return _strict.encode(value)
     except (TypeError, ValueError, RecursionError):  # infinities, keys that are no text, an object within itself
@@ -40,7 +41,7 @@ def to_text(value: Any) -> str:
 
 
 def from_text(text: str | bytes) -> Any:
-    """What `json.loads` makes of `text`. Raises CodecError if it is not JSON, or nested too deep."""
+    """Read JSON data from `text`. Raises CodecError if it is not JSON, or nested too deep."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -48,7 +49,7 @@ def from_text(text: str | bytes) -> Any:
 
 
 def plain(value: Any, depth: int = 0) -> Any:
-    """`value` of lists, dicts with text as keys, and what JSON has; deeper than MAX_DEPTH, the name of the class."""
+    """`value` as lists, dicts with texts as keys, and JSON's other types; below MAX_DEPTH, the name of its class."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if depth > MAX_DEPTH:
@@ -65,7 +66,7 @@ def _key(key: Any) -> str:
     if isinstance(key, str):
         return key
     if key is None or isinstance(key, bool):
-        return json.dumps(key)  # as the quick way writes it
+        return json.dumps(key)  # as JSONEncoder writes it
     try:
         return str(key)
     except Exception:  # noqa: BLE001 - the key is the researcher's
@@ -80,19 +81,19 @@ def _simple(value: Any) -> Any:
     return type(value).__name__
 
 
-def _written(found: re.Match[str]) -> str:
-    return {"Infinity": "1e999", "-Infinity": "-1e999", "NaN": "null"}.get(found[0], found[0])
+def _written(match: re.Match[str]) -> str:
+    return {"Infinity": "1e999", "-Infinity": "-1e999", "NaN": "null"}.get(match[0], match[0])
 
 
 _strict = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_simple)
 
 
 def decoder(space: Space, *, action: bool = False) -> Decode:
-    """A function that reads a value of `space` from what `json.loads` gave; the function raises CodecError.
+    """Make a function that reads a value of `space` from JSON data. Raises CodecError if it knows no such space.
 
-    Shape, type and the range of the dtype are checked. For an `action`, the value must also be one of the space; only
-    the finite numbers of a Box of floats may lie beyond its bounds, since many environments clip them, and policies
-    rely on that. An observation is what the environment says, within its space or not.
+    The function checks the value's shape and type, and the range of the dtype, and raises CodecError. An `action` must
+    also lie in the space; but the finite numbers of a Box of floats may lie beyond its bounds, since many environments
+    clip them, and policies rely on that. An observation may lie outside of its space.
     """
     for kind, make in _DECODERS.items():
         if isinstance(space, kind):
@@ -101,7 +102,7 @@ def decoder(space: Space, *, action: bool = False) -> Decode:
 
 
 def check_action(space: Any, numbers: np.ndarray[Any, Any]) -> None:
-    """Raise CodecError if `numbers`, one action of a space of numbers or a batch of them, are none of it."""
+    """Raise CodecError if `numbers`, an action or a batch of actions, do not lie in a space of numbers."""
     low: Any
     high: Any
     if isinstance(space, spaces.Box):
@@ -122,31 +123,31 @@ def check_action(space: Any, numbers: np.ndarray[Any, Any]) -> None:
 
 
 def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
-    """Reads arrays of `space`'s shape; with `batch`, lists of them of any length as one array."""
+    """Make a function that reads an array of `space`'s shape; with `batch`, a list of such arrays as one array."""
     dtype, shape = space.dtype, space.shape
     axes = len(shape) + batch
     if dtype.kind in "iu":
         least, most = (int(limit) for limit in (np.iinfo(dtype).min, np.iinfo(dtype).max))
 
-    def decode(said: Any) -> Any:
-        found = _array(said, dtype.kind == "f")
-        if found.size == 0:
-            found = _without_numbers(found, shape, batch)
-        if found.shape[batch:] != shape or found.ndim != axes:
-            raise CodecError(f"Numbers of shape {_shape(shape, batch)} are needed, not of {found.shape}.")
+    def decode(data: Any) -> Any:
+        array = _array(data, dtype.kind == "f")
+        if array.size == 0:
+            array = _without_numbers(array, shape, batch)
+        if array.shape[batch:] != shape or array.ndim != axes:
+            raise CodecError(f"Numbers of shape {_shape(shape, batch)} are needed, not of {array.shape}.")
         if dtype.kind == "f":
             with np.errstate(over="ignore"):
-                numbers = found.astype(dtype)
+                numbers = array.astype(dtype)
         elif dtype.kind == "b":
-            if not ((found == 0) | (found == 1)).all():
+            if not ((array == 0) | (array == 1)).all():
                 raise CodecError("True and false, or 1 and 0, are needed.")
-            numbers = found.astype(dtype)
+            numbers = array.astype(dtype)
         else:
-            if found.size and found.dtype.kind not in "iu":
+            if array.size and array.dtype.kind not in "iu":
                 raise CodecError("Whole numbers are needed.")
-            if found.size and (int(found.min()) < least or int(found.max()) > most):
+            if array.size and (int(array.min()) < least or int(array.max()) > most):
                 raise CodecError(f"A number does not fit into {dtype}.")
-            numbers = found.astype(dtype)
+            numbers = array.astype(dtype)
         if action:
             check_action(space, numbers)
         return numbers
@@ -154,29 +155,30 @@ def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
     return decode
 
 
-def _without_numbers(found: np.ndarray[Any, Any], shape: tuple[int, ...], batch: bool) -> np.ndarray[Any, Any]:
-    """An array without numbers in the shape that is needed: lists do not tell the axes after an empty one."""
-    whole = (len(found), *shape) if batch else shape
+def _without_numbers(array: np.ndarray[Any, Any], shape: tuple[int, ...], batch: bool) -> np.ndarray[Any, Any]:
+    """An array without numbers in the shape that is needed. JSON's lists have no axes after an empty one."""
+    whole = (len(array), *shape) if batch else shape
     known = whole[: whole.index(0) + 1] if 0 in whole else whole
-    return found.reshape(whole) if found.shape == known else found
+    return array.reshape(whole) if array.shape == known else array
 
 
-def _array(said: Any, nan: bool) -> np.ndarray[Any, Any]:
+def _array(data: Any, nan: bool) -> np.ndarray[Any, Any]:
+    """The array of a number or lists of numbers. With `nan`, None stands for NaN. Raises CodecError."""
     try:
-        found = np.asarray(said)
-        if found.dtype == object and nan:
-            found = np.asarray(_with_nan(said))
+        array = np.asarray(data)
+        if array.dtype == object and nan:
+            array = np.asarray(_with_nan(data))
     except (ValueError, RecursionError):
         raise CodecError("Lists of numbers must have the same length.") from None
-    if found.dtype.kind not in "biuf":
+    if array.dtype.kind not in "biuf":
         raise CodecError("Numbers are needed, and none that 64 bits cannot hold.")
-    return found
+    return array
 
 
-def _with_nan(said: Any) -> Any:
-    if isinstance(said, list):
-        return [_with_nan(part) for part in said]
-    return math.nan if said is None else said
+def _with_nan(data: Any) -> Any:
+    if isinstance(data, list):
+        return [_with_nan(part) for part in data]
+    return math.nan if data is None else data
 
 
 def _discrete(space: spaces.Discrete[Any], action: bool) -> Decode:
@@ -185,23 +187,23 @@ def _discrete(space: spaces.Discrete[Any], action: bool) -> Decode:
     if not action:
         first, last = int(np.iinfo(space.dtype).min), int(np.iinfo(space.dtype).max)
 
-    def decode(said: Any) -> Any:
-        if type(said) is not int:
+    def decode(data: Any) -> Any:
+        if type(data) is not int:
             raise CodecError("A whole number is needed.")
-        if not first <= said <= last:
-            raise CodecError(f"{str(said)[:40]} is not in {_short(space)}.")
-        return kind(said)
+        if not first <= data <= last:
+            raise CodecError(f"{str(data)[:40]} is not in {_short(space)}.")
+        return kind(data)
 
     return decode
 
 
 def _text(space: spaces.Text, action: bool) -> Decode:
-    def decode(said: Any) -> str:
-        if not isinstance(said, str):
+    def decode(data: Any) -> str:
+        if not isinstance(data, str):
             raise CodecError("A text is needed.")
-        if action and not space.contains(said):
+        if action and not space.contains(data):
             raise CodecError(f"The text is not in {_short(space)}.")
-        return said
+        return data
 
     return decode
 
@@ -211,10 +213,10 @@ def _dict(space: spaces.Dict, action: bool) -> Decode:
 
 
 def _dict_of(parts: dict[str, Decode]) -> Decode:
-    def decode(said: Any) -> dict[str, Any]:
-        if not isinstance(said, dict) or said.keys() != parts.keys():
+    def decode(data: Any) -> dict[str, Any]:
+        if not isinstance(data, dict) or data.keys() != parts.keys():
             raise CodecError(f"An object with {', '.join(parts) or 'no keys'} is needed.")
-        return {key: _part(read, said[key], key) for key, read in parts.items()}
+        return {key: _part(read, data[key], key) for key, read in parts.items()}
 
     return decode
 
@@ -224,26 +226,26 @@ def _tuple(space: spaces.Tuple[Any], action: bool) -> Decode:
 
 
 def _tuple_of(parts: list[Decode]) -> Decode:
-    def decode(said: Any) -> tuple[Any, ...]:
-        if not isinstance(said, list) or len(said) != len(parts):
+    def decode(data: Any) -> tuple[Any, ...]:
+        if not isinstance(data, list) or len(data) != len(parts):
             raise CodecError(f"A list of {len(parts)} values is needed.")
-        return tuple(_part(read, value, at) for at, (read, value) in enumerate(zip(parts, said, strict=True)))
+        return tuple(_part(read, value, at) for at, (read, value) in enumerate(zip(parts, data, strict=True)))
 
     return decode
 
 
-def _part(read: Decode, said: Any, where: str | int) -> Any:
+def _part(read: Decode, data: Any, where: str | int) -> Any:
     try:
-        return read(said)
+        return read(data)
     except CodecError as error:
         raise CodecError(f"{where}: {error}") from None
 
 
 def _list_of(read: Decode) -> Decode:
-    def decode(said: Any) -> tuple[Any, ...]:
-        if not isinstance(said, list):
+    def decode(data: Any) -> tuple[Any, ...]:
+        if not isinstance(data, list):
             raise CodecError("A list of values is needed.")
-        return tuple(_part(read, value, at) for at, value in enumerate(said))
+        return tuple(_part(read, value, at) for at, value in enumerate(data))
 
     return decode
 
@@ -255,7 +257,7 @@ def _sequence(space: spaces.Sequence, action: bool) -> Decode:
 
 
 def _stacked(space: Space, action: bool) -> Decode:
-    """Reads several values of `space` at once, in the form of `gymnasium.vector.utils.concatenate`."""
+    """Make a function that reads a batch of values, in the form of `gymnasium.vector.utils.concatenate`."""
     if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
         return _numbers(space, action, batch=True)
     if isinstance(space, spaces.Dict):
@@ -270,15 +272,15 @@ def _graph(space: spaces.Graph, action: bool) -> Decode:
     edges = None if space.edge_space is None else _stacked(space.edge_space, action)
     links = _numbers(spaces.Box(0, 2**31 - 1, (2,), np.int32), action, batch=True)
 
-    def decode(said: Any) -> spaces.GraphInstance:
-        if not isinstance(said, list) or len(said) != 3 or (said[1] is None) != (said[2] is None):
+    def decode(data: Any) -> spaces.GraphInstance:
+        if not isinstance(data, list) or len(data) != 3 or (data[1] is None) != (data[2] is None):
             raise CodecError("A list of nodes, edges and edge links is needed.")
-        if said[1] is None:
-            return spaces.GraphInstance(_part(nodes, said[0], "nodes"), None, None)
+        if data[1] is None:
+            return spaces.GraphInstance(_part(nodes, data[0], "nodes"), None, None)
         if edges is None:
             raise CodecError("The graphs of this space have no edges.")
         graph = spaces.GraphInstance(
-            _part(nodes, said[0], "nodes"), _part(edges, said[1], "edges"), _part(links, said[2], "edge_links")
+            _part(nodes, data[0], "nodes"), _part(edges, data[1], "edges"), _part(links, data[2], "edge_links")
         )
         if action and not space.contains(graph):
             raise CodecError("An edge leads to a node that is not there, or edges and their links differ in number.")
@@ -290,10 +292,10 @@ def _graph(space: spaces.Graph, action: bool) -> Decode:
 def _one_of(space: spaces.OneOf[Any], action: bool) -> Decode:
     parts = [decoder(part, action=action) for part in space.spaces]
 
-    def decode(said: Any) -> tuple[Any, Any]:
-        if not isinstance(said, list) or len(said) != 2 or type(said[0]) is not int or not 0 <= said[0] < len(parts):
+    def decode(data: Any) -> tuple[Any, Any]:
+        if not isinstance(data, list) or len(data) != 2 or type(data[0]) is not int or not 0 <= data[0] < len(parts):
             raise CodecError(f"A list of a whole number below {len(parts)} and a value is needed.")
-        return np.int64(said[0]), _part(parts[said[0]], said[1], said[0])
+        return np.int64(data[0]), _part(parts[data[0]], data[1], data[0])
 
     return decode
 
@@ -322,10 +324,10 @@ def _shape(shape: tuple[int, ...], batch: bool) -> str:
 
 
 def picture(rendered: Any, depth: int = 0) -> Any:
-    """What `render()` returned, for JSON: a picture as `{"png": base64}`, text as it is, a list of these, or None.
+    """The result of `render()` as JSON data: a picture as `{"png": base64, "shape"}`, a text or None as it is.
 
-    Pictures are height x width x 3 bytes, or x 4, x 1 or none. Any other array is `{"array": lists, "dtype": name}`.
-    Raises CodecError for all else.
+    A picture is an array of bytes: height x width, or height x width x 1, 3 or 4. Any other array becomes
+    `{"array": lists, "dtype": name, "shape"}`. A list may have all of these. Raises CodecError for anything else.
     """
     if rendered is None or isinstance(rendered, str):
         return rendered
@@ -335,30 +337,30 @@ def picture(rendered: Any, depth: int = 0) -> Any:
         raise CodecError(f"render() returned a {type(rendered).__name__}, which cannot be sent.")
     if rendered.dtype != np.uint8 or not _is_picture(rendered.shape):
         return {"array": rendered.tolist(), "dtype": rendered.dtype.name, "shape": list(rendered.shape)}
-    from PIL import Image  # noqa: PLC0415 - most clients never look
+    from PIL import Image  # noqa: PLC0415 - most clients ask for no picture
 
     out = io.BytesIO()
     grey = rendered.ndim == 3 and rendered.shape[2] == 1
-    # Level 1 packs a screen of a game nearly as small as 6, in a fraction of the time.
+    # Level 1 packs a game's screen nearly as small as level 6, in a fraction of the time.
     Image.fromarray(rendered[:, :, 0] if grey else rendered).save(out, "PNG", compress_level=1)
     return {"png": base64.b64encode(out.getvalue()).decode("ascii"), "shape": list(rendered.shape)}
 
 
-def rendered(said: Any) -> Any:
-    """What `picture` was given. Raises CodecError."""
-    if said is None or isinstance(said, str):
-        return said
-    if isinstance(said, list):
-        return [rendered(part) for part in said]
+def rendered(data: Any) -> Any:
+    """The result of `render()`, from the data that `picture` has made. Raises CodecError."""
+    if data is None or isinstance(data, str):
+        return data
+    if isinstance(data, list):
+        return [rendered(part) for part in data]
     try:
-        shape = tuple(said["shape"])
-        if "png" not in said:
-            return np.asarray(said["array"], np.dtype(said["dtype"])).reshape(shape)
+        shape = tuple(data["shape"])
+        if "png" not in data:
+            return np.asarray(data["array"], np.dtype(data["dtype"])).reshape(shape)
         from PIL import Image  # noqa: PLC0415 - as above
 
-        with Image.open(io.BytesIO(base64.b64decode(said["png"])), formats=["PNG"]) as found:
-            return np.array(found, np.uint8).reshape(shape)
-    except Exception as error:  # Pillow raises much for what is no picture
+        with Image.open(io.BytesIO(base64.b64decode(data["png"])), formats=["PNG"]) as image:
+            return np.array(image, np.uint8).reshape(shape)
+    except Exception as error:  # Pillow raises many kinds of errors
         raise CodecError("This is not what render() returned.") from error
 
 

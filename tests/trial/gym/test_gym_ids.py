@@ -35,7 +35,7 @@ def url() -> Iterator[str]:
 )
 def test_an_old_id_makes_its_successor(url: str, old: str, now: str) -> None:
     with RemoteEnv(url, old) as env:
-        assert env._made.spec["id"] == now
+        assert env._remote.spec["id"] == now
         env.reset(seed=1)
         env.step(env.action_space.sample())
 

@@ -165,7 +165,7 @@ def test_many_steps_in_one_message_are_those_of_a_vector_of_one(url: str, env_id
         remote.action_space.seed(2)
         actions = [remote.action_space.sample() for _ in range(100)]
         observations, rewards, terminated, truncated, infos = remote.step_many(actions)
-        layout = remote._made.observations
+        layout = remote._remote.observations
         rows = layout.rows(observations, 100)
         batches = gymnasium.vector.utils.concatenate
         for at, action in enumerate(actions):
