@@ -50,10 +50,10 @@ def selected(given: str | None) -> StudySelection:
 
 
 def local_data(study: StudySelection) -> Path | None:
-    """The data folder of a study that is held on this machine; None if its data are on AWS.
+    """The data folder of a study on this machine; None if its data are on AWS.
 
     Where config.yml leaves that open (it has awsSetup and no useAWS), the data are here if the folder `data` exists.
-    Raises `Problem` if the study is held on this machine, and the folder does not exist.
+    Raises `Problem` if it runs on this machine, and the folder does not exist.
     """
     from deploy.core.project_folder import may_use_aws, uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
 

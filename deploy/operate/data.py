@@ -82,7 +82,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Fetch a study's data and convert them: from AWS, or from this machine where the study is held here.
+    """Fetch a study's data and convert them: from AWS, or from this machine if the study runs here.
 
     Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
     Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists

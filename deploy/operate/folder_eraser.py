@@ -126,7 +126,7 @@ class FolderEraser:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise Problem(
-                    f"The study is held now with the data in {self._folder.root}.",
+                    f"The study runs now with the data in {self._folder.root}.",
                     "End `make run` with Ctrl-C, then run the same command again.",
                 ) from None
             yield

@@ -146,7 +146,7 @@ def command(
     """Stop every server now, and make sure that nothing of them is left.
 
     A participant who plays loses the present game; all answers, and the recordings up to now, are kept. Their page
-    says that those who hold the study have switched the server off. While the project is live, participants can start
+    says that the researchers have switched the server off. While the project is live, participants can start
     another server, and warm servers are started again: close the project first, with
     `python -m deploy register FOLDER --no-live`.
     """

@@ -95,7 +95,7 @@ _ENDED = {
     "failedTitle": "The game could not be started",
     "lostTitle": "The game could not go on",
     "fullTitle": "The study is full just now",
-    "stopped": "The computer for your game was switched off by those who hold the study.",
+    "stopped": "The computer for your game was switched off by the researchers.",
     "deadline": "The time for it was over.",
     "idle": "The game was not played for a while, or the time for it was over, so its computer switched itself off.",
     "failed": "The computers that we tried for your game failed, or it could not begin on them. This is not your fault.",

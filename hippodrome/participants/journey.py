@@ -97,7 +97,7 @@ class Journey:
         if not request.has_query("projectId"):
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
             status = 404 if request.query else 200
-            raise PageError(status, "This is where studies are held", text, PROJECT_NOT_FOUND)
+            raise PageError(status, "This is where studies run", text, PROJECT_NOT_FOUND)
         project_id = request.query_value("projectId")
         project = self._project_cache.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
         if project is None and project_id and self._project_cache.is_unreadable(project_id):

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from deploy.core.project_folder import reopened
+from deploy.core.project_folder import registration_of
 from hippodrome.model.project import MASTER_LIST, Project, read_list, step_key
 from lambdas import installed as place
 from lambdas import next_step, update_project_master_list
@@ -222,7 +222,7 @@ def test_a_study_that_the_script_registered_can_be_closed_and_keeps_its_pages(pl
     for file in ("consent-0", "consent-1", "thank"):
         platform.documents.put(f"flight/{file}.html", b"<p>")
     before = registered(platform)
-    answer = update_project_master_list.handler({"project": reopened(before, live=False)}, None)
+    answer = update_project_master_list.handler({"project": registration_of(before, live=False)}, None)
     assert answer == {"registered": "flight", "live": False, "steps": 3}
     (after,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
     assert (after.page_folder, after.steps) == ("", before.steps)
@@ -230,6 +230,6 @@ def test_a_study_that_the_script_registered_can_be_closed_and_keeps_its_pages(pl
 
 @pytest.mark.parametrize("folder", ["users", "../other", None, 7, []])
 def test_a_folder_of_pages_is_one_of_two(platform: FakePlatform, folder: Any) -> None:
-    ours = {**reopened(registered(platform), live=True), "pageFolder": folder}
+    ours = {**registration_of(registered(platform), live=True), "pageFolder": folder}
     (problem,) = update_project_master_list.handler({"project": ours}, None)["problems"]
     assert problem.startswith("pageFolder: must be steps")

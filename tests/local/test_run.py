@@ -438,7 +438,7 @@ def test_after_ctrl_c_the_participant_is_told_the_truth(local: Make) -> None:
     here.run()
     again = Walker(here.url, "quick", "P1")
     assert again.until("ended")["reason"] == "stopped"
-    assert "switched off by those who hold the study" in again.page()
+    assert "switched off by the researchers" in again.page()
 
 
 def test_a_folder_without_a_study_is_told(local: Make) -> None:

@@ -14,7 +14,7 @@ from hippodrome.limits.rules import ServerSlots, server_slots_key
 from hippodrome.model.records import from_json
 from hippodrome.model.server import ServerState
 from hippodrome.servers import leftovers
-from hippodrome.servers.leftovers import Why
+from hippodrome.servers.leftovers import LeftoverReason
 from hippodrome.servers.sweep import Sweep, SweepResult
 from hippodrome.servers.termination import Termination
 from hippodrome.servers.warm.handover import Handovers
@@ -73,7 +73,7 @@ MUTATIONS = {
     "a sweep that takes what is starting": Mutation(
         leftovers,
         "why_left_over",
-        lambda name, owner, scope, *, ours=False: owner and Why.CLOSED,
+        lambda name, owner, scope, *, ours=False: owner and LeftoverReason.CLOSED,
         r"waits for ever: .*'state': '(starting|naming|queued)'|its task is gone, and nobody will tell|has no name"
         r"|sweep: \S+ of \S+, which is (starting|naming)",
     ),

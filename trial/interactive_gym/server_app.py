@@ -1,4 +1,4 @@
-"""`server_app.run(config)`: makes a project of an experiment and holds it on this machine."""
+"""`server_app.run(config)`: makes a project of an experiment and runs it on this machine."""
 
 from __future__ import annotations
 

@@ -354,7 +354,7 @@ def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
     state = "failed" if reason in FAILURES else "ended"
     text = Elements(game(state=state, reason=reason, again=True).html).text
     assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
-    assert ("switched off by those who hold the study" in text) is (reason == Reason.STOPPED)
+    assert ("switched off by the researchers" in text) is (reason == Reason.STOPPED)
     assert ("The game was not played for a while" in text) is (reason == Reason.ENDED)
     assert ("not your fault" in text) is (state == "failed")
     assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
