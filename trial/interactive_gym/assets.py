@@ -1,4 +1,4 @@
-"""The images of an experiment, as files of the project's folder `assets/`."""
+"""Collects the images and atlases of an experiment for the project's folder `assets/`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from trial.interactive_gym.remote_config import RemoteConfig
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
-def of(config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]) -> dict[str, bytes]:
-    """The files below `assets/`, by their names there."""
+def asset_files(
+    config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]
+) -> dict[str, bytes]:
+    """The files of `assets/`, by their paths in it. `remark` gets a sentence about each image that is left out."""
     files: dict[str, bytes] = {}
     given = "assets_dir" in config.given
     folder = locate(config.assets_dir)
@@ -55,7 +57,7 @@ def _add(
 
 
 def _single(atlas: bytes, name: str, remark: Callable[[str], None]) -> bytes:
-    """The atlas of one image: of Phaser's several (`textures`) the first."""
+    """The atlas for one image. Of Phaser's multiatlas (`textures`) only the first image is used."""
     try:
         textures = json.loads(atlas).get("textures")
     except (ValueError, AttributeError):
@@ -76,13 +78,14 @@ def _animate(config: RemoteConfig, files: dict[str, bytes], remark: Callable[[st
             remark(f"the animation {key!r} is left out: its sprite sheet {spec.get('sprite_sheet_key')!r} has no atlas")
             continue
         atlas = json.loads(files[sheet])
-        played: dict[str, Any] = {"frames": list(spec.get("frames", ()))}
+        animation: dict[str, Any] = {"frames": list(spec.get("frames", ()))}
         if spec.get("frameRate"):
-            played["frameRate"] = spec["frameRate"]
-        atlas.setdefault("animations", {})[key] = played
+            animation["frameRate"] = spec["frameRate"]
+        atlas.setdefault("animations", {})[key] = animation
         files[sheet] = json.dumps(atlas).encode()
 
 
 def _plain(spec: Any) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = spec.as_dict() if hasattr(spec, "as_dict") else spec
-    return found
+    """The fields of a description by name."""
+    fields: Mapping[str, Any] = spec.as_dict() if hasattr(spec, "as_dict") else spec
+    return fields

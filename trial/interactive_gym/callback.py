@@ -1,4 +1,4 @@
-"""Interactive Gym's callbacks: methods that are told of the game as it goes on."""
+"""Interactive Gym's callbacks: methods that are called at the events of a game."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ EVENTS = (
     "on_waitroom_timeout",
     "on_game_end",
 )
-"""Each gets a `RemoteGame`. There are no waiting rooms here yet, so those of the waiting room are never called."""
+"""The methods' names. Each method gets a `RemoteGame`. Those of the waiting room are never called: participants wait in
+the lobby, before their server runs."""
 
 
 class GameCallback:
-    """A callback that does nothing: a base for callbacks of one's own."""
+    """A callback that does nothing: the base class of an experiment's callbacks."""
 
     def __init__(self, **_options: Any) -> None:
-        """Interactive Gym passes options on."""
+        """Take any options, as Interactive Gym does."""
 
     def on_episode_start(self, remote_game: Any) -> Any:
         """An episode has begun."""
@@ -34,16 +35,16 @@ class GameCallback:
         """An episode has ended."""
 
     def on_game_tick_start(self, remote_game: Any) -> Any:
-        """A step comes next."""
+        """The next step will be taken."""
 
     def on_game_tick_end(self, remote_game: Any) -> Any:
         """A step has been taken."""
 
     def on_graphics_start(self, remote_game: Any) -> Any:
-        """After a step, before `on_graphics_end`."""
+        """A step has been taken, and `on_game_tick_end` has been called."""
 
     def on_graphics_end(self, remote_game: Any) -> Any:
-        """After `on_graphics_start`."""
+        """A step has been taken, and `on_graphics_start` has been called."""
 
     def on_waitroom_start(self, remote_game: Any) -> Any:
         """Never called."""
@@ -58,14 +59,14 @@ class GameCallback:
         """Never called."""
 
     def on_game_end(self, remote_game: Any) -> Any:
-        """The trial is over."""
+        """The trial is over, in the middle of an episode."""
 
 
 class MultiCallback(GameCallback):
-    """Several callbacks, given as classes, each called in turn.
+    """Calls several callbacks in turn; `callbacks` are their classes.
 
-    What they return is a map by the names of the classes (`Score`, `Score 2` …), without those that return None. One
-    that raises keeps none of the others from being called; its error is raised after the last.
+    Each method returns a map of the values that the callbacks return, by the names of their classes (`Score`, `Score 2`
+    …), without None. If a callback raises, the others are called all the same. Then the first exception is raised.
     """
 
     def __init__(self, callbacks: Iterable[type[GameCallback]], **_options: Any) -> None:

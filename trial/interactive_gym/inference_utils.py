@@ -1,4 +1,4 @@
-"""Drawing an action by a model's output."""
+"""Interactive Gym's function that draws an action by a model's output."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ import numpy as np
 
 
 def sample_action_via_softmax(logits: Any) -> int:
-    """An action, drawn by the softmax of its logits."""
-    shares = np.exp(np.asarray(logits, float).reshape(-1) - np.max(logits))
-    return int(np.random.choice(len(shares), p=shares / shares.sum()))
+    """The number of a random action, with the probabilities of the softmax of `logits`."""
+    weights = np.exp(np.asarray(logits, float).reshape(-1) - np.max(logits))
+    return int(np.random.choice(len(weights), p=weights / weights.sum()))

@@ -1,4 +1,4 @@
-"""What an experiment is like: its environment is made and begun once, on the researcher's machine."""
+"""Looks at an experiment on the researcher's machine: makes its environment, and begins one episode."""
 
 from __future__ import annotations
 
@@ -20,26 +20,28 @@ _WORDS = re.compile(r"_+|(?<=[a-z0-9])(?=[A-Z])")  # between the words of a name
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What was found."""
+    """The facts that were found about an experiment."""
 
     players: tuple[Any, ...]
-    """As `policy_mapping` calls them."""
+    """The keys of `policy_mapping`."""
     several: bool
+    """Whether the environment has several players."""
     actions: int
-    """How many there are; of several players, the most that one has."""
+    """The number of actions; of several players, the highest number."""
     counts: Mapping[Any, int]
-    """The same by player."""
+    """The number of actions by player."""
     spaces: Mapping[Any, Any]
-    """Of several players: the space of each one's observations, None if it is not known."""
-    seen: Mapping[Any, Any]
-    """Of several players: the first observation of each that has one."""
+    """With several players: the observation space of each, None if it is not known."""
+    observations: Mapping[Any, Any]
+    """With several players: the first observation of each that has one."""
     human: Any
+    """The first human player."""
     joined_as_sorted: bool
-    """The policies' observations are arrays, or dictionaries whose keys come in their sorted order."""
+    """Whether the last player's observation is no dictionary, or one whose keys are in their sorted order."""
     objects: bool
-    """The game is drawn by objects, and not by pixels."""
+    """Whether the game is drawn by objects, and not by pixels."""
     game: Any
-    """A RemoteGame of it, for `game_page_html_fn`."""
+    """The experiment's RemoteGame, for `game_page_html_fn`."""
 
 
 def look(config: RemoteConfig) -> Look:
@@ -55,16 +57,16 @@ def look(config: RemoteConfig) -> Look:
         counts = {player: _count(env, player, several=agent.several) for player in players}
         picture = agent.render()
         by_player = observation if agent.several and isinstance(observation, Mapping) else None
-        seen = observation if by_player is None else by_player.get(players[-1])
+        last = observation if by_player is None else by_player.get(players[-1])
         return Look(
             players=players,
             several=agent.several,
             actions=max(counts.values()),
             counts=counts,
             spaces={player: env.observation_space(player) for player in players} if agent.several else {},
-            seen={player: by_player[player] for player in players if player in by_player} if by_player else {},
+            observations={player: by_player[player] for player in players if player in by_player} if by_player else {},
             human=next(iter(agent.game.human_players)) if agent.game else None,
-            joined_as_sorted=not isinstance(seen, Mapping) or list(seen) == sorted(seen, key=str),
+            joined_as_sorted=not isinstance(last, Mapping) or list(last) == sorted(last, key=str),
             objects=isinstance(picture, Mapping),
             game=agent.game,
         )
@@ -73,38 +75,41 @@ def look(config: RemoteConfig) -> Look:
 
 
 def is_file(config: RemoteConfig, plays: Any) -> bool:
-    """Whether a policy is an ONNX file that Hippodrome plays by itself: no function of the experiment's own does."""
+    """Whether a policy is an ONNX file that Hippodrome can play, since the experiment has no functions of its own."""
     ours = (onnx_inference_utils.load_onnx_policy_fn, onnx_inference_utils.onnx_model_inference_fn)
     functions = (config.load_policy_fn, config.policy_inference_fn)
     return isinstance(plays, str) and plays.endswith(".onnx") and functions in (ours, (None, None))
 
 
 def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> list[str]:
-    """The actions' names: the experiment's own constants (`LEFT = 1`), if each action has one; else their numbers."""
-    found: dict[int, list[str]] = {}
+    """The actions' names: the constants of the experiment's module (`LEFT = 1`), if each action has exactly one.
+
+    Otherwise the actions' numbers are their names.
+    """
+    constants: dict[int, list[str]] = {}
     for name, value in module.items():
         if type(value) is int and 0 <= value < actions and name[:1].isupper():
-            found.setdefault(value, []).append(name.lower())
-    if len(found) == actions and all(len(names) == 1 for names in found.values()):
-        named = [found[number][0] for number in range(actions)]
+            constants.setdefault(value, []).append(name.lower())
+    if len(constants) == actions and all(len(names) == 1 for names in constants.values()):
+        named = [constants[number][0] for number in range(actions)]
         if len(set(named)) == actions:
             return named
     return [str(number) for number in range(actions)]
 
 
 def labels_of(names: Iterable[str], module: Mapping[str, Any]) -> dict[str, str]:
-    """What participants read instead of those actions' names that are written as one: `PickUp` is `Pick up`."""
-    found = {}
+    """The labels that participants read, of actions whose constants have several words: `Pick up` for `PickUp`."""
+    labels = {}
     for name in names:
         constant = next((key for key, value in module.items() if type(value) is int and key.lower() == name), name)
         label = _WORDS.sub(" ", constant).lower().capitalize()
         if " " in label:
-            found[name] = label
-    return found
+            labels[name] = label
+    return labels
 
 
 def _check(config: RemoteConfig) -> None:
-    """Raises Unplayable for what cannot be, whatever the environment is."""
+    """Raise Unplayable for options that cannot work with any environment."""
     if "eventlet" in sys.modules:
         raise Unplayable("take `import eventlet` and `eventlet.monkey_patch()` out: it changes Python's own threads")
     mapping, humans = mapping_of(config), humans_of(config)
@@ -130,7 +135,7 @@ def _check(config: RemoteConfig) -> None:
 
 
 def check_actions(config: RemoteConfig, actions: int) -> None:
-    """Raises Unplayable for a key whose action there is not."""
+    """Raise Unplayable if a key or `default_action` names an action that does not exist."""
     for key, action in {**config.action_mapping, "default_action": config.default_action}.items():
         if key == "default_action" and action is None:
             continue
@@ -146,15 +151,17 @@ def _is_whole(value: Any) -> bool:
 
 
 def _check_players(players: tuple[Any, ...], observation: Any) -> None:
-    seen = list(observation) if isinstance(observation, Mapping) else None
-    if seen is not None and not set(seen) <= set(players):
+    """Raise Unplayable if there are observations of players who are not in `policy_mapping`."""
+    observed = list(observation) if isinstance(observation, Mapping) else None
+    if observed is not None and not set(observed) <= set(players):
         raise Unplayable(
-            f"the environment's players are {', '.join(map(repr, seen))}, and policy_mapping has "
+            f"the environment's players are {', '.join(map(repr, observed))}, and policy_mapping has "
             f"{', '.join(map(repr, players))}: write the environment's names"
         )
 
 
 def _count(env: Any, player: Any, *, several: bool) -> int:
+    """The number of a player's actions. Raises Unplayable if the environment does not say it."""
     space = env.action_space(player) if several else space_of(env, "action_space", player)
     count = getattr(space, "n", None)
     if count is None:

@@ -1,6 +1,7 @@
-"""Interactive Gym's objects that `env_to_state_fn` returns, and its descriptions of images.
+"""Interactive Gym's objects, as `env_to_state_fn` returns them, and its descriptions of images.
 
-docs/objects.md tells what each field means. `trial/pictures/scene.py` reads them.
+docs/objects.md says what each field means. `trial/pictures/scene_object.py` reads the objects, and `assets.py` the
+descriptions of images.
 """
 
 from __future__ import annotations

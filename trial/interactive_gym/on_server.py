@@ -1,4 +1,4 @@
-"""What the generated agent.py imports: the experiment's file, loaded on a participant's server."""
+"""Loads the experiment's file on a participant's server, for the generated agent.py."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _loading = False
 
 
 def is_loading() -> bool:
-    """Whether an experiment's file is being loaded on a server, where `server_app.run` is to do nothing."""
+    """Whether an experiment's file is being loaded here. Then `server_app.run` does nothing."""
     return _loading
 
 
@@ -28,19 +28,19 @@ class Experiment:
         self._locate = playing.located(folder)
 
     def agent(self) -> type:
-        """The class `Agent`."""
-        return playing.agent_class(self._config, self._locate)
+        """The class `Agent` of the experiment."""
+        return playing.agent_class(self._config)
 
     def policy(self, player: Any) -> type:
-        """A class that plays this player."""
+        """The class of the policy that plays this player."""
         return playing.policy_class(self._config, player, self._locate)
 
 
 def load(agent_file: str, module: str, name: str) -> Experiment:
-    """The experiment whose config is the variable `name` of `module`, a file beside agent.py.
+    """Load the experiment whose config is the variable `name` of `module`, a file beside agent.py.
 
-    The module is imported under its own name, so what stands below `if __name__ == "__main__"` is not run. Raises
-    Unplayable if there is no such config, and what the module raises.
+    The module is imported under its own name, so code below `if __name__ == "__main__"` does not run. Raises Unplayable
+    if there is no such config, and what the module raises.
     """
     folder = Path(agent_file).resolve().parent
     if str(folder) not in sys.path:
@@ -52,18 +52,18 @@ def load(agent_file: str, module: str, name: str) -> Experiment:
 
 
 def _imported(folder: Path, module: str) -> Any:
-    """The module of the project's folder, and not another one of the same name."""
+    """Import the module from the project's folder, even if another module has the same name."""
     global _loading  # noqa: PLW0603 - one import at a time
     path = folder / f"{module.replace('.', '/')}.py"
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
         raise playing.Unplayable(f"there is no {path.name} beside agent.py; run the experiment's file again")
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[module] = made
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[module] = loaded
     _loading = True
     try:
-        with contextlib.chdir(folder):  # files that the experiment reads by their paths are there
-            spec.loader.exec_module(made)
+        with contextlib.chdir(folder):  # the experiment may read files by their relative paths
+            spec.loader.exec_module(loaded)
     finally:
         _loading = False
-    return made
+    return loaded

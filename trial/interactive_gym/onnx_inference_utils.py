@@ -10,14 +10,14 @@ import numpy as np
 from trial.interactive_gym.inference_utils import sample_action_via_softmax
 
 ORT_SESSIONS: dict[str, Any] = {}
-"""Models by their paths."""
+"""The loaded models by their paths."""
 _TYPES = {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(double)": np.float64}
 
 
 def load_onnx_policy_fn(onnx_model_path: str) -> str:
-    """Load a model; the path stands for it."""
+    """Load a model. Return its path, by which the other functions find it."""
     if onnx_model_path not in ORT_SESSIONS:
-        import onnxruntime  # noqa: PLC0415 - only experiments with models have it
+        import onnxruntime  # noqa: PLC0415 - only experiments with models need it
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -28,7 +28,7 @@ def load_onnx_policy_fn(onnx_model_path: str) -> str:
 
 
 def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
-    """The model's output for these inputs. Others that it asks for, such as recurrent states, are zeros."""
+    """The model's outputs for these inputs. Its other inputs, such as recurrent states, get zeros."""
     session = ORT_SESSIONS[model_path]
     feeds = {
         each.name: input_dict[each.name] if each.name in input_dict else _zeros(each) for each in session.get_inputs()
@@ -37,14 +37,14 @@ def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
 
 
 def _zeros(port: Any) -> Any:
-    """What an input gets that is no observation: zeros; a plain `seq_lens` is 1."""
+    """The value of an input without a value: zeros, but 1 for a `seq_lens` with at most one axis."""
     shape = [size if isinstance(size, int) else 1 for size in port.shape]
     fill = 1 if port.name == "seq_lens" and len(shape) <= 1 else 0
     return np.full(shape, fill, _TYPES.get(port.type, np.float32))
 
 
 def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
-    """The action that a model draws for an observation; the parts of a dictionary are joined in their order."""
+    """An action drawn by the model's output for an observation. The parts of a dictionary are joined in their order."""
     if isinstance(observation, Mapping):
         observation = np.hstack([np.asarray(part).reshape(-1) for part in observation.values()])
     inputs = {"obs": np.asarray(observation, np.float32).reshape(1, -1)}

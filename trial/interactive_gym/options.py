@@ -1,4 +1,4 @@
-"""Every option of Interactive Gym's RemoteConfig: the method that sets it, its default, and what it becomes here.
+"""The table of all options of Interactive Gym's RemoteConfig: the method that sets each, its default, its meaning here.
 
 `python -m trial.interactive_gym.options` prints the table of docs/interactive-gym.md.
 """
@@ -21,14 +21,16 @@ class Option:
     name: str
     method: str
     default: Any
+    """The default value, or the type of which an empty value is the default."""
     becomes: str
+    """The option's meaning here, for the table in docs/interactive-gym.md."""
     ignored: str = ""
-    """If it has no effect here: why, as a sentence that is said when an experiment sets it."""
+    """The reason, if the option has no effect here. It is printed if an experiment sets the option."""
     of_several: bool = False
-    """It has an effect if several players are human: `ignored` is said of other experiments alone."""
+    """Whether the option has an effect if several players are human. Then `ignored` is about other experiments alone."""
 
-    def fresh(self) -> Any:
-        """The default; lists and dictionaries are new ones."""
+    def new_default(self) -> Any:
+        """The default; a list or a dictionary is a new one."""
         return self.default() if isinstance(self.default, type) else self.default
 
 
@@ -116,7 +118,7 @@ METHODS = tuple(dict.fromkeys(option.method for option in OPTIONS if option.meth
 
 
 def of_method(method: str) -> tuple[str, ...]:
-    """The names of the options that a method sets, in order."""
+    """The names of the options that a method sets, in the order of its parameters."""
     return tuple(option.name for option in OPTIONS if option.method == method)
 
 
@@ -141,10 +143,10 @@ _ASSERTIONS: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
-def wrong(name: str, value: Any) -> str | None:
-    """What is wrong with a value by itself, as Interactive Gym has it."""
-    good, sentence = _ASSERTIONS.get(name, (lambda _: True, ""))
-    return None if good(value) else f"{name} {sentence}, not {value!r}"
+def problem_of(name: str, value: Any) -> str | None:
+    """Why Interactive Gym refuses this value of the option, as a sentence; None if it does not."""
+    is_allowed, rule = _ASSERTIONS.get(name, (lambda _: True, ""))
+    return None if is_allowed(value) else f"{name} {rule}, not {value!r}"
 
 
 if __name__ == "__main__":

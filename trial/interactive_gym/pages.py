@@ -1,4 +1,4 @@
-"""The pages of steps/ that an experiment's texts become."""
+"""Makes the pages of steps/ of an experiment's texts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TAG = re.compile(r"<[A-Za-z/!]")
 _JINJA = re.compile(r"\{[{%#]")
 
 Locate = Callable[[str], Path | None]
-"""Where a file that an option names lies; None if it is not found."""
+"""Finds a file that an option names. Returns None if there is none."""
 
 
 def welcome(config: RemoteConfig) -> str:
@@ -27,7 +27,7 @@ def welcome(config: RemoteConfig) -> str:
 
 
 def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
-    """The pages before and after the game, by their names, in their order."""
+    """The pages before the game, and those after it, by their names, in their order."""
     before: list[Any] = getattr(config, "before", [])
     after: list[Any] = getattr(config, "after", [])
     if not before and not after:
@@ -38,7 +38,7 @@ def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _name(where: str, number: int, scene: Any) -> str:
-    """A page's name: the scene's own, if it can be one."""
+    """The name of a scene's page. It begins with the scene's id, if that can be part of a name."""
     name = str(scene.scene_id or "")
     fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name) and name not in ("game", "instructions", "between")
     return f"{name}_{where}_{number}" if fits else f"{where}_{number}"
@@ -55,7 +55,7 @@ def _static(scene: Any) -> str:
 
 
 def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, remark: Callable[[str], None]) -> str:
-    """What is shown before the game; empty if there is nothing. `human` is the name of the human player."""
+    """The page with the instructions; empty if the experiment has none. `human` is the first human player."""
     parts = []
     if config.instructions_html_file is not None:
         path = locate(config.instructions_html_file)
@@ -88,18 +88,18 @@ def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
 
 
 def final(config: RemoteConfig) -> str:
-    """The last page, which leads on if the experiment says where. An unmatched participant gets another text."""
+    """The last page, with a link if the experiment has an address for it. Unmatched participants get another text."""
     page = _page(config.final_page_header_text or "Thank you!", config.final_page_text, plain="<p>This is the end.</p>")
-    page += _led(config, config.experiment_end_redirect_url or config.end_game_redirect_url)
+    page += _redirect(config, config.experiment_end_redirect_url or config.end_game_redirect_url)
     if len(humans_of(config)) == 1:
         return page
     alone = _page("There was nobody to play with", "<p>Thank you for waiting.</p>")
-    alone += _led(config, config.waitroom_timeout_redirect_url)
+    alone += _redirect(config, config.waitroom_timeout_redirect_url)
     return "{% if participant.unmatched %}\n" + alone + "{% else %}\n" + page + "{% endif %}\n"
 
 
-def _led(config: RemoteConfig, address: str | None) -> str:
-    """The link to this address, and the script that follows it; empty if there is none."""
+def _redirect(config: RemoteConfig, address: str | None) -> str:
+    """The link to this address, and the script that follows it after `redirect_timeout`; empty without an address."""
     if not address:
         return ""
     appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect
@@ -112,26 +112,26 @@ def _led(config: RemoteConfig, address: str | None) -> str:
 
 
 def _onward(address: str, appended: bool) -> str:
-    """A link to another site, with the participant's id at the end of its address or without."""
-    whose = "{{ participant.userId|urlencode }}" if appended else ""
-    return f'<p><a id="onward" href="{raw(html.escape(address, quote=True))}{whose}">Go on</a></p>\n'
+    """A link to another site. If `appended`, the participant's id stands at the end of its address."""
+    user_id = "{{ participant.userId|urlencode }}" if appended else ""
+    return f'<p><a id="onward" href="{raw(html.escape(address, quote=True))}{user_id}">Go on</a></p>\n'
 
 
 def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:
-    """The page with its pictures and styles beside it: those that are found are added to `files`."""
+    """Add the files that the page links to `files`, beside the page. Return the page with links to them there."""
 
-    def beside(found: re.Match[str]) -> str:
-        path = locate(found["path"])
+    def beside(link: re.Match[str]) -> str:
+        path = locate(link["path"])
         if path is None:
-            return found[0]
+            return link[0]
         files[f"steps/{path.name}"] = path.read_bytes()
-        return f"{found['before']}{path.name}"
+        return f"{link['before']}{path.name}"
 
     return _LINKED.sub(beside, page)
 
 
 def raw(text: str) -> str:
-    """The text as a template shows it unchanged."""
+    """The text in a form that a template shows unchanged."""
     return "{% raw %}" + text + "{% endraw %}" if _JINJA.search(text) else text
 
 
@@ -153,5 +153,5 @@ def _has_heading(parts: Iterable[str]) -> bool:
 
 
 def quoted(text: str) -> str:
-    """The text as a value of Python and of JSON."""
+    """The text as a literal of Python, which is one of JSON too."""
     return json.dumps(text, ensure_ascii=False)

@@ -1,6 +1,6 @@
-"""Plays an experiment's environment: the agent and the policies of the project that `server_app.run` makes.
+"""The agent and the policies of the project that `server_app.run` makes of an experiment.
 
-The generated agent.py takes them from `on_server.py`.
+The generated agent.py gets them by `on_server.py`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,7 @@ class Unplayable(ValueError):
 
 
 class Several:
-    """An environment with several players, as PettingZoo's `ParallelEnv` describes itself.
-
-    Its `agents` are those of the environment, if it says so.
-    """
+    """An environment with several players, with the attributes by which a PettingZoo `ParallelEnv` describes them."""
 
     def __init__(self, env: Any, players: Iterable[Any]) -> None:
         self.env = env
@@ -45,24 +42,25 @@ class Several:
 
 
 def space_of(env: Any, name: str, player: Any) -> Any:
-    """The space of a player: of a method, of a map by player, or one for all."""
-    for found in (getattr(env, name, None), getattr(env, f"{name}s", None)):
-        if callable(found) and not hasattr(found, "sample"):
+    """A player's space, by a method or a map by player, or the one of all players; None if it is not known."""
+    for attribute in (getattr(env, name, None), getattr(env, f"{name}s", None)):
+        if callable(attribute) and not hasattr(attribute, "sample"):
             try:
-                return found(player)
+                return attribute(player)
             except (KeyError, TypeError, NotImplementedError):
                 continue
-        several = getattr(found, "spaces", found)  # "in" asks a Dict space for whole samples
-        if isinstance(several, Mapping):
-            if player in several:
-                return several[player]
-        elif found is not None:
-            return found
+        # `key in space` would ask a Dict space whether the key is a sample of it: so take its dict.
+        by_player = getattr(attribute, "spaces", attribute)
+        if isinstance(by_player, Mapping):
+            if player in by_player:
+                return by_player[player]
+        elif attribute is not None:
+            return attribute
     return None
 
 
 def mapping_of(config: RemoteConfig) -> dict[Any, Any]:
-    """`policy_mapping`, or what `human_id` says where it is empty."""
+    """`policy_mapping`. If it is empty, the one player is human: `human_id`, or else player_0."""
     if config.policy_mapping:
         return dict(config.policy_mapping)
     return {"player_0" if config.human_id is None else config.human_id: PolicyTypes.Human}
@@ -74,7 +72,10 @@ def humans_of(config: RemoteConfig) -> list[Any]:
 
 
 def make_environment(config: RemoteConfig) -> Any:
-    """A new environment, as Interactive Gym makes it. Raises Unplayable without a way to, and what the code raises."""
+    """Make an environment as Interactive Gym does.
+
+    Raises Unplayable if the config does not say how, and what the experiment's code raises.
+    """
     if config.env_creator is not None:
         return config.env_creator(**config.env_config, render_mode="rgb_array")
     if config.environment_initialization_code:
@@ -87,15 +88,12 @@ def make_environment(config: RemoteConfig) -> Any:
 
 
 class ExperimentAgent:
-    """The agent of an experiment: what docs/agent.md asks of a class `Agent`."""
+    """The agent of an experiment, with the methods of a class `Agent` (docs/agent.md)."""
 
-    def __init__(self, config: RemoteConfig, locate: Callable[[Any], Any] = lambda name: name) -> None:
-        """`locate` turns a policy's name into the path of its file in the project, if it is one."""
+    def __init__(self, config: RemoteConfig) -> None:
         self._config = config
-        self._locate = locate
-        self._raw: Any = None
-        self._first = True
-        self._late_start: Callable[[], None] | None = None
+        self._raw: Any = None  # the experiment's environment
+        self._first = True  # the next picture is the episode's first
         self.game: RemoteGame | None = None
         self.env: Any = None
         self.several = False
@@ -103,7 +101,7 @@ class ExperimentAgent:
     # ---- the five methods
 
     def start(self, _game: str | None = None) -> Any:
-        """Make the environment."""
+        """Make the environment, and return it."""
         config = self._config
         self._raw = make_environment(config)
         players = mapping_of(config)
@@ -113,10 +111,10 @@ class ExperimentAgent:
         return self.env
 
     def reset(self, seed: int | None = None) -> Any:
-        """Begin an episode."""
+        """Begin an episode. Return its observation and infos."""
         game = self._game
         alone = len(game.human_players) == 1
-        for key in game.human_players:  # in a game of several no code sees participants' ids
+        for key in game.human_players:  # with several participants, no code of the researcher's gets their ids
             game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
         observation, infos = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
@@ -125,7 +123,7 @@ class ExperimentAgent:
         return observation, infos
 
     def step(self, action: Any) -> Any:
-        """Take one step: with an action, or with one for each player."""
+        """Take one step with an action, or with a map of the players' actions. Return the environment's five values."""
         game = self._game
         result = tuple(self._raw.step(action))
         actions = action if isinstance(action, Mapping) else dict.fromkeys(mapping_of(self._config), action)
@@ -133,7 +131,7 @@ class ExperimentAgent:
         return result
 
     def render(self) -> Any:
-        """The present picture: objects with the HUD's text, or pixels."""
+        """Return the present picture: objects with the HUD's text, or pixels."""
         config, game = self._config, self._game
         hud = "" if config.hud_text_fn is None else str(config.hud_text_fn(game))
         if config.env_to_state_fn is None:
@@ -142,17 +140,17 @@ class ExperimentAgent:
                 return drawn
         else:
             drawn = config.env_to_state_fn(self._raw, config)
-        found = [each.as_dict() if hasattr(each, "as_dict") else each for each in drawn]
-        pixels = next((each for each in found if _kind(each) == "rendered_env_rgb"), None)
+        objects = [each.as_dict() if hasattr(each, "as_dict") else each for each in drawn]
+        pixels = next((each for each in objects if _kind(each) == "rendered_env_rgb"), None)
         if pixels is not None:
             return _pixels(pixels)
         if self._first:
             self._first = False
-            found = [*({**_fields(each), "permanent": True} for each in config.state_init), *found]
-        return {"objects": found, "hud": hud}
+            objects = [*({**_fields(each), "permanent": True} for each in config.state_init), *objects]
+        return {"objects": objects, "hud": hud}
 
     def close(self) -> None:
-        """Free the environment."""
+        """Close the environment, if it has a method `close`."""
         close = getattr(self._raw, "close", None)
         if callable(close):
             close()
@@ -166,8 +164,8 @@ class ExperimentAgent:
 class ListeningAgent(ExperimentAgent):
     """The agent of an experiment with a callback, which it calls as Interactive Gym does.
 
-    `on_game_tick_start` sees the state before a step, which is the one after the step before it. So it is called at
-    the end of that step.
+    `on_game_tick_start` gets the state before a step. That is the state after the step before, so it is called at the
+    end of that one, or after the reset.
     """
 
     def on_episode_start(self, session: Any) -> Any:
@@ -184,12 +182,15 @@ class ListeningAgent(ExperimentAgent):
         self._tell(session, "on_episode_end")
 
     def on_session_end(self, session: Any) -> Any:
-        """The trial is over. Interactive Gym tells of the end of a game only where it is left in the middle."""
+        """The trial is over. Interactive Gym calls `on_game_end` only if a game ends in the middle of an episode."""
         if not self._game.over:
             self._tell(session, "on_game_end")
 
     def _tell(self, session: Any, *events: str) -> None:
-        """Call these methods of the callback. What one returns is recorded. Raises what they raise, after the last."""
+        """Call these methods of the callback, and record what each returns.
+
+        If methods raise, the others are called all the same. Then the first exception is raised.
+        """
         game, raised = self._game, []
         game.record = session.record
         for event in events:
@@ -197,7 +198,7 @@ class ListeningAgent(ExperimentAgent):
             if callable(method):
                 try:
                     value = method(game)
-                except Exception as error:  # noqa: BLE001 - the callback's others are called all the same
+                except Exception as error:  # noqa: BLE001 - the callback's other methods are called all the same
                     raised.append(error)
                 else:
                     if value is not None:
@@ -206,7 +207,7 @@ class ListeningAgent(ExperimentAgent):
             raise raised[0]
 
 
-def agent_class(config: RemoteConfig, locate: Callable[[Any], Any]) -> type:
+def agent_class(config: RemoteConfig) -> type:
     """The class `Agent` of the project's agent.py."""
     base = ExperimentAgent if config.callback is None else ListeningAgent
 
@@ -214,13 +215,16 @@ def agent_class(config: RemoteConfig, locate: Callable[[Any], Any]) -> type:
         """The experiment's agent."""
 
         def __init__(self) -> None:
-            super().__init__(config, locate)
+            super().__init__(config)
 
     return Agent
 
 
 def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]) -> type:
-    """A class of the project's agent.py that plays this player by the experiment's functions."""
+    """The class of agent.py that plays this player by the experiment's functions.
+
+    `locate` returns the path of a policy's file, if its name is that of a file; else it returns the name.
+    """
 
     class Policy:
         """A policy of the experiment."""
@@ -239,7 +243,7 @@ def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]
 
 
 def located(folder: Path) -> Callable[[Any], Any]:
-    """A function that turns the name of a policy into the path of its file in the project's folder, if it has one."""
+    """The function `locate` of `policy_class`, for the policies' files in the project's folder."""
 
     def locate(name: Any) -> Any:
         if isinstance(name, str | os.PathLike):

@@ -15,33 +15,33 @@ from trial.interactive_gym.configuration_constants import ActionSettings, InputM
 from trial.interactive_gym.looking import Look
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.sources import MADE, ConfigModule
+from trial.interactive_gym.sources import HASHES, ConfigModule
 
 LEAST_PATIENCE, MOST_PATIENCE = 10, 3600
-"""Seconds, as `project.patience` may be."""
+"""The limits of `project.patience`, in seconds."""
 LONGEST_BUFFER = 10_000
-"""Steps: the most that `actionBufferLifespan` may be."""
+"""The highest value of `actionBufferLifespan`, in steps."""
 _NO_ID = re.compile(r"[^A-Za-z0-9_-]+")
 _MADE_BY = "made by `python {file}`; change that file and run it again"
 
 
 @dataclass(frozen=True, slots=True)
 class MadeProject:
-    """A project that was made."""
+    """A project that was made of an experiment."""
 
     folder: Path
     remarks: list[str] = field(default_factory=list)
-    """What has no effect, or is not as in Interactive Gym."""
+    """Sentences about options that have no effect, or another effect than in Interactive Gym."""
 
 
-def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, ...] = ()) -> MadeProject:
-    """Make the project in `folder`, or beside the experiment's file.
+def make(config: RemoteConfig, folder: Path | None = None, candidates: tuple[Any, ...] = ()) -> MadeProject:
+    """Make the project in `folder`, or in a folder beside the experiment's file.
 
-    A file that was changed by hand since it was made stays. Raises Unplayable if the experiment cannot be played here
-    or the folder holds something else, OSError, and what the experiment's code raises. `standing` are the objects of
-    which one must be a variable of the experiment's file, the one that is wanted most last.
+    One of `candidates`, by default the config, must be a variable of the experiment's file (`sources.find`).
+    A file that was changed by hand since it was made stays as it is. Raises Unplayable if the experiment cannot be
+    played here, or if the folder has other files in it; OSError; and what the experiment's code raises.
     """
-    source = sources.find(*(standing or (config,)))
+    source = sources.find(*(candidates or (config,)))
     target = (folder or source.file.parent / f"{_id(source.file.stem)}-study").resolve()
     remarks: list[str] = []
     files = files_of(config, source, target, remarks.append)
@@ -53,12 +53,12 @@ def make(config: RemoteConfig, folder: Path | None = None, standing: tuple[Any, 
 def files_of(
     config: RemoteConfig, source: ConfigModule, target: Path, remark: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The project's files, by their paths there. Raises Unplayable, and what the experiment's code raises."""
+    """The project's files, by their paths in it. Raises Unplayable, and what the experiment's code raises."""
     look = looking.look(config)
     looking.check_actions(config, look.actions)
     find = sources.locate(source)
-    own, said = sources.belonging(source, target)
-    for sentence in said:
+    own, sentences = sources.belonging(source, target)
+    for sentence in sentences:
         remark(sentence)
     files = {name: path.read_bytes() for name, path in own.items()}
     for name in files.keys() & {"agent.py", "config.yml"}:
@@ -68,7 +68,7 @@ def files_of(
     players = _players(config, look, find, files, remark)
     for sentence in trying.try_policies(config, look, find, source.root):
         remark(sentence)
-    files |= {f"assets/{name}": data for name, data in assets.of(config, find, remark).items()}
+    files |= {f"assets/{name}": data for name, data in assets.asset_files(config, find, remark).items()}
     before, after = pages.around(config)
     steps = {
         **before,
@@ -105,18 +105,18 @@ def files_of(
 
 
 def ignored(config: RemoteConfig) -> list[str]:
-    """Sentences about options that the experiment sets and that have no effect here."""
+    """A sentence about each option that the experiment sets and that has no effect here."""
     several = len(playing.humans_of(config)) > 1
     return [f"{name} has no effect: the game runs on a server" for name in getattr(config, "ignored", ())] + [
         f"{option.name} has no effect: {option.ignored}"
         for option in options.OPTIONS
         if option.ignored and not (several and option.of_several)
-        if option.name in config.given and getattr(config, option.name) != option.fresh()
+        if option.name in config.given and getattr(config, option.name) != option.new_default()
     ]
 
 
 def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[str, Any]:
-    """The section `trial` of config.yml, but for pages and players. `names` are those of the actions."""
+    """The section `trial` of config.yml, without pages and players. `names` are the names of the actions."""
     trial: dict[str, Any] = {
         "game": config.env_name or "experiment",
         "maxEpisodes": config.num_episodes,
@@ -153,7 +153,7 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
 
 
 def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
-    """The project's agent.py: the experiment's agent, and a class for each policy: its name and the player."""
+    """The project's agent.py. `policies` has the name of each policy's class, and the player."""
     lines = [
         f'"""The agent of {source.file.name}, {_MADE_BY.format(file=source.file.name)}."""',
         "",
@@ -168,21 +168,22 @@ def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
 
 
 def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write the files, and remove those of an earlier time that are there no more; sentences about what was kept.
+    """Write the files of a project, and remove files of the project's earlier version that it does not have any more.
 
-    Raises Unplayable if the folder holds something that was not made here, and OSError.
+    A file that was changed by hand stays; return a sentence about each. Raises Unplayable if the folder has files in it
+    and none of them was made here, and OSError.
     """
-    made = folder / MADE
-    if folder.exists() and any(folder.iterdir()) and not made.is_file():
+    hashes = folder / HASHES
+    if folder.exists() and any(folder.iterdir()) and not hashes.is_file():
         raise Unplayable(f"{folder} holds something else; give server_app.run(config, project=…) another folder")
-    before: dict[str, str] = json.loads(made.read_text()) if made.is_file() else {}
-    kept = []
+    before: dict[str, str] = json.loads(hashes.read_text()) if hashes.is_file() else {}
+    sentences = []
     now = {}
     for name, data in files.items():
         path = folder / name
         now[name] = _hash(data)
         if path.is_file() and name in before and _hash(path.read_bytes()) not in (before[name], now[name]):
-            kept.append(f"{path} was changed by hand and stays; delete it to have it made anew")
+            sentences.append(f"{path} was changed by hand and stays; delete it to have it made anew")
             now[name] = before[name]
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,8 +192,8 @@ def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
         path = folder / name
         if path.is_file() and _hash(path.read_bytes()) == before[name]:
             path.unlink()
-    made.write_text(json.dumps(now, indent=0, sort_keys=True))
-    return kept
+    hashes.write_text(json.dumps(now, indent=0, sort_keys=True))
+    return sentences
 
 
 def _players(
@@ -202,14 +203,14 @@ def _players(
     files: dict[str, bytes],
     remark: Callable[[str], None],
 ) -> dict[Any, tuple[str, str]]:
-    """By player: what `trial.players` says, and the name of a class in agent.py, if there is one.
+    """By player: the value in `trial.players`, and the name of the policy's class in agent.py, or an empty name.
 
-    Files of policies are added to `files`.
+    Adds the files of policies to `files`.
     """
-    found: dict[Any, tuple[str, str]] = {}
+    players: dict[Any, tuple[str, str]] = {}
     for number, (player, plays) in enumerate(playing.mapping_of(config).items()):
         if isinstance(plays, str) and plays in (PolicyTypes.Human, PolicyTypes.Random):
-            found[player] = (plays, "")
+            players[player] = (plays, "")
             continue
         file = find(plays) if isinstance(plays, str) and ("/" in plays or "." in plays) else None
         if file is not None and file.is_file():
@@ -217,10 +218,10 @@ def _players(
         elif isinstance(plays, str) and plays.endswith(".onnx"):
             remark(f"the policy of {player} is not found: {plays}")
         if looking.is_file(config, plays) and look.joined_as_sorted:
-            found[player] = (f"sample:policies/{Path(plays).name}", "")
+            players[player] = (f"sample:policies/{Path(plays).name}", "")
         else:
-            found[player] = (f"agent:Policy{number}", f"Policy{number}")
-    return found
+            players[player] = (f"agent:Policy{number}", f"Policy{number}")
+    return players
 
 
 def _project(config: RemoteConfig, source: ConfigModule, steps: list[str]) -> dict[str, Any]:
@@ -251,7 +252,7 @@ def _keys(key: Any) -> str:
 
 
 def _yaml(document: Mapping[str, Any], source: ConfigModule) -> str:
-    import yaml  # noqa: PLC0415 - servers do without
+    import yaml  # noqa: PLC0415 - servers do not need it
 
     head = f"# {source.file.name}, {_MADE_BY.format(file=source.file.name)}.\n\n"
     return head + yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120)

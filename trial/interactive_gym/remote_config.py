@@ -1,4 +1,4 @@
-"""Interactive Gym's `RemoteConfig`: an experiment's settings, set by methods that can be called one after the other."""
+"""Interactive Gym's `RemoteConfig`: the settings of an experiment, which methods set."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from trial.interactive_gym import options
 
 
 class RemoteConfig:
-    """The settings of an experiment; docs/interactive-gym.md has a table of all of them.
+    """The settings of an experiment. docs/interactive-gym.md has a table of them.
 
-    Each method takes the options of its group by name (or in the table's order), and returns the config itself. None
-    leaves an option as it is. Raises TypeError for an option that there is not, and AssertionError, as Interactive
-    Gym does, for some values.
+    Each method takes the options of its group by name, or in the table's order, and returns the config itself, so that
+    calls can be chained. None leaves an option as it is. A method raises TypeError for an unknown option, and, as in
+    Interactive Gym, AssertionError for some values.
     """
 
     def __init__(self) -> None:
         self.given: set[str] = set()
         """The options that the experiment has set."""
         for option in options.OPTIONS:
-            object.__setattr__(self, option.name, option.fresh())
+            object.__setattr__(self, option.name, option.new_default())
 
     def __setattr__(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -31,57 +31,57 @@ class RemoteConfig:
         raise AttributeError(f"RemoteConfig has no option {name}{did_you_mean(name, options.BY_NAME)}")
 
     def environment(self, *values: Any, **named: Any) -> Self:
-        """The environment."""
+        """Set options of the environment."""
         return self._set("environment", values, named)
 
     def policies(self, *values: Any, **named: Any) -> Self:
-        """Who plays whom."""
+        """Set who or which policy plays each player."""
         return self._set("policies", values, named)
 
     def gameplay(self, *values: Any, **named: Any) -> Self:
-        """Actions, keys, episodes, the callback."""
+        """Set options of actions, keys and episodes, and the callback."""
         return self._set("gameplay", values, named)
 
     def rendering(self, *values: Any, **named: Any) -> Self:
-        """What participants see of the game."""
+        """Set how the game is drawn."""
         return self._set("rendering", values, named)
 
     def hosting(self, *values: Any, **named: Any) -> Self:
-        """Where the experiment is held."""
+        """Set options of the server."""
         return self._set("hosting", values, named)
 
     def user_experience(self, *values: Any, **named: Any) -> Self:
-        """Texts, pages, and where participants go afterwards."""
+        """Set texts, pages, and the sites to which participants go afterwards."""
         return self._set("user_experience", values, named)
 
     def logging(self, *values: Any, **named: Any) -> Self:
-        """The log."""
+        """Set options of the log."""
         return self._set("logging", values, named)
 
     def pyodide(self, *values: Any, **named: Any) -> Self:
-        """Interactive Gym's way of running an environment in the browser."""
+        """Set options of environments that Interactive Gym runs in the browser."""
         return self._set("pyodide", values, named)
 
     @property
     def simulate_waiting_room(self) -> bool:
-        """Whether a waiting room is asked for, even for those who play alone."""
+        """Whether the experiment wants a waiting room, even for participants who play alone."""
         return bool(max(self.waitroom_time_randomization_interval_s) > 0)
 
     def to_dict(self, serializable: bool = False) -> dict[str, Any]:
-        """The options and their values; with `serializable` only those that JSON can hold."""
+        """The values by the options' names; with `serializable`, only the values that JSON can hold."""
         import json  # noqa: PLC0415 - rarely used
 
-        found = {name: getattr(self, name) for name in options.BY_NAME}
+        all_values = {name: getattr(self, name) for name in options.BY_NAME}
         if not serializable:
-            return found
-        kept = {}
-        for name, value in found.items():
+            return all_values
+        in_json = {}
+        for name, value in all_values.items():
             try:
                 json.dumps(value)
             except (TypeError, ValueError, OverflowError):
                 continue
-            kept[name] = value
-        return kept
+            in_json[name] = value
+        return in_json
 
     def _set(self, method: str, values: tuple[Any, ...], named: dict[str, Any]) -> Self:
         known = options.of_method(method)
@@ -95,7 +95,7 @@ class RemoteConfig:
         for name, value in given.items():
             if value is None:
                 continue
-            problem = options.wrong(name, value)
+            problem = options.problem_of(name, value)
             if problem:
                 raise AssertionError(problem)
             setattr(self, name, value)

@@ -1,4 +1,4 @@
-"""What Interactive Gym's callbacks and functions are given: the game as it stands."""
+"""`RemoteGame`, the argument of Interactive Gym's callbacks and functions: the present state of the game."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trial.core.players import ALL
 
 
 class GameStatus:
-    """Where the game is."""
+    """The values of `RemoteGame.status`."""
 
     Done = "done"
     Active = "active"
@@ -20,17 +20,17 @@ class GameStatus:
 
 
 def _unrecorded(name: str, value: Any) -> None:
-    """Outside a callback nothing can be recorded."""
+    """Record nothing: values can be recorded in a callback alone."""
 
 
 class RemoteGame:
-    """The game, with Interactive Gym's attributes. Read it; what is changed here changes nothing.
+    """The state of the game, in Interactive Gym's attributes. To change them does not change the game.
 
     `current_ping` is always 0, and `document_focus_status` always true: neither is measured here.
     """
 
     def __init__(self, config: Any, env: Any, players: Mapping[Any, Any], subject: str = "") -> None:
-        """`players` is `policy_mapping`; `bot_players` has the names of policies that stand there."""
+        """`players` is `policy_mapping`, and `subject` the id of the participant, if there is one alone."""
         self.config = config
         self.env = env
         self.status = GameStatus.Inactive
@@ -57,12 +57,12 @@ class RemoteGame:
 
     @property
     def observation(self) -> Any:
-        """What the environment returned last."""
+        """The observations that the environment returned last."""
         return self.obs
 
     @property
     def rewards(self) -> dict[Any, float]:
-        """Of the last step."""
+        """The rewards of the last step."""
         return self.prev_rewards
 
     def began(self, observation: Any, infos: Any) -> None:
@@ -92,10 +92,10 @@ class RemoteGame:
 
     @property
     def over(self) -> bool:
-        """The episode has ended for all."""
-        said = (self.terminateds, self.truncateds)
-        if not all(isinstance(each, Mapping) for each in said):
-            return any(map(bool, said))
-        players = {player for each in said for player in each} - {ALL}
-        each_ended = all(any(each.get(player) for each in said) for player in players)
-        return any(each.get(ALL) for each in said) or (bool(players) and each_ended)
+        """Whether the episode has ended for all players."""
+        ends = (self.terminateds, self.truncateds)
+        if not all(isinstance(each, Mapping) for each in ends):
+            return any(map(bool, ends))
+        players = {player for each in ends for player in each} - {ALL}
+        each_ended = all(any(each.get(player) for each in ends) for player in players)
+        return any(each.get(ALL) for each in ends) or (bool(players) and each_ended)

@@ -1,7 +1,4 @@
-"""Interactive Gym's scenes, as far as they are one game with pages before and after it.
-
-A `GymScene` is a `RemoteConfig` whose texts have other names.
-"""
+"""Interactive Gym's scenes, for experiments with one game and pages before and after it."""
 
 from __future__ import annotations
 
@@ -30,20 +27,20 @@ class _Scene:
     scene_id: str | None = None
 
     def scene(self, scene_id: str | None = None, experiment_config: Any = None, **_more: Any) -> Self:
-        """Name the scene."""
+        """Set the scene's id."""
         self.scene_id = scene_id or self.scene_id
         return self
 
 
 class GymScene(_Scene, RemoteConfig):
-    """A game. Its options are those of `RemoteConfig`, with the names of scenes for texts."""
+    """A game. It is a `RemoteConfig`, but some options of texts have other names."""
 
     def __init__(self, scene_id: str | None = None, **_more: Any) -> None:
         super().__init__()
         self.scene_id = scene_id
         self.max_steps: int | None = None
         self.ignored: list[str] = []
-        """Options of scenes that have no effect."""
+        """The options of scenes that the experiment has set and that have no effect."""
         self.before: list[StaticScene] = []
         self.after: list[StaticScene] = []
 
@@ -74,7 +71,7 @@ class StaticScene(_Scene):
         scene_body: str | None = None,
         scene_body_filepath: str | None = None,
     ) -> Self:
-        """Set its texts. Raises OSError if the file cannot be read."""
+        """Set the page's texts. Raises OSError if the file cannot be read."""
         if scene_body_filepath is not None:
             scene_body = Path(scene_body_filepath).read_text(encoding="utf-8")
         self.scene_header = self.scene_header if scene_header is None else scene_header
@@ -94,7 +91,7 @@ class EndScene(StaticScene):
     append_subject_id = False
 
     def redirect(self, url: str | None = None, append_subject_id: bool | None = None) -> Self:
-        """Where a link on the page leads to, with the participant's id at its end or without."""
+        """Set the address of the link on the page, and whether the participant's id is appended to it."""
         self.url = self.url if url is None else url
         self.append_subject_id = self.append_subject_id if append_subject_id is None else append_subject_id
         return self
@@ -120,21 +117,21 @@ class ExperimentConfig:
         self.hosted: dict[str, Any] = {}
 
     def experiment(self, experiment_id: str | None = None, stager: Stager | None = None, **_more: Any) -> Self:
-        """The scenes, and the experiment's name."""
+        """Set the experiment's id and its scenes."""
         self.experiment_id = experiment_id or self.experiment_id
         self.stager = stager or self.stager
         return self
 
     def hosting(self, **options: Any) -> Self:
-        """Where it is held: `host`, `port`, `max_ping`."""
+        """Set options of `RemoteConfig.hosting`: `host`, `port`, `max_ping`."""
         self.hosted |= options
         return self
 
 
 def game_of(config: Any) -> Any:
-    """The game of an experiment of scenes, with the pages before and after it; a RemoteConfig as it is.
+    """Return the game of an experiment of scenes, with the pages before and after it. Return anything else as it is.
 
-    Raises Unplayable unless there is one game, and pages that can be shown.
+    Raises Unplayable if there is not exactly one game, or if a page cannot be shown.
     """
     stager = config.stager if isinstance(config, ExperimentConfig) else config
     if not isinstance(stager, Stager):

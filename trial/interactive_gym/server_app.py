@@ -1,4 +1,4 @@
-"""`server_app.run(config)`: makes a project of an experiment and runs it on this machine."""
+"""`server_app.run(config)`: makes a project of an experiment, and runs it on this machine."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _END_SECONDS = 60
 
 
 def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bool = True) -> Path | None:
-    """Make the experiment's project, say where, and hold it until Ctrl-C.
+    """Make the experiment's project, print its folder, and run it until Ctrl-C. Return the folder.
 
-    `project` is its folder, by default one beside the experiment's file. Without `serve` it is only made. Returns the
-    folder. On a server, where the experiment's file is loaded again, it does nothing. Ends Python with a sentence and
-    exit status 1 if the experiment cannot be played here.
+    `project` is the folder, by default one beside the experiment's file. Without `serve`, the project is made, but not
+    run. On a participant's server, where the experiment's file is loaded again, this does nothing and returns None.
+    Raises SystemExit with a sentence if the experiment cannot be played here, or if the run fails.
     """
     if on_server.is_loading():
         return None
@@ -35,23 +35,23 @@ def run(config: Any, *, project: str | os.PathLike[str] | None = None, serve: bo
         game = game_of(config)
         if not isinstance(game, RemoteConfig):
             raise Unplayable(f"run() takes a RemoteConfig, not {type(config).__name__}")
-        standing = (config, getattr(config, "stager", None), game)
-        made = make(game, None if project is None else Path(project), standing)
+        candidates = (config, getattr(config, "stager", None), game)
+        made_project = make(game, None if project is None else Path(project), candidates)
     except Unplayable as error:
         sys.exit(f"This experiment cannot be played here: {error}")
-    for remark in made.remarks:
+    for remark in made_project.remarks:
         print(f"Remark: {remark}")
-    folder = shlex.quote(str(made.folder))
-    print(f"The project is in {made.folder}.")
+    folder = shlex.quote(str(made_project.folder))
+    print(f"The project is in {made_project.folder}.")
     check = f"make -C {shlex.quote(str(_HIPPODROME))} check PROJECT={folder}"
     print(f"Check it with `{check}`; deploy it as docs/aws-project.md says.", flush=True)
     if serve:
-        _hold(made.folder, game.port)
-    return made.folder
+        _run_locally(made_project.folder, game.port)
+    return made_project.folder
 
 
-def _hold(folder: Path, port: int) -> None:
-    """Hold the project by local mode, which says where participants find it, until Ctrl-C."""
+def _run_locally(folder: Path, port: int) -> None:
+    """Run the project on this machine by `python -m local`, which prints the participants' link, until Ctrl-C."""
     if importlib.util.find_spec("local") is None and not (_HIPPODROME / "local").is_dir():
         sys.exit("The project cannot be held here: there is no Hippodrome beside this package.")
     command = [sys.executable, "-m", "local", str(folder), "--port", str(port), "--data", str(folder / "data")]
@@ -73,10 +73,13 @@ def _interrupt(*_: Any) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """End local mode, which stores what is to be stored. A second Ctrl-C waits for it too."""
-    for wanted in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+    """End the local run, and wait while it stores the last data; a second Ctrl-C does not interrupt that at once.
+
+    Return 0, or 1 if it has not ended even by SIGKILL.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is None:
-            process.send_signal(wanted)
+            process.send_signal(number)
         with contextlib.suppress(KeyboardInterrupt, subprocess.TimeoutExpired):
             process.wait(_END_SECONDS)
             return 0

@@ -1,4 +1,4 @@
-"""The files of an experiment: which module its config stands in, and what of the researcher's code belongs to it."""
+"""Finds the files of an experiment: the module with its config, and the other files that the project needs."""
 
 from __future__ import annotations
 
@@ -18,39 +18,42 @@ from protocol.players import ONNXRUNTIME
 from trial.interactive_gym.playing import Unplayable
 
 MOST_BYTES = 50 * 2**20
-"""Of one file that lies beside the experiment's; larger ones are left out."""
+"""The most bytes of one file. Larger files are left out."""
 MOST_BYTES_IN_ALL = 500 * 2**20
-MADE = ".made-by-interactive-gym.json"
-"""In a project's folder: what was made there, and the hash of each file."""
+"""The most bytes of all files of an experiment."""
+HASHES = ".made-by-interactive-gym.json"
+"""The file of a project's folder that names the files that were made there, with their hashes."""
 _HIPPODROME = Path(__file__).resolve().parents[2]
-_SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's assets lie below its server's folder
+_SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's assets are in its server's folder
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
 _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _TAKEN = {"agent", "trial", "protocol"}
 _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
-"""Python imports these itself as it starts; Debian's and Ubuntu's stand outside its folders (`/etc/python3.11`)."""
+"""Modules that Python imports when it starts. Debian and Ubuntu have theirs outside Python's folders, below /etc."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigModule:
-    """The module in which a config stands."""
+    """The module that has a config as its `variable`."""
 
     module: str
     variable: str
     file: Path
     root: Path
-    """The folder from which its modules are imported."""
+    """The folder from which the experiment's modules are imported."""
     names: Mapping[str, Any]
+    """The values of all variables of the module."""
 
 
 def find(*configs: Any) -> ConfigModule:
-    """Where one of these stands. Raises Unplayable unless it is a variable of a module of the researcher's.
+    """Find the module of the researcher's that has one of these objects as a variable.
 
-    What stands below `if __name__ == "__main__"` is a variable too, but not on a server, so the last one counts most.
+    If there are several, the last object counts: an earlier one may be a variable only below
+    `if __name__ == "__main__"`, which does not run on a server. Raises Unplayable if there is none.
     """
-    found = [source for source in map(_find, (each for each in reversed(configs) if each is not None)) if source]
-    if found:
-        return found[0]
+    for config in reversed(configs):
+        if config is not None and (source := _find(config)) is not None:
+            return source
     raise Unplayable(
         "the config must be a variable of the experiment's file, such as config = RemoteConfig()…, so that servers "
         'find it there: write it above `if __name__ == "__main__"`'
@@ -82,13 +85,16 @@ def _source(module: ModuleType, variable: str, file: Path) -> ConfigModule:
 
 
 def locate(source: ConfigModule) -> Any:
-    """A function that finds a file that an option names: from here, or from the experiment's file upwards."""
-    here = [Path.cwd(), source.file.parent, *list(source.file.parents)[1:5]]
+    """A function that finds a file or folder that an option names, and returns None if there is none.
+
+    It looks in the current folder, in that of the experiment's file, and in the four above.
+    """
+    folders = [Path.cwd(), source.file.parent, *list(source.file.parents)[1:5]]
 
     def find_file(name: Any) -> Path | None:
         if not str(name):
             return None
-        for folder in here:
+        for folder in folders:
             for below in _SERVER_FOLDERS:
                 path = folder / below / str(name)
                 if path.exists():
@@ -99,53 +105,54 @@ def locate(source: ConfigModule) -> Any:
 
 
 def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list[str]]:
-    """The files that go into the project, by their paths there, and sentences about those that do not.
+    """The files that go into the project, by their paths in it, and sentences about those that are left out.
 
-    They are the modules that the experiment has imported from folders of the researcher's, and all that lies beside its
-    file.
+    They are the modules that the experiment has imported from folders of the researcher's, and all files in the folder
+    of the experiment's file. Raises Unplayable if these are too large.
     """
-    found: dict[str, Path] = {}
-    said = []
+    files: dict[str, Path] = {}
+    sentences = []
     for module in list(sys.modules.values()):
         file = _file(module)
-        if file is not None and file.is_relative_to(source.root) and _ours(file, source.root, target):
-            found[file.relative_to(source.root).as_posix()] = file
+        if file is not None and file.is_relative_to(source.root) and _is_own(file, source.root, target):
+            files[file.relative_to(source.root).as_posix()] = file
         if file is not None and (name := _from_elsewhere(module, file, source.root, target)):
-            found[name] = file
+            files[name] = file
     for file in _beside(source.file.parent, target):
-        found.setdefault(file.relative_to(source.root).as_posix(), file)
+        files.setdefault(file.relative_to(source.root).as_posix(), file)
     total = 0
-    for name, file in sorted(found.items()):
+    for name, file in sorted(files.items()):
         size = file.stat().st_size
         total += size
         if size > MOST_BYTES:
-            del found[name]
-            said.append(f"{name} is left out: it has {size / 2**20:.0f} MB, and {MOST_BYTES / 2**20:.0f} are the most")
+            del files[name]
+            megabytes, most = size / 2**20, MOST_BYTES / 2**20
+            sentences.append(f"{name} is left out: it has {megabytes:.0f} MB, and {most:.0f} are the most")
     if total > MOST_BYTES_IN_ALL:
         raise Unplayable(
             f"{source.file.parent} holds {total / 2**20:.0f} MB: put the experiment into a folder of its own"
         )
-    found[source.file.relative_to(source.root).as_posix()] = source.file
-    return found, said
+    files[source.file.relative_to(source.root).as_posix()] = source.file
+    return files, sentences
 
 
 def requirements(files: Iterable[Path], given: Iterable[str], modules: Collection[str] = ()) -> list[str]:
-    """The lines of requirements.txt: packages that these files import, with the versions here, and those given.
+    """The lines of requirements.txt: the packages that these files import, in their versions here, and `given` lines.
 
-    `modules` are imported by other code; `onnxruntime` is named even if it is not installed here.
+    `modules` are modules that other code imports. Of these `onnxruntime` gets a line even if it is not installed here.
     """
     packages = metadata.packages_distributions()
-    found = {"onnxruntime": ONNXRUNTIME} if "onnxruntime" in modules else {}
+    lines = {"onnxruntime": ONNXRUNTIME} if "onnxruntime" in modules else {}
     for name in sorted({*modules, *(name for file in files if file.suffix == ".py" for name in _imports(file))}):
         for package in packages.get(name, [])[:1]:
-            found[package.lower()] = f"{package}=={metadata.version(package)}"
+            lines[package.lower()] = f"{package}=={metadata.version(package)}"
     for line in given:
-        found[line.partition("=")[0].partition("<")[0].partition(">")[0].strip().lower()] = line
-    return [found[name] for name in sorted(found)]
+        lines[line.partition("=")[0].partition("<")[0].partition(">")[0].strip().lower()] = line
+    return [lines[name] for name in sorted(lines)]
 
 
 def _imports(file: Path) -> Iterator[str]:
-    """The top-level names of what a file imports."""
+    """The top-level names of the modules that a file imports."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
@@ -162,20 +169,21 @@ def _beside(folder: Path, target: Path) -> Iterator[Path]:
         if path.name in _LEFT_OUT or path.name.startswith(".") or path == target or path.is_symlink():
             continue
         if path.is_dir():
-            if not (path / "pyvenv.cfg").exists() and not (path / MADE).exists():
+            if not (path / "pyvenv.cfg").exists() and not (path / HASHES).exists():
                 yield from _beside(path, target)
         elif path.is_file() and path.suffix != ".pyc":
             yield path
 
 
-def _ours(file: Path, root: Path, target: Path) -> bool:
+def _is_own(file: Path, root: Path, target: Path) -> bool:
+    """Whether a file below `root` is the researcher's: not hidden, installed, in the project, or of Hippodrome."""
     parts = file.relative_to(root).parts
     hidden = any(part.startswith(".") or part == "site-packages" for part in parts)
     return not hidden and not file.is_relative_to(target) and not _of_hippodrome(file)
 
 
 def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) -> str | None:
-    """Where in the project a module belongs that comes from another folder of PYTHONPATH; None if it is no such one."""
+    """The path in the project of a module that comes from another folder of PYTHONPATH; None for other modules."""
     parts = module.__name__.split(".")
     if file.name == "__init__.py":
         parts.append("__init__")
@@ -186,7 +194,7 @@ def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) ->
         return None
     if parts[0] in {*_TAKEN, *_OF_THE_MACHINE, *metadata.packages_distributions()}:
         return None
-    if not _ours(file, came_from, target):
+    if not _is_own(file, came_from, target):
         return None
     return file.relative_to(came_from).as_posix()
 
@@ -206,6 +214,6 @@ def _file(module: Any) -> Path | None:
     return _resolved(name) if isinstance(name, str) and name.endswith(".py") else None
 
 
-@functools.cache  # each module is looked at several times
+@functools.cache  # each module's path is resolved several times
 def _resolved(path: str) -> Path:
     return Path(path).resolve()

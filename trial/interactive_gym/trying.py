@@ -17,14 +17,15 @@ from trial.interactive_gym.remote_config import RemoteConfig
 from trial.policies import onnx
 from trial.policies.policy import PolicyError
 
-_WORDS = 300
+_LONGEST = 300  # characters of an error
 
 
 def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | None], root: Path) -> Iterator[str]:
-    """Try each player's policy with what that player sees first. Yields sentences about those that cannot be tried.
+    """Try each player's policy with that player's first observation. Yield a sentence if some cannot be tried.
 
     `find` finds a file that an option names, `root` is the folder of the experiment's modules. Raises Unplayable if a
-    policy is no ONNX file, does not fit the environment, raises, or chooses an action that there is not.
+    policy's file cannot be read, if a policy does not fit the environment or raises an exception, or if it chooses an
+    action that does not exist.
     """
     untried = False
     for player, plays in playing.mapping_of(config).items() if look.several else ():
@@ -33,7 +34,7 @@ def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | 
         if looking.is_file(config, plays):
             file = find(plays)
             if file is None or not file.is_file():
-                continue  # that is said where the files are copied
+                continue  # `project.py` gives a remark about it when it copies the files
             if importlib.util.find_spec("onnxruntime") is None:
                 untried = True
                 continue
@@ -46,11 +47,11 @@ def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | 
 
 
 def _try_file(player: Any, file: Path, look: Look) -> None:
-    """As Hippodrome plays the file on a server."""
+    """Try a file as Hippodrome plays it on a server."""
     try:
         policy = onnx.load(file.name, file, look.counts[player], look.spaces.get(player), sample=True)
-        if player in look.seen:
-            policy.act(look.seen[player], {}, None)
+        if player in look.observations:
+            policy.act(look.observations[player], {}, None)
     except PolicyError as error:
         raise Unplayable(f"the policy of {player} does not fit: {error}") from error
 
@@ -58,7 +59,7 @@ def _try_file(player: Any, file: Path, look: Look) -> None:
 def _try_functions(
     config: RemoteConfig, player: Any, look: Look, find: Callable[[Any], Path | None], root: Path
 ) -> None:
-    """As the experiment's own functions play on a server."""
+    """Try the experiment's own functions as they play on a server."""
 
     def locate(name: Any) -> Any:
         path = find(name) if isinstance(name, str) else None
@@ -66,11 +67,11 @@ def _try_functions(
 
     try:
         policy = playing.policy_class(config, player, locate)()
-        action = policy.act(look.seen[player], {}) if player in look.seen else 0
+        action = policy.act(look.observations[player], {}) if player in look.observations else 0
     except Exception as error:
-        words = " ".join(f"{type(error).__name__}: {error}".split())
+        text = " ".join(f"{type(error).__name__}: {error}".split())
         place = where(error, root)
         at = f" ({place})" if place else ""
-        raise Unplayable(f"the policy of {player} fails: {words[:_WORDS]}{at}") from error
+        raise Unplayable(f"the policy of {player} fails: {text[:_LONGEST]}{at}") from error
     if not 0 <= action < look.counts[player]:
         raise Unplayable(f"the policy of {player} chose action {action}; there are 0 to {look.counts[player] - 1}")
