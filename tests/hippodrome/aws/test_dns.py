@@ -36,7 +36,7 @@ def test_one_change_for_the_whole_batch(moto_world: MotoWorld) -> None:
     assert moto_world.records() == {r.name: r.host for r in RECORDS[2:]}
 
 
-def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_change(moto_world: MotoWorld) -> None:
+def test_a_change_that_moves_a_name_does_not_also_remove_it(moto_world: MotoWorld) -> None:
     """Route 53 refuses a change that names one record twice."""
     names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
@@ -50,7 +50,7 @@ def test_a_name_that_leads_elsewhere_from_now_on_is_not_removed_in_the_same_chan
     assert moto_world.records() == {record.name: record.host for record in moved}
 
 
-def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: MotoWorld) -> None:
+def test_a_large_change_is_sent_in_parts_and_is_in_sync_when_all_parts_are(moto_world: MotoWorld) -> None:
     names = moto_world.platform.dns
     change = names.change(add=[_record(n) for n in range(801)])
     assert [len(call.params["ChangeBatch"]["Changes"]) for call in moto_world.calls] == [400, 400, 1]
@@ -62,7 +62,7 @@ def test_a_large_change_goes_in_parts_and_is_in_sync_when_all_are(moto_world: Mo
     assert len(list(names.list())) == 801
 
 
-def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld) -> None:
+def test_names_that_no_longer_exist_are_left_out_and_the_rest_is_sent_again(moto_world: MotoWorld) -> None:
     names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     with moto_world.recording() as calls:
@@ -72,7 +72,7 @@ def test_what_is_gone_is_left_out_and_the_rest_asked_again(moto_world: MotoWorld
     assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
 
 
-def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+def test_when_all_names_are_gone_there_is_no_change_to_wait_for(moto_world: MotoWorld) -> None:
     names = moto_world.platform.dns
     assert names.change(remove=RECORDS) == ""
     with moto_world.recording() as calls:
@@ -80,7 +80,7 @@ def test_when_everything_is_gone_nothing_is_left_to_wait_for(moto_world: MotoWor
     assert calls == []
 
 
-def test_a_refusal_in_unknown_words_is_taken_apart(moto_world: MotoWorld) -> None:
+def test_after_a_refusal_in_unknown_words_the_rest_of_the_change_still_succeeds(moto_world: MotoWorld) -> None:
     names = moto_world.platform.dns
     names.change(add=RECORDS[:2])
     moto_world.fail("route53:ChangeResourceRecordSets", "InvalidChangeBatch", "Something is wrong here")
@@ -89,7 +89,7 @@ def test_a_refusal_in_unknown_words_is_taken_apart(moto_world: MotoWorld) -> Non
     assert moto_world.records() == {RECORDS[3].name: RECORDS[3].host}
 
 
-def test_escaped_names_in_a_refusal_are_understood(moto_world: MotoWorld) -> None:
+def test_escaped_names_in_a_refusal_are_recognized(moto_world: MotoWorld) -> None:
     moto_world.fail(
         "route53:ChangeResourceRecordSets",
         "InvalidChangeBatch",
@@ -107,7 +107,7 @@ def test_the_messages_of_a_refusal_may_come_as_a_list(moto_world: MotoWorld) -> 
 
 
 @pytest.mark.parametrize("code", ["PriorRequestNotComplete", "Throttling"])
-def test_a_busy_zone_is_waited_for_though_not_for_ever(
+def test_a_change_of_a_busy_zone_is_tried_a_limited_number_of_times(
     moto_world: MotoWorld, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retry, "FIRST", 0.0)
@@ -120,11 +120,11 @@ def test_a_busy_zone_is_waited_for_though_not_for_ever(
         names.change(remove=RECORDS[:1])
 
 
-def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
+def test_tries_of_a_busy_zone_end_after_a_limited_time() -> None:
     clock = SimpleNamespace(now=0.0)
 
     def act() -> None:
-        clock.now += 3.0  # what botocore takes for its own tries
+        clock.now += 3.0  # the time that botocore takes for its own tries
         raise TimeoutError
 
     def sleep(seconds: float) -> None:
@@ -135,20 +135,20 @@ def test_waiting_for_a_zone_ends_well_before_the_function_does() -> None:
     assert 25 < clock.now <= retry.MAX_SECONDS + 3
 
 
-def test_a_look_beyond_the_accounts_calls_says_so(moto_world: MotoWorld) -> None:
+def test_a_throttled_status_request_raises_service_busy(moto_world: MotoWorld) -> None:
     moto_world.fail("route53:GetChange", "Throttling", times=9)
     with pytest.raises(ServiceBusy):
         moto_world.platform.dns.in_sync("C1")
 
 
 @pytest.mark.parametrize("code", ["AccessDenied", "NoSuchHostedZone"])
-def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
+def test_other_errors_are_raised_unchanged(moto_world: MotoWorld, code: str) -> None:
     moto_world.fail("route53:ChangeResourceRecordSets", code)
     with pytest.raises(ClientError, match=code):
         moto_world.platform.dns.change(add=RECORDS)
 
 
-def test_a_zone_that_somebody_has_deleted_has_no_names(moto_world: MotoWorld) -> None:
+def test_a_deleted_zone_has_no_names(moto_world: MotoWorld) -> None:
     """So that servers can still be stopped; additions fail."""
     names = moto_world.platform.dns
     moto_world.fail("route53:ListResourceRecordSets", "NoSuchHostedZone")
@@ -167,7 +167,7 @@ WORDS = {
 
 
 def refusing(world: MotoWorld, code: str, wrong: Callable[[str], bool]) -> None:
-    """From now on Route 53 refuses every batch that would add such a name, as a whole."""
+    """From now on Route 53 refuses, as a whole, every batch that would add a name for which `wrong` is true."""
 
     def added(params: Mapping[str, Any]) -> bool:
         changes = params["ChangeBatch"]["Changes"]
@@ -177,7 +177,7 @@ def refusing(world: MotoWorld, code: str, wrong: Callable[[str], bool]) -> None:
 
 
 @pytest.mark.parametrize("code", WORDS)
-def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld, code: str) -> None:
+def test_a_refused_name_does_not_prevent_the_others(moto_world: MotoWorld, code: str) -> None:
     refusing(moto_world, code, lambda name: name == TOO_LONG.name)
     names, many = moto_world.platform.dns, [_record(n) for n in range(40)]
     names.change(add=many[:1])
@@ -190,7 +190,7 @@ def test_one_name_that_is_refused_does_not_keep_the_others(moto_world: MotoWorld
     assert "x" * 64 not in str(refused.value), "a name may be an id"
 
 
-def test_a_name_that_is_taken_by_a_record_of_another_type_does_not_keep_the_others(moto_world: MotoWorld) -> None:
+def test_a_name_with_a_record_of_another_type_does_not_prevent_the_others(moto_world: MotoWorld) -> None:
     taken = DnsRecord("www.example.org", "203.0.113.9")
     alias = {"Name": taken.name, "Type": "CNAME", "TTL": 60, "ResourceRecords": [{"Value": "example.com"}]}
     moto_world.client("route53").change_resource_record_sets(
@@ -203,7 +203,7 @@ def test_a_name_that_is_taken_by_a_record_of_another_type_does_not_keep_the_othe
     assert list(moto_world.platform.dns.list()) == sorted(RECORDS)
 
 
-def test_when_all_names_are_refused_nothing_is_left_to_wait_for(moto_world: MotoWorld) -> None:
+def test_when_all_names_are_refused_there_is_no_change_to_wait_for(moto_world: MotoWorld) -> None:
     refusing(moto_world, "InvalidInput", lambda name: True)
     with pytest.raises(RefusedDnsRecords) as refused:
         moto_world.platform.dns.change(add=RECORDS)
@@ -246,7 +246,9 @@ def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
     assert list(moto_world.platform.dns.list()) == RECORDS[:1]
 
 
-def test_servers_are_found_on_their_level_and_where_earlier_versions_named_them(moto_world: MotoWorld) -> None:
+def test_servers_are_listed_at_the_present_level_of_names_and_at_that_of_earlier_versions(
+    moto_world: MotoWorld,
+) -> None:
     label = "s" + "a" * 20
     ours = [f"{label}-1.servers.example.org", f"{label}-2.example.org"]
     others = [f"{label}-3.other.example.org", f"{label}-4.a.servers.example.org", "alice.servers.example.org"]

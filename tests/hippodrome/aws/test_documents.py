@@ -20,7 +20,7 @@ def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(documents, "PAUSE", 0)
 
 
-def test_the_conditions_are_sent(moto_world: MotoWorld) -> None:
+def test_conditional_writes_send_their_conditions(moto_world: MotoWorld) -> None:
     store = moto_world.platform.documents
     etag = store.create(KEY, b"one")
     known = store.get(KEY)
@@ -36,7 +36,7 @@ def test_the_conditions_are_sent(moto_world: MotoWorld) -> None:
 
 
 @pytest.mark.parametrize("write", ["create", "replace"])
-def test_writers_who_meet_try_again(moto_world: MotoWorld, write: str) -> None:
+def test_a_write_that_meets_another_is_tried_again(moto_world: MotoWorld, write: str) -> None:
     store = moto_world.platform.documents
     etag = store.create("other.json", b"one")
     moto_world.fail("s3:PutObject", "ConditionalRequestConflict", status=409, times=2)
@@ -47,7 +47,7 @@ def test_writers_who_meet_try_again(moto_world: MotoWorld, write: str) -> None:
     assert moto_world.actions.count("s3:PutObject") == 4
 
 
-def test_writers_who_keep_meeting_give_up(moto_world: MotoWorld) -> None:
+def test_a_write_that_meets_another_at_every_try_raises_conflict(moto_world: MotoWorld) -> None:
     moto_world.fail("s3:PutObject", "ConditionalRequestConflict", status=409, times=99)
     with pytest.raises(Conflict):
         moto_world.platform.documents.create(KEY, b"one")
@@ -55,7 +55,7 @@ def test_writers_who_keep_meeting_give_up(moto_world: MotoWorld) -> None:
 
 
 @pytest.mark.parametrize(("code", "status"), [("AccessDenied", 403), ("SlowDown", 503), ("NoSuchBucket", 404)])
-def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str, status: int) -> None:
+def test_other_errors_are_raised_unchanged(moto_world: MotoWorld, code: str, status: int) -> None:
     store = moto_world.platform.documents
     for action, act in (
         ("s3:GetObject", lambda: store.get(KEY)),
@@ -70,7 +70,7 @@ def test_other_errors_come_as_they_are(moto_world: MotoWorld, code: str, status:
 
 
 @pytest.mark.explores
-def test_a_listing_pages(moto_world: MotoWorld, pages: int) -> None:
+def test_a_listing_reads_all_pages(moto_world: MotoWorld, pages: int) -> None:
     for n in range(pages + 1):
         moto_world.client("s3").put_object(Bucket=moto_world.env["BUCKET"], Key=f"k{n:04}", Body=b"")
     entries = moto_world.platform.documents.list("k")

@@ -40,7 +40,9 @@ def _shape(value: Any) -> Any:
         ("stopped_memory", "STOPPED", {"exit_code": 137, "container_reason": "OutOfMemoryError: Container killed"}),
     ],
 )
-def test_task_events(moto_world: MotoWorld, file: str, status: str, how: dict[str, Any]) -> None:
+def test_task_events_have_the_shape_of_the_examples(
+    moto_world: MotoWorld, file: str, status: str, how: dict[str, Any]
+) -> None:
     task = moto_world.platform.tasks.run(TaskRequest(NAME, "hippodrome", "hippodrome", 1, 2, {"TOKEN": "t"}))
     made = moto_world.task_event(task, status, **how)
     kept = json.loads(aws_events.load(f"sqs_task_{file}")["Records"][0]["body"])
@@ -52,7 +54,7 @@ def test_task_events(moto_world: MotoWorld, file: str, status: str, how: dict[st
             assert made["detail"].get(key) == kept["detail"].get(key)
 
 
-def test_a_stopped_task_says_why(moto_world: MotoWorld) -> None:
+def test_the_event_of_a_stopped_task_gives_the_reason(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     task = tasks.run(TaskRequest(NAME, "hippodrome", "hippodrome", 1, 2, {}))
     first = moto_world.task_event(task, "RUNNING")["detail"]
@@ -62,7 +64,7 @@ def test_a_stopped_task_says_why(moto_world: MotoWorld) -> None:
     assert last["version"] > first["version"]
 
 
-def test_sqs_batches(moto_world: MotoWorld) -> None:
+def test_sqs_batches_have_the_shape_of_the_examples(moto_world: MotoWorld) -> None:
     made = moto_world.sqs_event("start", [{"projectId": "study"}])["Records"][0]
     kept = aws_events.load("sqs_start_raw")["Records"][0]
     assert set(kept) == set(made)

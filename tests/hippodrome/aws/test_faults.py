@@ -1,14 +1,14 @@
 """The ports on moto: an error or a timeout at any call of any journey strands no participant and leaves nothing behind.
 
-Each journey runs once to count its calls, then once for each of its fault points: a call number, a kind of fault, how far
-it reaches (`testing/aws_faults.py` says which there are, and that they strike below botocore). Queues deliver again, timers fire
-and the sweep comes, as `testing/clocked_moto.py` has it; afterwards everybody must have been served or told how things are,
-what they answered must be there, and no task, name, timer, cluster, place, open record, message or dead letter be left.
-Nor may a function wait longer for AWS than it is given time.
+Each journey runs once to count its calls, then once for each of its fault points: a call number, a kind of fault, and its
+reach (`testing/aws_faults.py` lists the kinds and reaches; the faults occur below botocore). Queues deliver again, timers fire
+and the sweep runs, as `testing/clocked_moto.py` does it. Afterwards every participant must have been served, or told why not; their
+answers must be stored; and no task, name, timer, cluster, slot, open record, message or dead letter may be left.
+No function may wait longer for AWS than its timeout.
 
-All points are some thousands: `make hunt` plays them. The rule that chooses among them (`plan`): every call number of
-every journey, with the next of the kinds and reaches that there are for its operation; and at the last such call of all
-journeys, each kind that has not had its turn with that operation. `make test` plays a sample of those.
+There are some thousands of fault points: `make hunt` plays all of them. `plan` chooses among them: each call number of
+each journey gets the next kind and reach of its operation; the last call of an operation also gets each kind that
+this operation has not had yet. `make test` plays a sample of the chosen points.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Journey:
     name: str
     begin: Callable[[TimedInstallation], list[VisitorOnMoto]]
     changes: dict[str, Any] = field(default_factory=dict)  # of the project
-    finishes: bool = True  # whether they come to the last page where nothing goes wrong
-    spot: bool = True  # whether it has room
-    check: Callable[[TimedInstallation], list[str]] = lambda installation: []  # what else is wrong in the end
-    alarms: bool = False  # whether messages may come to the dead letters, and so to somebody's eyes
+    finishes: bool = True  # whether the participants come to the last page in a run without a fault
+    spot: bool = True  # whether Spot has capacity
+    check: Callable[[TimedInstallation], list[str]] = lambda installation: []  # returns what else is wrong at the end
+    alarms: bool = False  # whether messages may become dead letters, which raise an alarm
 
 
 def from_the_link(installation: TimedInstallation) -> list[VisitorOnMoto]:
@@ -83,7 +83,7 @@ def spot_strikes(installation: TimedInstallation) -> list[VisitorOnMoto]:
 
 
 def stop_overtakes_start(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    """Told to stop before it was started; the participant then asks for another one."""
+    """The stop message comes before the start message; the participant then asks for another server."""
     installation.delays["start"] = 20
     people = at_the_game(installation)
     installation.delays.clear()
@@ -99,7 +99,7 @@ def stopped_while_it_starts(installation: TimedInstallation) -> list[VisitorOnMo
 
 
 def no_event_tells(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    """The task ends after a while, and the event is lost: the sweep sees it, ten minutes after the request."""
+    """The task ends after 25 seconds and its event is lost: the sweep notices it ten minutes after the request."""
     first: list[str] = []
 
     def ran(task: str) -> None:
@@ -117,14 +117,14 @@ def no_event_tells(installation: TimedInstallation) -> list[VisitorOnMoto]:
 
 
 def no_timer_fires(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    """Nobody plays, and the timer is gone."""
+    """The participant leaves, and the timer is gone."""
     installation.clock.after(60, installation._schedules.clear)
     installation.sweeps_from = installation.clock.seconds + 540
     return nobody_plays(installation)
 
 
 def by_the_relays(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    """A program starts its server, stops it with a delay, and a second time at once."""
+    """A program starts its server, stops it with a delay of 60 seconds, and at once again with one of 30 seconds."""
     person = nobody_plays(installation)[0]
 
     def ask(relay: str, form: dict[str, str]) -> Iterator[float]:
@@ -148,7 +148,7 @@ def by_the_relays(installation: TimedInstallation) -> list[VisitorOnMoto]:
 
 
 def leftovers(installation: TimedInstallation) -> list[VisitorOnMoto]:
-    """Everything of a server that is closed; the first sweep comes at once."""
+    """Create all resources of a server whose record is closed; the first sweep comes at once."""
     label = ids.server_label(PROJECT, USER)
     name, now = ids.server_name(label, 1), installation.clock.now()
     closed = {
@@ -208,7 +208,7 @@ def registering(installation: TimedInstallation) -> list[VisitorOnMoto]:
 
 
 def registered(installation: TimedInstallation) -> list[str]:
-    """It is there once, as it should be, and its links and tickets are good as before."""
+    """Whether the project is in the list once, under its new name and with its old salt; what is wrong, if anything."""
     projects = installation.stored("project_master_list.json")["projects"]
     found = [(project["id"], project["name"], project["salt"]) for project in projects]
     expected = [(PROJECT, "Another name", installation.project["salt"])]
@@ -254,7 +254,9 @@ JOURNEYS = (
     Journey("the trial ends by itself", ends_by_itself, finishes=False),
     Journey("the stop comes before the start", stop_overtakes_start),
     Journey("the stop comes while it starts", stopped_while_it_starts),
-    Journey("no event tells of its end", no_event_tells, alarms=True),  # that it runs cannot be dealt with any more
+    Journey(
+        "no event tells of its end", no_event_tells, alarms=True
+    ),  # the message that the task runs cannot be handled any more
     Journey("programs use the relays", by_the_relays, finishes=False),
     Journey("the sweep finds leftovers", leftovers, {"maxServers": 3}),
     Journey("a study is registered anew", registering, check=registered),
@@ -264,13 +266,13 @@ JOURNEYS = (
 
 @dataclass
 class Outcome:
-    """What came of one run."""
+    """The result of one run."""
 
     journey: str
     fault: AwsFault | None
     made: MadeCall | None
     calls: list[MadeCall]
-    wrong: list[str]  # nothing where all is well
+    wrong: list[str]  # empty if nothing is wrong
     failures: list[str]
 
     def __str__(self) -> str:
@@ -300,8 +302,8 @@ def run(installation: TimedInstallation, journey: Journey, fault: AwsFault | Non
 
 def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
     """The fault points of each journey, by the rule above."""
-    combos = {c.action: every(c.action) for made in calls.values() for c in made}
-    turn = {action: itertools.cycle(order(found)) for action, found in combos.items()}
+    combos = {c.action: faults_of(c.action) for made in calls.values() for c in made}
+    turn = {action: itertools.cycle(worst_first(found)) for action, found in combos.items()}
     points: dict[str, list[AwsFault]] = {name: [] for name in calls}
     last: dict[str, tuple[str, int]] = {}
     for name, made in calls.items():
@@ -312,17 +314,17 @@ def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
     done = {(calls[name][p.number - 1].action, p.kind) for name, found in points.items() for p in found}
     for action, found in combos.items():
         name, number = last[action]
-        missing = {kind: reach for kind, reach in order(found)[::-1] if (action, kind) not in done}
+        missing = {kind: reach for kind, reach in worst_first(found)[::-1] if (action, kind) not in done}
         points[name] += [AwsFault(number, kind, reach) for kind, reach in missing.items()]
     return points
 
 
-def every(action: str) -> list[tuple[FaultKind, Reach]]:
-    """All that can go wrong with an operation."""
+def faults_of(action: str) -> list[tuple[FaultKind, Reach]]:
+    """All kinds and reaches of faults of an operation."""
     return [(kind, reach) for kind in kinds(action) for reach in reaches(action, kind)]
 
 
-def order(combos: list[tuple[FaultKind, Reach]]) -> list[tuple[FaultKind, Reach]]:
+def worst_first(combos: list[tuple[FaultKind, Reach]]) -> list[tuple[FaultKind, Reach]]:
     """The worst first: calls that were made and whose reply is lost; then the errors of the port."""
     return sorted(combos, key=lambda combo: (combo[1] is Reach.ATTEMPT, combo[0] is not FaultKind.READ))
 
@@ -353,7 +355,7 @@ def calls(installation: TimedInstallation) -> Calls:
 @pytest.mark.explores
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("journey", JOURNEYS, ids=lambda journey: journey.name)
-def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(
+def test_a_fault_at_any_call_strands_no_participant_and_leaves_nothing(
     journey: Journey, installation: TimedInstallation, calls: Calls
 ) -> None:
     made = calls[journey.name]
@@ -366,7 +368,7 @@ def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(
     assert not bad, f"{len(bad)} of {len(outcomes)}:\n" + "\n".join(map(str, bad[:20]))
 
 
-def test_the_points_cover_every_call_and_all_that_can_go_wrong(calls: Calls) -> None:
+def test_the_fault_points_cover_every_call_and_every_kind_of_fault(calls: Calls) -> None:
     points = plan(calls)
     for name, made in calls.items():
         assert {point.number for point in points[name]} == set(range(1, len(made) + 1))
@@ -375,17 +377,17 @@ def test_the_points_cover_every_call_and_all_that_can_go_wrong(calls: Calls) -> 
     assert {(action, kind) for action, kind, _ in done} == {
         (action, kind) for action in actions for kind in kinds(action)
     }
-    assert {(kind, reach) for _, kind, reach in done} == {combo for action in actions for combo in every(action)}
+    assert {(kind, reach) for _, kind, reach in done} == {combo for action in actions for combo in faults_of(action)}
     print(f"{sum(map(len, points.values()))} fault points of {sum(map(len, plan(calls, ALL).values()))}: ")
     print(
         f"{len(actions)} operations in {len(done)} ways; {sum(map(len, calls.values()))} calls in {len(calls)} journeys"
     )
 
 
-def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(
+def test_without_the_sweep_and_with_one_delivery_faults_leave_something_behind(
     installation: TimedInstallation, calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The exploration sees what it should: the same faults, without what repairs them."""
+    """The exploration notices damage: the same faults, without the sweep and the second delivery that repair it."""
 
     def unswept(installation: TimedInstallation) -> list[VisitorOnMoto]:
         installation.sweeps_from = math.inf

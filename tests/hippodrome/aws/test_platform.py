@@ -21,7 +21,7 @@ def _loaded(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_importing_costs_next_to_nothing() -> None:
+def test_importing_the_package_loads_no_large_module() -> None:
     loaded = _loaded("import hippodrome.aws; hippodrome.aws.AwsPlatform({}).settings")
     assert not {"boto3", "botocore", "urllib3", "asyncio", "logging"} & loaded
 
@@ -60,13 +60,13 @@ def test_a_missing_region_is_named() -> None:
         AwsPlatform({"BUCKET": "b"}).documents.get("key")
 
 
-def test_only_what_is_used_needs_to_be_there() -> None:
+def test_a_variable_that_no_call_needs_may_be_missing() -> None:
     platform = AwsPlatform({})
     assert platform.dns.browser_host(DnsRecord("a.example.org", "203.0.113.1")) == "a.example.org"
     assert platform.settings.max_runtime == 24 * 60
 
 
-def test_front_ends_without_tokens_are_allowed_by_one_word_alone() -> None:
+def test_only_the_value_allowed_lets_front_ends_in_without_tokens() -> None:
     for value, allowed in (("allowed", True), ("refused", False), ("", False), ("true", False)):
         assert AwsPlatform({"PLAIN_CLIENTS": value}).settings.plain_clients is allowed
     assert AwsPlatform({}).settings.plain_clients is False
@@ -80,7 +80,7 @@ def test_pages_may_connect_to_servers_on_their_two_ports_and_nowhere_else() -> N
     assert AwsPlatform({}).settings.game_sources == ""
 
 
-def test_no_call_waits_for_ever(moto_world: MotoWorld) -> None:
+def test_every_client_has_timeouts(moto_world: MotoWorld) -> None:
     platform = moto_world.platform
     for service, seconds in (("s3", 5), ("ecs", 10), ("route53", 5)):
         config = platform._client(service).meta.config
@@ -94,7 +94,7 @@ def test_one_client_per_service(moto_world: MotoWorld) -> None:
     assert platform.documents is platform.documents
 
 
-def test_next_step_calls_s3_and_sns_alone(moto_world: MotoWorld) -> None:
+def test_next_step_has_clients_of_s3_and_sns_only(moto_world: MotoWorld) -> None:
     platform = moto_world.platform
     platform.documents.get("project_master_list.json")
     platform.dns.browser_host(DnsRecord("a.example.org", "203.0.113.1"))

@@ -18,7 +18,7 @@ NAME = "s" + "a" * 20 + "-1"
 REQUEST = TaskRequest(NAME, "hippodrome", "hippodrome", 0.25, 0.5, {"TOKEN": "secret", "USER_ID": "P1"})
 
 
-def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
+def test_run_task_gets_the_parameters_of_the_request(moto_world: MotoWorld) -> None:
     moto_world.platform.tasks.run(REQUEST)
     [call] = moto_world.calls
     assert call.action == "ecs:RunTask"
@@ -45,13 +45,13 @@ def test_what_run_task_is_asked(moto_world: MotoWorld) -> None:
     assert len(call.params["clientToken"]) == 64
 
 
-def test_a_server_is_told_the_port_of_its_request(moto_world: MotoWorld) -> None:
+def test_a_server_gets_the_port_of_its_request(moto_world: MotoWorld) -> None:
     moto_world.platform.tasks.run(replace(REQUEST, port=443))
     told = moto_world.calls[0].params["overrides"]["containerOverrides"][0]["environment"]
     assert {"name": "PORT", "value": "443"} in told
 
 
-def test_on_demand_is_another_task_than_spot(moto_world: MotoWorld) -> None:
+def test_a_request_on_demand_runs_another_task_than_one_on_spot(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     assert tasks.run(REQUEST) != tasks.run(replace(REQUEST, spot=False))
     assert moto_world.calls[1].params["capacityProviderStrategy"] == [{"capacityProvider": "FARGATE", "weight": 1}]
@@ -59,18 +59,18 @@ def test_on_demand_is_another_task_than_spot(moto_world: MotoWorld) -> None:
     assert client_token(REQUEST) != client_token(replace(REQUEST, name=f"{NAME}0"))
 
 
-def test_a_name_that_is_used_again_after_an_erasure_is_another_task(moto_world: MotoWorld) -> None:
+def test_a_name_that_is_used_again_after_an_erasure_runs_another_task(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     first = tasks.run(replace(REQUEST, nonce="before"))
     assert tasks.run(replace(REQUEST, nonce="before")) == first
     assert tasks.run(replace(REQUEST, nonce="after")) != first
 
 
-def test_the_environment_does_not_show_in_the_requests_repr() -> None:
+def test_the_repr_of_a_request_does_not_show_its_environment() -> None:
     assert "secret" not in repr(REQUEST)
 
 
-def test_overrides_that_ecs_would_not_take(moto_world: MotoWorld) -> None:
+def test_overrides_that_are_too_long_for_ecs_are_refused_without_a_call(moto_world: MotoWorld) -> None:
     with pytest.raises(Refused, match=r"takes \d+ characters, and ECS allows 8192"):
         moto_world.platform.tasks.run(replace(REQUEST, environment={"TRIAL": "x" * 8000}))
     assert moto_world.calls == []
@@ -100,7 +100,7 @@ def test_failures_of_run_task(moto_world: MotoWorld, reason: str, kind: type[Exc
         moto_world.platform.tasks.run(REQUEST)
 
 
-def test_run_task_that_says_nothing(moto_world: MotoWorld) -> None:
+def test_an_empty_answer_of_run_task_means_no_capacity(moto_world: MotoWorld) -> None:
     moto_world.answer("ecs:RunTask", {"tasks": [], "failures": []})
     with pytest.raises(NoCapacity):
         moto_world.platform.tasks.run(REQUEST)
@@ -142,7 +142,9 @@ def test_errors_of_run_task(moto_world: MotoWorld, code: str, message: str, kind
     assert message in str(caught.value)
 
 
-def test_a_participants_own_cluster_may_need_a_moment(moto_world: MotoWorld) -> None:
+def test_a_participants_own_cluster_that_is_not_ready_raises_an_error_that_is_tried_again(
+    moto_world: MotoWorld,
+) -> None:
     own = replace(REQUEST, cluster=NAME)
     with pytest.raises(ClientError, match="ClusterNotFound"):
         moto_world.platform.tasks.run(own)
@@ -154,8 +156,8 @@ def test_a_participants_own_cluster_may_need_a_moment(moto_world: MotoWorld) -> 
         moto_world.platform.tasks.run(REQUEST)
 
 
-def test_a_participants_own_cluster_is_not_measured_whatever_the_account_does(moto_world: MotoWorld) -> None:
-    """Container Insights would cost by the metric, and leave a log group of the cluster's name behind."""
+def test_a_participants_own_cluster_has_no_container_insights(moto_world: MotoWorld) -> None:
+    """Container Insights costs per metric, and leaves a log group of the cluster's name behind."""
     moto_world.platform.tasks.create_cluster(NAME)
     [call] = moto_world.calls
     assert call.params["settings"] == [{"name": "containerInsights", "value": "disabled"}]
@@ -183,7 +185,7 @@ def test_errors_of_stop_task(moto_world: MotoWorld, code: str, message: str, fin
 
 def test_one_call_for_all_addresses_and_one_more_if_some_are_gone(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
-    interfaces = [_interface(moto_world, tasks.run(replace(REQUEST, name=NAME[:-1] + str(n)))) for n in range(1, 4)]
+    interfaces = [interface_of(moto_world, tasks.run(replace(REQUEST, name=NAME[:-1] + str(n)))) for n in range(1, 4)]
     with moto_world.recording() as calls:
         assert len(tasks.addresses(interfaces)) == 3
     assert [call.operation for call in calls] == ["DescribeNetworkInterfaces"]
@@ -204,13 +206,13 @@ def test_an_interface_without_a_public_address_is_left_out(moto_world: MotoWorld
     assert moto_world.platform.tasks.addresses([_id(event)]) == {}
 
 
-def test_an_error_about_no_interface_of_ours_is_raised(moto_world: MotoWorld) -> None:
+def test_an_error_that_names_no_requested_interface_is_raised(moto_world: MotoWorld) -> None:
     moto_world.fail("ec2:DescribeNetworkInterfaces", "InvalidNetworkInterfaceID.NotFound", "something else")
     with pytest.raises(ClientError):
         moto_world.platform.tasks.addresses(["eni-1"])
 
 
-def test_other_peoples_tasks_and_clusters_are_not_ours(moto_world: MotoWorld) -> None:
+def test_tasks_and_clusters_of_others_are_not_listed(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     tasks.run(replace(REQUEST, name="ecs-svc/1234567890"))
     moto_world.client("ecs").create_cluster(clusterName="somebody-elses")
@@ -219,8 +221,8 @@ def test_other_peoples_tasks_and_clusters_are_not_ours(moto_world: MotoWorld) ->
     assert list(tasks.clusters()) == []
 
 
-def test_tasks_are_counted_without_a_look_at_what_they_are_told(moto_world: MotoWorld) -> None:
-    """Who may see no more than lists can count them: `status` runs with a researcher's rights."""
+def test_tasks_are_counted_with_list_calls_only(moto_world: MotoWorld) -> None:
+    """`status` counts them with a researcher's rights, which allow no more than lists."""
     tasks = moto_world.platform.tasks
     tasks.create_cluster(NAME)
     for request in (REQUEST, replace(REQUEST, name=f"{NAME[:-1]}2"), replace(REQUEST, cluster=NAME)):
@@ -232,7 +234,7 @@ def test_tasks_are_counted_without_a_look_at_what_they_are_told(moto_world: Moto
     assert {call.action for call in calls} == {"ecs:ListClusters", "ecs:ListTasks"}
 
 
-def test_a_cluster_that_goes_while_tasks_are_counted_holds_none(moto_world: MotoWorld) -> None:
+def test_a_cluster_that_is_deleted_during_the_count_counts_no_tasks(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     tasks.run(REQUEST)
     tasks.create_cluster(NAME)
@@ -245,7 +247,7 @@ def test_a_cluster_that_goes_while_tasks_are_counted_holds_none(moto_world: Moto
         tasks.count()
 
 
-def test_a_cluster_that_goes_while_tasks_are_listed(moto_world: MotoWorld) -> None:
+def test_a_cluster_that_is_deleted_during_the_listing_has_no_tasks(moto_world: MotoWorld) -> None:
     tasks = moto_world.platform.tasks
     task = tasks.run(REQUEST)
     tasks.create_cluster(NAME)
@@ -255,7 +257,7 @@ def test_a_cluster_that_goes_while_tasks_are_listed(moto_world: MotoWorld) -> No
     assert list(listing) == []
 
 
-def _interface(world: MotoWorld, task: str) -> str:
+def interface_of(world: MotoWorld, task: str) -> str:
     return _id(world.task_event(task, "RUNNING"))
 
 

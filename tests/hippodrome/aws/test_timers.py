@@ -17,7 +17,7 @@ NAME = "s" + "a" * 20 + "-1"
 MESSAGE = {"projectId": "study", "userId": "P1"}
 
 
-def test_what_the_scheduler_is_asked(moto_world: MotoWorld) -> None:
+def test_the_scheduler_gets_the_parameters_of_the_timer(moto_world: MotoWorld) -> None:
     at = datetime(2031, 7, 1, 14, 30, 59, 999_999, tzinfo=timezone(timedelta(hours=-4)))
     moto_world.platform.timers.set(NAME, at, MESSAGE)
     [call] = moto_world.calls
@@ -33,7 +33,7 @@ def test_what_the_scheduler_is_asked(moto_world: MotoWorld) -> None:
     assert json.loads(asked["Target"]["Input"]) == MESSAGE
 
 
-def test_a_time_that_has_passed_becomes_soon(moto_world: MotoWorld) -> None:
+def test_a_timer_for_a_time_in_the_past_is_set_to_20_seconds_from_now(moto_world: MotoWorld) -> None:
     timers = moto_world.platform.timers
     for ago in (timedelta(hours=1), timedelta(0), timedelta(seconds=-5)):
         timers.set(NAME, moto_world.platform.now() - ago, MESSAGE)
@@ -46,14 +46,14 @@ def test_a_time_without_a_zone_is_a_mistake(moto_world: MotoWorld) -> None:
         moto_world.platform.timers.set(NAME, datetime(2031, 1, 1), MESSAGE)
 
 
-def test_a_timer_that_fires_while_it_is_replaced(moto_world: MotoWorld) -> None:
+def test_a_timer_that_fires_while_it_is_replaced_is_created_anew(moto_world: MotoWorld) -> None:
     moto_world.fail("scheduler:CreateSchedule", "ConflictException")
     moto_world.platform.timers.set(NAME, moto_world.platform.now() + timedelta(hours=1), MESSAGE)
     assert moto_world.actions == ["scheduler:CreateSchedule", "scheduler:UpdateSchedule", "scheduler:CreateSchedule"]
     assert list(moto_world.timers()) == [NAME]
 
 
-def test_a_timer_that_can_neither_be_made_nor_replaced(moto_world: MotoWorld) -> None:
+def test_a_timer_that_can_be_neither_created_nor_replaced_raises_the_error(moto_world: MotoWorld) -> None:
     moto_world.fail("scheduler:CreateSchedule", "ConflictException", times=9)
     with pytest.raises(ClientError, match="ResourceNotFoundException"):
         moto_world.platform.timers.set(NAME, moto_world.platform.now(), MESSAGE)
@@ -61,7 +61,7 @@ def test_a_timer_that_can_neither_be_made_nor_replaced(moto_world: MotoWorld) ->
 
 
 @pytest.mark.parametrize("code", ["ThrottlingException", "ValidationException", "AccessDeniedException"])
-def test_other_errors_of_the_scheduler_come_as_they_are(moto_world: MotoWorld, code: str) -> None:
+def test_other_errors_of_the_scheduler_are_raised_unchanged(moto_world: MotoWorld, code: str) -> None:
     timers = moto_world.platform.timers
     moto_world.fail("scheduler:CreateSchedule", code)
     with pytest.raises(ClientError, match=code):
@@ -71,7 +71,7 @@ def test_other_errors_of_the_scheduler_come_as_they_are(moto_world: MotoWorld, c
         timers.cancel(NAME)
 
 
-def test_schedules_of_other_groups_are_not_ours(moto_world: MotoWorld) -> None:
+def test_schedules_of_other_groups_are_not_listed(moto_world: MotoWorld) -> None:
     moto_world.client("scheduler").create_schedule(
         Name="theirs",
         ScheduleExpression="at(2031-01-01T00:00:00)",
@@ -81,7 +81,7 @@ def test_schedules_of_other_groups_are_not_ours(moto_world: MotoWorld) -> None:
     assert list(moto_world.platform.timers.list()) == []
 
 
-def test_what_sns_and_sqs_are_asked(moto_world: MotoWorld) -> None:
+def test_sns_and_sqs_get_the_parameters_of_the_message(moto_world: MotoWorld) -> None:
     bus = moto_world.platform.bus
     bus.publish(Topic.STOP, MESSAGE)
     bus.send_delayed(MESSAGE, 30)
@@ -94,7 +94,7 @@ def test_what_sns_and_sqs_are_asked(moto_world: MotoWorld) -> None:
 
 
 @pytest.mark.parametrize("seconds", [-1, 901])
-def test_a_delay_that_sqs_does_not_take(moto_world: MotoWorld, seconds: int) -> None:
+def test_a_delay_that_sqs_does_not_accept_raises_value_error(moto_world: MotoWorld, seconds: int) -> None:
     with pytest.raises(ValueError, match="0 to 900"):
         moto_world.platform.bus.send_delayed(MESSAGE, seconds)
 
@@ -108,7 +108,7 @@ def test_without_raw_delivery_a_message_comes_in_an_envelope() -> None:
         assert json.loads(envelope["Message"]) == MESSAGE
 
 
-def test_another_region() -> None:
+def test_an_installation_works_in_another_region() -> None:
     with MotoWorld(region="ca-central-1") as world:
         world.platform.documents.create("a.json", b"{}")
         world.platform.bus.publish(Topic.START, MESSAGE)

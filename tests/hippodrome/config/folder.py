@@ -88,7 +88,7 @@ def read(folder: Path, text: str) -> Config:
 
 
 def mistakes(folder: Path, text: str | bytes) -> list[str]:
-    """The mistakes as lines, as a researcher reads them."""
+    """The messages that a researcher sees for this config.yml, one per line."""
     data = text if isinstance(text, bytes) else textwrap.dedent(text).encode()
     (folder / "config.yml").write_bytes(data)
     with pytest.raises(ConfigErrors) as caught:
@@ -108,7 +108,7 @@ def small(project: str = "", trial: str = "", steps: str = "") -> str:
     return before + textwrap.indent(project, "  ") + "trial:\n" + after + textwrap.indent(trial, "  ")
 
 
-def one(folder: Path, text: str | bytes) -> str:
+def only_mistake(folder: Path, text: str | bytes) -> str:
     """The one mistake of a file, without the file's name and line."""
     (line,) = mistakes(folder, text)
     return re.sub(r"^config\.yml(:\d+)?: ", "", line)

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import ConfigErrors, read_project
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, one, small
+from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, small
 
 __all__ = ["folder"]
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "expected"),
     [
         (b"", "config.yml: the file is empty; it needs the sections project and trial"),
         (b"# nothing\n", "config.yml: the file is empty; it needs the sections project and trial"),
@@ -49,8 +49,8 @@ __all__ = ["folder"]
         (b"a: " + b"{b: " * 30 + b"1" + b"}" * 30, "config.yml:1: the sections are nested too deeply"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_answered_with_a_sentence(folder: Path, data: bytes, said: str) -> None:
-    assert mistakes(folder, data) == [said]
+def test_a_file_that_cannot_be_read_gets_one_message(folder: Path, data: bytes, expected: str) -> None:
+    assert mistakes(folder, data) == [expected]
 
 
 @pytest.mark.parametrize(
@@ -65,35 +65,35 @@ def test_a_file_that_cannot_be_read_is_answered_with_a_sentence(folder: Path, da
         ('a: "\\q"\n', 1, '"a: "\\q""'),
     ],
 )
-def test_other_syntax_errors_are_told_as_yaml_tells_them(folder: Path, text: str, line: int, quoted: str) -> None:
-    """With the line, its text and what to look at."""
-    (said,) = mistakes(folder, text)
-    assert said.startswith(f"config.yml:{line}: YAML cannot read {quoted}, column ")
-    assert said.endswith("; check quotes, brackets and indentation")
+def test_other_syntax_errors_get_the_message_of_yaml(folder: Path, text: str, line: int, quoted: str) -> None:
+    """The message has the line, its text and what to look at."""
+    (expected,) = mistakes(folder, text)
+    assert expected.startswith(f"config.yml:{line}: YAML cannot read {quoted}, column ")
+    assert expected.endswith("; check quotes, brackets and indentation")
 
 
-def test_a_bomb_of_anchors_does_not_go_off(folder: Path) -> None:
+def test_anchors_that_multiply_without_limit_are_refused(folder: Path) -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
-    said = "config.yml: the file holds too many values; do not repeat large parts with aliases (*name)"
-    assert mistakes(folder, "\n".join(lines)) == [said]
+    expected = "config.yml: the file holds too many values; do not repeat large parts with aliases (*name)"
+    assert mistakes(folder, "\n".join(lines)) == [expected]
 
 
-def test_an_anchor_within_itself_ends(folder: Path) -> None:
+def test_an_anchor_within_itself_is_refused(folder: Path) -> None:
     assert mistakes(folder, "a: &a [*a]") == ["config.yml:1: the sections are nested too deeply"]
 
 
-def test_no_folder(folder: Path) -> None:
-    for place, said in (
+def test_a_path_that_is_no_folder_is_refused(folder: Path) -> None:
+    for place, expected in (
         (folder / "nowhere", "there is no such folder"),
         (folder / "steps" / "consent.html", "this is a file; name the folder it is in"),
     ):
         with pytest.raises(ConfigErrors) as caught:
             read_project(place)
-        assert str(caught.value) == f"{place}: {said}"
+        assert str(caught.value) == f"{place}: {expected}"
 
 
-def test_no_file_and_two_files(folder: Path) -> None:
+def test_a_missing_file_and_two_files_are_refused(folder: Path) -> None:
     with pytest.raises(ConfigErrors) as caught:
         read_project(folder)
     assert str(caught.value) == f"config.yml: there is no such file in {folder}"
@@ -101,7 +101,7 @@ def test_no_file_and_two_files(folder: Path) -> None:
     assert mistakes(folder, SMALL) == ["config.yml: there is a config.yaml too; keep only one of them"]
 
 
-def test_a_key_given_twice(folder: Path) -> None:
+def test_a_key_that_is_given_twice_is_refused(folder: Path) -> None:
     assert mistakes(folder, small(project="live: true\nid: other\nlive: false\n")) == [
         "config.yml:8: project.id: given twice (first on line 2); keep one",
         "config.yml:9: project.live: given twice (first on line 7); keep one",
@@ -110,7 +110,7 @@ def test_a_key_given_twice(folder: Path) -> None:
     assert mistakes(folder, text) == ["config.yml:5: project.steps.1: given twice (first on line 4); keep one"]
 
 
-def test_merge_keys_and_odd_keys(folder: Path) -> None:
-    assert one(folder, small(project="<<: {live: true}\n")) == "project: << is not allowed; write the keys out"
-    said = "project: a key must be a plain word or number, not a list or a map"
-    assert one(folder, small(project="? [a, b]\n: c\n")) == said
+def test_merge_keys_and_keys_that_are_no_words_are_refused(folder: Path) -> None:
+    assert only_mistake(folder, small(project="<<: {live: true}\n")) == "project: << is not allowed; write the keys out"
+    expected = "project: a key must be a plain word or number, not a list or a map"
+    assert only_mistake(folder, small(project="? [a, b]\n: c\n")) == expected

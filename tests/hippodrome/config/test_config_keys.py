@@ -1,4 +1,4 @@
-"""The keys of config.yml and their values: the message about each mistake."""
+"""The keys of config.yml and their values: the message for each mistake."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import ConfigErrors, fargate, parse_registration
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, one, read, small
+from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
 
 __all__ = ["folder"]
 
@@ -16,7 +16,7 @@ __all__ = ["folder"]
 
 
 @pytest.mark.parametrize(
-    ("project", "trial", "said"),
+    ("project", "trial", "expected"),
     [
         ("maxRuntme: 5", "", "project.maxRuntme: unknown key; did you mean maxRuntime?"),
         ("max_runtime: 5", "", "project.max_runtime: unknown key; did you mean maxRuntime?"),
@@ -62,8 +62,13 @@ __all__ = ["folder"]
         ),
     ],
 )
-def test_a_key_in_the_wrong_place_or_with_the_wrong_name(folder: Path, project: str, trial: str, said: str) -> None:
-    assert one(folder, small(project=project + "\n" if project else "", trial=trial + "\n" if trial else "")) == said
+def test_a_key_in_the_wrong_place_or_with_a_wrong_name_gets_a_message(
+    folder: Path, project: str, trial: str, expected: str
+) -> None:
+    assert (
+        only_mistake(folder, small(project=project + "\n" if project else "", trial=trial + "\n" if trial else ""))
+        == expected
+    )
 
 
 def test_a_trial_indented_under_the_project_is_one_mistake(folder: Path) -> None:
@@ -73,7 +78,7 @@ def test_a_trial_indented_under_the_project_is_one_mistake(folder: Path) -> None
     ]
 
 
-def test_sections_that_are_missing(folder: Path) -> None:
+def test_missing_sections_get_a_message(folder: Path) -> None:
     assert mistakes(folder, "trial: {}") == ["config.yml:1: the section project is missing"]
     assert mistakes(folder, "projct: {id: a}") == ["config.yml:1: projct: unknown key; did you mean project?"]
     assert mistakes(folder, "project:\n  name: x\n") == [
@@ -87,7 +92,7 @@ def test_sections_that_are_missing(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("project", "said"),
+    ("project", "expected"),
     [
         ("live: perhaps", 'live: must be true or false, not "perhaps"'),
         ("live: 1", "live: must be true or false, not 1"),
@@ -156,12 +161,12 @@ def test_sections_that_are_missing(folder: Path) -> None:
         ("events: {startServerStep: first}", 'events.startServerStep: must be the number of a step or finalStep, not "first"'),
     ],
 )  # fmt: skip
-def test_a_value_of_the_project_that_cannot_be(folder: Path, project: str, said: str) -> None:
-    assert one(folder, small(project=project + "\n")) == f"project.{said}"
+def test_a_wrong_value_under_project_gets_a_message(folder: Path, project: str, expected: str) -> None:
+    assert only_mistake(folder, small(project=project + "\n")) == f"project.{expected}"
 
 
 @pytest.mark.parametrize(
-    ("trial", "said"),
+    ("trial", "expected"),
     [
         ("maxEpisodes: many", 'maxEpisodes: must be a whole number from 1 to 1000000, not "many"'),
         ("maxEpisodes: 0", "maxEpisodes: must be a whole number from 1 to 1000000, not 0"),
@@ -191,8 +196,8 @@ def test_a_value_of_the_project_that_cannot_be(folder: Path, project: str, said:
         ("allowFrameRateChange: yes\nminFrameRate: 40", "minFrameRate: must be at most startingFrameRate, which is 30 by default, not 40; set startingFrameRate too"),
     ],
 )  # fmt: skip
-def test_a_value_of_the_trial_that_cannot_be(folder: Path, trial: str, said: str) -> None:
-    assert one(folder, small(trial=trial + "\n")) == f"trial.{said}"
+def test_a_wrong_value_under_trial_gets_a_message(folder: Path, trial: str, expected: str) -> None:
+    assert only_mistake(folder, small(trial=trial + "\n")) == f"trial.{expected}"
 
 
 @pytest.mark.parametrize("written", ["my-study", "my_study", "My_study-2", "a_", "-a", "7"])
@@ -201,8 +206,8 @@ def test_an_id_has_letters_digits_dashes_and_underscores(folder: Path, written: 
 
 
 @pytest.mark.parametrize("written", ["[a]", "{a: b}", "yes", "…"])
-def test_what_is_no_id_at_all(folder: Path, written: str) -> None:
-    assert one(folder, SMALL.replace("id: small", f"id: {written}")).startswith("project.id: m")
+def test_a_value_that_is_no_id_is_refused(folder: Path, written: str) -> None:
+    assert only_mistake(folder, SMALL.replace("id: small", f"id: {written}")).startswith("project.id: m")
 
 
 def test_folders_of_hippodrome_begin_with_an_underscore_and_ids_do_not() -> None:
@@ -212,9 +217,9 @@ def test_folders_of_hippodrome_begin_with_an_underscore_and_ids_do_not() -> None
 
 
 def test_the_folder_of_the_certificate_is_no_project(folder: Path) -> None:
-    """Servers may not write below SSL/, so a study with this id would keep no answers of games."""
-    said = "project.id: must not be SSL: that is the folder of the servers' certificate in the bucket"
-    assert one(folder, SMALL.replace("id: small", "id: SSL")) == said
+    """Servers may write nothing below SSL/: a study of this name would keep no answer of a game."""
+    expected = "project.id: must not be SSL: that is the folder of the servers' certificate in the bucket"
+    assert only_mistake(folder, SMALL.replace("id: small", "id: SSL")) == expected
     assert read(folder, SMALL.replace("id: small", "id: SSL-study")).project.id == "SSL-study"
     with pytest.raises(ConfigErrors, match="must not be SSL"):
         parse_registration({"id": "SSL", "steps": [{"key": "1", "page": "hello"}, {"key": "2", "page": "bye"}]})
@@ -222,15 +227,15 @@ def test_the_folder_of_the_certificate_is_no_project(folder: Path) -> None:
 
 def test_an_id_has_at_most_64_characters(folder: Path) -> None:
     assert read(folder, SMALL.replace("id: small", f"id: {'a' * 64}")).project.id == "a" * 64
-    said = "project.id: must be at most 64 characters long, not 65"
-    assert one(folder, SMALL.replace("id: small", f"id: {'a' * 65}")) == said
+    expected = "project.id: must be at most 64 characters long, not 65"
+    assert only_mistake(folder, SMALL.replace("id: small", f"id: {'a' * 65}")) == expected
 
 
 @pytest.mark.parametrize(
     "name", ["ab", "a" * 64, "-lab", "lab-", "a..b", "10.0.0.1", "xn--lab", "lab-s3alias", "la_b", "sthree-lab"]
 )
 def test_buckets_follow_the_rules_of_s3(folder: Path, name: str) -> None:
-    assert "must be the name of an S3 bucket" in one(folder, small(project=f"awsSetup: {{bucket: {name}}}\n"))
+    assert "must be the name of an S3 bucket" in only_mistake(folder, small(project=f"awsSetup: {{bucket: {name}}}\n"))
 
 
 # Values against each other
@@ -243,7 +248,7 @@ def test_aws_needs_its_keys(folder: Path) -> None:
     ]
 
 
-def test_where_on_aws_may_be_left_to_the_installation(folder: Path) -> None:
+def test_bucket_and_domain_may_be_left_to_the_installation(folder: Path) -> None:
     found = read(folder, small(project="useAWS: true\nawsSetup: {cpu: 1, memory: 4, region: eu-west-1}\n"))
     here = {"bucket": None, "region": "eu-west-1", "rootDomain": None, "cpu": 1, "memory": 4}
     assert found.registration()["awsSetup"] == here
@@ -259,13 +264,13 @@ def aws(cpu: object, memory: object) -> str:
 @pytest.mark.parametrize(
     ("cpu", "memory"), [(c, m) for c, sizes in fargate.SIZES.items() for m in (sizes[0], sizes[-1])]
 )
-def test_sizes_that_fargate_has(folder: Path, cpu: float, memory: float) -> None:
+def test_cpu_and_memory_may_be_a_size_of_fargate(folder: Path, cpu: float, memory: float) -> None:
     found = read(folder, aws(cpu, memory)).registration()["awsSetup"]
     assert (found["cpu"], found["memory"]) == (cpu, memory)
 
 
 @pytest.mark.parametrize(
-    ("cpu", "memory", "said"),
+    ("cpu", "memory", "expected"),
     [
         (0.25, 4, "4 GB do not go with cpu 0.25; choose 0.5, 1 or 2"),
         (".5", "0.5", "0.5 GB do not go with cpu 0.5; choose 1 to 4"),
@@ -276,12 +281,14 @@ def test_sizes_that_fargate_has(folder: Path, cpu: float, memory: float) -> None
         (16, 24, "24 GB do not go with cpu 16; choose 32 to 120 in steps of 8"),
     ],
 )
-def test_sizes_that_fargate_does_not_have(folder: Path, cpu: object, memory: object, said: str) -> None:
-    assert one(folder, aws(cpu, memory)) == f"project.awsSetup.memory: {said}"
+def test_cpu_and_memory_that_are_no_size_of_fargate_are_refused(
+    folder: Path, cpu: object, memory: object, expected: str
+) -> None:
+    assert only_mistake(folder, aws(cpu, memory)) == f"project.awsSetup.memory: {expected}"
 
 
 @pytest.mark.parametrize(
-    ("steps", "said"),
+    ("steps", "expected"),
     [
         ("1: consent\n3: thanks\n", "3: step 2 is missing before it; number the steps 1, 2, 3 … without gaps"),
         ("1: consent\n5: thanks\n", "5: steps 2 to 4 are missing before it; number the steps 1, 2, 3 … without gaps"),
@@ -295,18 +302,18 @@ def test_sizes_that_fargate_does_not_have(folder: Path, cpu: object, memory: obj
         ("1: consent\nfinalStep: game\n", "finalStep: the game cannot be the last step; add a page after it, which stops the server"),
     ],
 )  # fmt: skip
-def test_steps_are_numbered_without_gaps_and_end_with_a_page(folder: Path, steps: str, said: str) -> None:
-    assert one(folder, small(steps=steps)) == f"project.steps.{said}"
+def test_steps_are_numbered_without_gaps_and_end_with_a_page(folder: Path, steps: str, expected: str) -> None:
+    assert only_mistake(folder, small(steps=steps)) == f"project.steps.{expected}"
 
 
-def test_steps_are_not_a_dashed_list(folder: Path) -> None:
+def test_steps_that_are_a_list_are_refused(folder: Path) -> None:
     text = "project:\n  id: a\n  steps:\n    - consent\n    - thanks\n"
-    said = 'project.steps: must be a section: indented lines such as "1: consent" below it, not a list'
-    assert one(folder, text) == said
+    expected = 'project.steps: must be a section: indented lines such as "1: consent" below it, not a list'
+    assert only_mistake(folder, text) == expected
 
 
 @pytest.mark.parametrize(
-    ("events", "said"),
+    ("events", "expected"),
     [
         ("startServerStep: 9", "startServerStep: there is no step 9; the steps are 1 to 4 and finalStep"),
         ("stopServerStep: 502", "stopServerStep: must be the number of a step or finalStep, not 502"),
@@ -316,19 +323,19 @@ def test_steps_are_not_a_dashed_list(folder: Path) -> None:
         ("stopServerStep: 1", "stopServerStep: step 1 does not come after the game, step 3, which needs the server; use 4 or later"),
     ],
 )  # fmt: skip
-def test_the_server_runs_around_the_game(folder: Path, events: str, said: str) -> None:
+def test_events_that_leave_the_game_without_a_server_are_refused(folder: Path, events: str, expected: str) -> None:
     steps = "1: consent\n2: survey\n3: game\n4: survey\nfinalStep: thanks\n"
-    assert one(folder, small(steps=steps, project=f"events: {{{events}}}\n")) == f"project.events.{said}"
+    assert only_mistake(folder, small(steps=steps, project=f"events: {{{events}}}\n")) == f"project.events.{expected}"
 
 
-def test_both_events_can_be_wrong(folder: Path) -> None:
+def test_two_wrong_events_get_two_messages(folder: Path) -> None:
     text = small(
         steps="1: consent\n2: game\n3: thanks\n", project="events:\n  startServerStep: 3\n  stopServerStep: 1\n"
     )
-    said = ["which needs the server; 2 is the usual choice", "which needs the server; use 3 or later"]
-    assert [line[-len(end) :] for line, end in zip(mistakes(folder, text), said, strict=True)] == said
+    expected = ["which needs the server; 2 is the usual choice", "which needs the server; use 3 or later"]
+    assert [line[-len(end) :] for line, end in zip(mistakes(folder, text), expected, strict=True)] == expected
 
 
-def test_a_server_does_not_stop_before_it_starts(folder: Path) -> None:
+def test_a_stop_step_before_the_start_step_is_refused(folder: Path) -> None:
     text = small(steps="1: consent\n2: thanks\n", project="events: {startServerStep: 2, stopServerStep: 1}\n")
-    assert one(folder, text) == "project.events.stopServerStep: step 1 comes before startServerStep, step 2"
+    assert only_mistake(folder, text) == "project.events.stopServerStep: step 1 comes before startServerStep, step 2"

@@ -1,4 +1,4 @@
-"""The variables of a server fit into the 8,192 characters that ECS allows, or the study is not registered."""
+"""The environment of a server fits into the 8,192 characters that ECS allows, or the study is not registered."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Make = Callable[[int], dict[str, Any]]
 
 
 def message(trial: dict[str, Any], games: int = 1, **project: Any) -> dict[str, Any]:
-    """A registration with an id of the greatest length."""
+    """A registration with the longest possible id."""
     pages = ["game"] * games + ["bye"]
     steps = [{"key": str(number), "page": page} for number, page in enumerate(pages, 1)]
     return {"id": LONG, "steps": steps, "trial": {"game": "x/Y-v0", **trial}, **project}
 
 
 def request_of(registration: dict[str, Any]) -> TaskRequest:
-    """The request to ECS for the server of a participant with the longest id."""
+    """The request to ECS for the server of a participant with the longest possible id."""
     steps = [{**step, "variants": 0} for step in registration["steps"]]
     kept = {"id": LONG, "name": "n", "live": True, "secret": "s", "awsSetup": {"cpu": 16, "memory": 120}}
     project = from_json(
@@ -79,7 +79,7 @@ MAKES: dict[str, tuple[Make, str]] = {
 
 
 @pytest.mark.parametrize("name", MAKES)
-def test_what_is_registered_is_what_ecs_takes(name: str) -> None:
+def test_a_registration_is_accepted_exactly_if_ecs_takes_its_environment(name: str) -> None:
     make, key = MAKES[name]
     accepted, refused, words = 1, 5000, ""
     while refused - accepted > 1:  # the largest section that is accepted
@@ -95,7 +95,7 @@ def test_what_is_registered_is_what_ecs_takes(name: str) -> None:
         assert "8192" in words
 
 
-def test_all_that_a_server_is_told_counts_together() -> None:
+def test_all_variables_of_a_server_count_together() -> None:
     trial = {"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(98)]}
     aws = {"useAWS": True, "awsSetup": {"cpu": 1, "memory": 2}}
     assert ecs_takes(request_of(parse_registration(message(trial, **aws))))
@@ -114,7 +114,7 @@ def test_the_addresses_of_a_front_end_count() -> None:
         parse_registration(message({"actionSpace": [f"action-{k}-{'a' * 40}" for k in range(104)]}, **ends))
 
 
-def test_little_room_is_given_away() -> None:
-    """The check leaves little room unused: it accepts a section that nearly fills the limit of ECS."""
+def test_a_section_a_little_below_the_limit_is_accepted() -> None:
+    """The check leaves little of ECS's limit unused."""
     actions = [f"action-{k}-{'a' * 40}" for k in range(107)]
     assert ecs_takes(request_of(parse_registration(message({"actionSpace": actions}))))

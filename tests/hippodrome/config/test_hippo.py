@@ -1,6 +1,6 @@
-"""A config.yml that HIPPO Gym accepts is accepted here, with remarks that say what its keys do.
+"""A config.yml that HIPPO Gym accepts is accepted here, with a remark on what each key does.
 
-The examples have the form of HIPPO's template and documentation, and of studies that used HIPPO, in our own words.
+The files have the form of HIPPO's template and documentation, and of studies that were held with it, in words of our own.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ trial:
 """
 
 
-# The template as it comes
+# The unchanged template
 
 
-def test_the_template_with_nothing_filled_in_is_the_game_and_a_page_that_says_it_is_over(tmp_path: Path) -> None:
+def test_the_empty_template_is_a_study_of_the_game_and_a_closing_page(tmp_path: Path) -> None:
     project = tmp_path / "Lunar study (2)"
     project.mkdir()
     (project / "config.yml").write_text(TEMPLATE)
@@ -87,22 +87,22 @@ def test_the_template_with_nothing_filled_in_is_the_game_and_a_page_that_says_it
     ]
 
 
-def test_without_an_id_a_folder_whose_name_is_none_either_is_a_mistake(tmp_path: Path) -> None:
+def test_a_missing_id_is_a_mistake_if_the_folders_name_is_no_id_either(tmp_path: Path) -> None:
     project = tmp_path / "…"
     project.mkdir()
-    said = mistakes(project, TEMPLATE)
-    assert said == [
+    expected = mistakes(project, TEMPLATE)
+    assert expected == [
         "config.yml:12: project.id: missing; give the project an id of letters, digits, dashes and underscores"
     ]
 
 
-def test_without_an_id_no_study_is_for_aws(folder: Path) -> None:
+def test_a_study_for_aws_needs_an_id(folder: Path) -> None:
     text = SMALL.replace("id: small", "id:\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
-    said = "config.yml:2: project.id: missing; give the project an id of letters, digits, dashes and underscores"
-    assert mistakes(folder, text) == [said]
+    expected = "config.yml:2: project.id: missing; give the project an id of letters, digits, dashes and underscores"
+    assert mistakes(folder, text) == [expected]
 
 
-def test_a_template_for_aws_has_the_size_that_hippo_takes(folder: Path) -> None:
+def test_an_empty_size_on_aws_is_that_of_hippo(folder: Path) -> None:
     text = game(project="useAWS: true\nawsSetup:\n  cpu:\n  memory:\n")
     found = read(folder, text)
     assert (found.project.aws_setup.cpu, found.project.aws_setup.memory) == (2, 10)
@@ -112,7 +112,7 @@ def test_a_template_for_aws_has_the_size_that_hippo_takes(folder: Path) -> None:
     ]
 
 
-def test_a_certificate_that_is_not_all_there_is_left_out(folder: Path) -> None:
+def test_an_incomplete_certificate_is_left_out(folder: Path) -> None:
     size = "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\n"
     found = read(folder, game(project=size + "ssl: {sslBucket: , fullchain: a.pem, privkey: b.pem}\n"))
     assert found.registration()["ssl"] is None
@@ -120,7 +120,7 @@ def test_a_certificate_that_is_not_all_there_is_left_out(folder: Path) -> None:
     assert remarks(read(folder, game(project=size + "ssl: {sslBucket: , fullchain: , privkey: }\n"))) == []
 
 
-def test_an_empty_live_is_said_to_be_open(folder: Path) -> None:
+def test_an_empty_live_means_an_open_study_and_gets_a_remark(folder: Path) -> None:
     found = read(folder, game(project="live:\n"))
     assert found.project.live
     assert remarks(found) == ["project.live: is empty: the study is open; HIPPO Gym took that for closed"]
@@ -133,12 +133,12 @@ def test_an_empty_live_is_said_to_be_open(folder: Path) -> None:
     ("written", "better"),
     [("my study", "my-study"), ("_pilot", "pilot"), ("a.b/c", "a-b-c"), ("Übung 1", "bung-1"), ('"__a__"', "a")],
 )
-def test_an_id_that_no_address_carries_has_a_substitute(folder: Path, written: str, better: str) -> None:
+def test_an_id_that_fits_no_address_is_replaced(folder: Path, written: str, better: str) -> None:
     found = read(folder, SMALL.replace("id: small", f"id: {written}"))
     assert found.project.id == better
-    (said,) = remarks(found)
+    (expected,) = remarks(found)
     shown = written.strip('"')
-    assert said == (
+    assert expected == (
         f'project.id: "{shown}" cannot stand in addresses and folders on AWS; the project is called "{better}" '
         "in links and folders here"
     )
@@ -156,7 +156,7 @@ def test_a_page_may_be_written_with_its_folder(folder: Path) -> None:
     ]
 
 
-def test_steps_without_a_page_are_passed_by_and_events_move_along(folder: Path) -> None:
+def test_steps_without_a_page_are_left_out_and_events_are_renumbered(folder: Path) -> None:
     steps = "1: consent\n2:\n3: survey\n4:\n5: game\n6:\nfinalStep: thanks\n"
     found = read(folder, game(steps, project="events:\n  startServerStep: 3\n  stopServerStep: 6\n"))
     assert [(step.key, step.page) for step in found.steps] == [
@@ -174,7 +174,7 @@ def test_steps_without_a_page_are_passed_by_and_events_move_along(folder: Path) 
     ]
 
 
-def test_where_a_game_is_named_and_no_step_is_the_game_that_is_said(folder: Path) -> None:
+def test_a_named_game_without_a_game_step_gets_a_remark(folder: Path) -> None:
     found = read(folder, game("1: consent\n2:\n3: thanks\n"))
     assert found.game_steps == ()
     assert remarks(found)[0] == (
@@ -183,14 +183,14 @@ def test_where_a_game_is_named_and_no_step_is_the_game_that_is_said(folder: Path
     )
 
 
-def test_a_mistake_in_a_step_that_moved_is_told_where_it_stands(folder: Path) -> None:
+def test_a_mistake_in_a_renumbered_step_has_the_line_and_number_of_the_file(folder: Path) -> None:
     text = game("1: consent\n2:\n3: surveey\n4: game\n5: thanks\n")
     assert mistakes(folder, text) == [
         "config.yml:6: project.steps.3: there is no surveey.html in steps/; did you mean survey?"
     ]
 
 
-def test_a_study_of_a_final_step_alone_is_one_page(folder: Path) -> None:
+def test_a_study_with_a_final_step_only_has_one_page(folder: Path) -> None:
     found = read(folder, "project: {id: a, steps: {1: , finalStep: thanks}}")
     assert [(step.key, step.page) for step in found.steps] == [("1", "thanks")]
     assert remarks(found) == ["project.steps.finalStep: the study has this page only"]
@@ -215,7 +215,7 @@ def test_a_stop_step_beyond_the_end_is_the_last_step(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("stop", ["4", "finalStep", "3"])
-def test_a_stop_step_that_there_is_is_no_remark(folder: Path, stop: str) -> None:
+def test_a_stop_step_that_exists_gets_no_remark(folder: Path, stop: str) -> None:
     found = read(folder, game(project=f"events: {{stopServerStep: {stop}}}\n"))
     assert (found.events.stop_server_step, remarks(found)) == ("3", [])
 
@@ -223,7 +223,7 @@ def test_a_stop_step_that_there_is_is_no_remark(folder: Path, stop: str) -> None
 # Spellings, and keys that HIPPO's own programs add
 
 
-def test_step_is_steps(folder: Path) -> None:
+def test_the_key_step_is_read_as_steps(folder: Path) -> None:
     found = read(folder, SMALL.replace("steps:", "step:"))
     assert [step.page for step in found.steps] == ["consent", "game", "thanks"]
     assert [str(remark) for remark in found.remarks] == ["config.yml:3: remark: project.step: read as steps"]
@@ -239,7 +239,7 @@ def test_team_members_are_team_members(folder: Path) -> None:
     assert (found.project.team_members, remarks(found)) == (("Ada",), ["project.team_members: read as teamMembers"])
 
 
-def test_what_updateproject_wrote_may_stand_there(folder: Path) -> None:
+def test_keys_that_updateproject_wrote_are_accepted(folder: Path) -> None:
     text = game(
         project="ecsTask: small\nbucket: lab\nawsSetup: {containerName: a, repository: a, repositoryUri: x/a}\n",
         trial="projectId: small\nbucket: lab\nui: [left, right, good]\n",
@@ -262,10 +262,10 @@ def test_what_updateproject_wrote_may_stand_there(folder: Path) -> None:
     assert found.trial.options == {}
 
 
-# Keys of the agent's own
+# The agent's own keys
 
 
-def test_keys_of_the_agents_own_reach_it_as_options(folder: Path) -> None:
+def test_unknown_keys_reach_the_agent_as_options(folder: Path) -> None:
     own = "modality: demo\nrows: 6\nblocked: [{x: 1, y: 2}]\nname: maze\noptions: {level: 2}\n"
     found = read(folder, game(project="name: A maze\n", trial=own))
     assert found.trial.options == {
@@ -282,25 +282,25 @@ def test_keys_of_the_agents_own_reach_it_as_options(folder: Path) -> None:
     ]
 
 
-def test_an_option_counts_more_than_a_key_of_its_name(folder: Path) -> None:
+def test_an_option_overrides_a_key_of_its_name(folder: Path) -> None:
     found = read(folder, game(trial="level: 1\noptions: {level: 2}\n"))
     assert found.trial.options == {"level": 2}
     assert remarks(found) == ["trial.level: no effect: trial.options.level is there too"]
 
 
-def test_keys_of_the_agents_own_have_the_limits_of_options(folder: Path) -> None:
-    (said,) = mistakes(folder, game(trial=f"text: {'a' * 5000}\n"))
-    assert said.startswith("config.yml:7: trial.options: must be at most 4096 characters long")
+def test_the_agents_own_keys_have_the_limits_of_options(folder: Path) -> None:
+    (expected,) = mistakes(folder, game(trial=f"text: {'a' * 5000}\n"))
+    assert expected.startswith("config.yml:7: trial.options: must be at most 4096 characters long")
 
 
-def test_a_control_of_the_projects_own_is_no_remark(folder: Path) -> None:
+def test_a_projects_own_control_gets_no_remark(folder: Path) -> None:
     found = read(folder, game(trial="ui: {left: true, undo: true, redo: false, hue: , height: 6}\n"))
     assert (found.trial.ui.left, found.trial.ui.own) == (True, ("undo",))
     assert remarks(found) == ["trial.ui.height: no effect: neither true nor false"]
 
 
 @pytest.mark.parametrize("known", ["", ", left: true"])
-def test_a_control_that_is_like_a_known_one_is_a_mistake(folder: Path, known: str) -> None:
+def test_a_control_whose_name_is_similar_to_a_known_one_is_a_mistake(folder: Path, known: str) -> None:
     assert mistakes(folder, game(trial=f"ui: {{lft: true{known}}}\n")) == [
         "config.yml:9: trial.ui.lft: unknown key; did you mean left?"
     ]
@@ -333,11 +333,11 @@ def test_an_unknown_section_has_no_effect(folder: Path) -> None:
 
 @pytest.mark.parametrize("slip", ["maxEpisods", "maxepisodes", "actionspace", "startngFrameRate", "maxruntime"])
 def test_a_likely_typing_error_stays_a_mistake(folder: Path, slip: str) -> None:
-    (said,) = mistakes(folder, game(trial=f"{slip}: 5\n"))
-    assert f"trial.{slip}: unknown key; did you mean " in said
+    (expected,) = mistakes(folder, game(trial=f"{slip}: 5\n"))
+    assert f"trial.{slip}: unknown key; did you mean " in expected
 
 
-def test_what_is_like_a_key_that_is_given_is_no_typing_error(folder: Path) -> None:
+def test_a_key_similar_to_one_that_is_given_is_an_option(folder: Path) -> None:
     found = read(folder, game(trial="maxEpisodes: 3\nmaxEpisode: 4\n"))
     assert (found.trial.max_episodes, found.trial.options) == (3, {"maxEpisode": 4})
 
@@ -345,7 +345,7 @@ def test_what_is_like_a_key_that_is_given_is_no_typing_error(folder: Path) -> No
 # Actions and rates
 
 
-def test_equal_names_of_actions_hold_the_places_of_their_numbers(folder: Path) -> None:
+def test_actions_of_equal_names_keep_their_numbers(folder: Path) -> None:
     found = read(folder, game(trial="actionSpace: [noop, left, Left, 3, 3]\n"))
     assert found.trial.action_space == ("noop", "left", "Left 2", "3", "3 4")
     assert remarks(found) == [
@@ -366,7 +366,7 @@ def test_bounds_of_a_rate_that_may_not_change_do_not_matter(folder: Path, rates:
     ]
 
 
-# In all
+# Remarks in general
 
 
 def test_a_project_in_our_form_has_no_remark(folder: Path) -> None:
@@ -398,7 +398,7 @@ _VALUES = st.recursive(
 
 
 @given(st.dictionaries(_KEYS, _VALUES, max_size=4))
-def test_whatever_the_document_is_it_is_adapted_and_stays_as_it_was(document: dict[str, Any]) -> None:
+def test_any_document_is_adapted_and_not_changed(document: dict[str, Any]) -> None:
     before = repr(document)
     once = adapt(document, "name")
     assert repr(document) == before

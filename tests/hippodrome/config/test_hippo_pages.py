@@ -33,12 +33,12 @@ def page(tmp_path: Path) -> Path:
         ('<img src="https://nowhere"><img src="https://{{ host }}/a"><img src>', ()),
     ],
 )  # fmt: skip
-def test_what_a_page_loads_from_elsewhere(page: Path, html: str, found: tuple[str, ...]) -> None:
+def test_hosts_finds_the_sites_from_which_a_page_loads(page: Path, html: str, found: tuple[str, ...]) -> None:
     page.write_text(html)
     assert hosts([page]) == found
 
 
-def test_pages_that_cannot_be_read_load_nothing_and_sites_are_bounded(page: Path) -> None:
+def test_unreadable_pages_name_no_site_and_the_number_of_sites_is_limited(page: Path) -> None:
     page.write_text("".join(f'<img src="https://a{n}.example/">' for n in range(MAX_HOSTS + 1)))
     assert len(hosts([page.with_name("gone.html"), page])) == MAX_HOSTS
 
@@ -59,12 +59,12 @@ def test_in_a_clone_the_sites_of_its_pages_are_allowed(folder: Path) -> None:
     ]
 
 
-def test_what_the_configuration_allows_is_all_that_is_allowed(folder: Path) -> None:
+def test_a_list_of_allowed_hosts_in_the_configuration_is_not_extended(folder: Path) -> None:
     config = SMALL.replace("  steps:", "  allowedHosts: []\n  steps:")
     found = read_project(write(folder, "StepFiles", config))
     assert (found.registration()["allowedHosts"], found.remarks) == ([], ())
 
 
-def test_elsewhere_sites_are_named_by_the_researcher(folder: Path) -> None:
+def test_outside_a_clone_no_site_is_allowed_by_itself(folder: Path) -> None:
     found = read_project(write(folder, "steps"))
     assert (found.registration()["allowedHosts"], found.remarks) == ([], ())

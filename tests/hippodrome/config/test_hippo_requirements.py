@@ -22,13 +22,13 @@ PRESENT = ("numpy", "Pillow", "PyYAML", "websockets")
         ("numpy>=1.22.0", f"{HERE}: numpy"),
     ],
 )
-def test_what_the_image_has_or_does_without_is_left_out(line: str, why: str) -> None:
+def test_packages_that_the_image_has_or_does_not_need_are_left_out(line: str, why: str) -> None:
     text, remarks = adapt(f"# ours\n{line}\nshortuuid==1.0.1", "requirements.txt", PRESENT)
     assert text == "# ours\n\nshortuuid==1.0.1\n"
     assert [str(remark) for remark in remarks] == [f"requirements.txt: remark: {why}"]
 
 
-def test_what_is_left_out_is_named_in_two_sentences() -> None:
+def test_packages_that_are_left_out_are_named_in_two_remarks() -> None:
     lines = "gym==0.17.2\nasyncio\nnumpy==1.18.5\nPillow==7.0.0\nshortuuid==1.0.1\n"
     text, remarks = adapt(lines, "requirements.txt", PRESENT)
     assert text == "\n\n\n\nshortuuid==1.0.1\n"
@@ -42,5 +42,5 @@ def test_what_is_left_out_is_named_in_two_sentences() -> None:
     "line",
     ["shortuuid==1.0.1", "numpy-stl==2", "gymnasium-robotics", "-r more.txt", "./numpy", "torch @ https://a.example/x"],
 )
-def test_everything_else_stays_as_it_is(line: str) -> None:
+def test_all_other_lines_stay_unchanged(line: str) -> None:
     assert adapt(f"{line}\n", "requirements.txt", PRESENT) == (f"{line}\n", [])

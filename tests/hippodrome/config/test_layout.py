@@ -63,7 +63,7 @@ def test_the_configuration_may_lie_beside_the_agent(clone: Path, app: str) -> No
         read_project(clone)
 
 
-def test_that_of_the_folder_itself_counts_first(clone: Path) -> None:
+def test_the_configuration_of_the_folder_itself_counts_before_that_beside_the_agent(clone: Path) -> None:
     put(clone / "App/config.yml", SMALL.replace("small", "other"))
     assert read_project(clone).project.id == "small"
 
@@ -76,7 +76,7 @@ def test_requirements_are_found(clone: Path, place: str) -> None:
     assert layout.find(clone).requirements == file
 
 
-def test_an_agent_that_is_not_used_is_a_remark(clone: Path) -> None:
+def test_an_agent_that_is_not_used_gets_a_remark(clone: Path) -> None:
     put(clone / "agent.py")
     put(clone / "App/agent.py")
     assert [str(remark) for remark in read_project(clone).remarks] == [
@@ -84,7 +84,7 @@ def test_an_agent_that_is_not_used_is_a_remark(clone: Path) -> None:
     ]
 
 
-# Never played without the agent that is there
+# An agent that exists is never left out without a message
 
 
 def refused(project: Path) -> str:
@@ -153,17 +153,17 @@ def test_a_study_without_a_game_needs_no_agent(clone: Path) -> None:
     assert read_project(clone).project.id == "paper"
 
 
-# What is no project folder
+# Folders that are no project folders
 
 
-def test_the_app_folder_alone_leads_to_the_folder_above(clone: Path) -> None:
+def test_the_message_for_the_app_folder_names_the_folder_above(clone: Path) -> None:
     put(clone / "App/agent.py")
     assert refused(clone / "App") == (
         f"config.yml: there is no such file in {clone / 'App'}; name the folder {clone}, which has it"
     )
 
 
-def test_a_folder_that_is_gone_has_no_files(clone: Path) -> None:
+def test_a_missing_folder_has_no_files(clone: Path) -> None:
     shutil.rmtree(clone)
     assert (layout.agent_folder(clone), layout.pages_folder(clone), layout.has_config(clone)) == (clone, None, False)
     with pytest.raises(ConfigErrors, match="there is no such folder"):
@@ -171,7 +171,7 @@ def test_a_folder_that_is_gone_has_no_files(clone: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the administrator may read everything")
-def test_a_folder_of_pages_that_cannot_be_read_is_said(clone: Path) -> None:
+def test_a_folder_of_pages_that_cannot_be_read_gets_a_message(clone: Path) -> None:
     (clone / "steps").chmod(0)
     try:
         assert "the folder steps cannot be read" in refused(clone)
@@ -179,7 +179,7 @@ def test_a_folder_of_pages_that_cannot_be_read_is_said(clone: Path) -> None:
         (clone / "steps").chmod(0o700)
 
 
-def said_of_recordings(clone: Path, config: str) -> list[str]:
+def remarks_on_recordings(clone: Path, config: str) -> list[str]:
     (clone / "config.yml").write_text(config)
     found = remarks.remarks_on(clone, read_project(clone))
     return [str(remark) for remark in found if "recordObservations" in str(remark)]
@@ -187,18 +187,18 @@ def said_of_recordings(clone: Path, config: str) -> list[str]:
 
 def test_in_a_clone_recordings_without_observations_get_a_remark(clone: Path) -> None:
     put(clone / "App" / "agent.py")
-    assert said_of_recordings(clone, SMALL) == [
+    assert remarks_on_recordings(clone, SMALL) == [
         "config.yml:7: remark: trial: recordObservations is not given: recordings hold no observations, which HIPPO Gym "
         "saved; write recordObservations: true to have them, or false"
     ]
 
 
 @pytest.mark.parametrize("key", ["recordObservations: true", "recordObservations: false", "s3upload: false"])
-def test_not_if_the_configuration_says_what_is_kept(clone: Path, key: str) -> None:
+def test_recordings_get_no_remark_if_the_configuration_says_what_they_hold(clone: Path, key: str) -> None:
     put(clone / "App" / "agent.py")
-    assert said_of_recordings(clone, f"{SMALL.rstrip()}\n  {key}\n") == []
+    assert remarks_on_recordings(clone, f"{SMALL.rstrip()}\n  {key}\n") == []
 
 
-def test_not_in_a_project_that_was_written_for_hippodrome(clone: Path) -> None:
+def test_recordings_get_no_remark_in_a_project_that_was_written_for_hippodrome(clone: Path) -> None:
     put(clone / "agent.py")
-    assert said_of_recordings(clone, SMALL) == []
+    assert remarks_on_recordings(clone, SMALL) == []

@@ -9,7 +9,7 @@ import pytest
 
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.__main__ import main
-from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, one, read, small
+from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, only_mistake, read, small
 
 __all__ = ["folder"]
 
@@ -28,16 +28,16 @@ def test_pages_in_the_game_are_found_with_their_groups(folder: Path) -> None:
     assert found.groups == 3
 
 
-def test_a_page_in_the_game_that_is_not_there_is_named(folder: Path) -> None:
+def test_a_missing_page_in_the_game_is_named(folder: Path) -> None:
     text = small(trial="instructions: brief\n")
-    assert one(folder, text) == "trial.instructions: there is no brief.html in steps/; did you mean briefing?"
+    assert only_mistake(folder, text) == "trial.instructions: there is no brief.html in steps/; did you mean briefing?"
 
 
-def test_a_policys_file_that_is_not_there_is_named_with_those_that_there_are(folder: Path) -> None:
+def test_a_missing_policy_file_is_named_with_the_existing_ones(folder: Path) -> None:
     (folder / "policies/small").mkdir(parents=True)
     (folder / "policies/small/partner.onnx").touch()
     text = small(trial="players: {left: human, right: policies/partner.onnx}\n")
-    assert one(folder, text) == (
+    assert only_mistake(folder, text) == (
         "trial.players.right: there is no file policies/partner.onnx beside agent.py; there are "
         "policies/small/partner.onnx"
     )
@@ -82,7 +82,7 @@ def test_steps_come_in_order_with_their_files(folder: Path) -> None:
     assert steps[2].files == ()
 
 
-def test_what_is_not_given_has_its_default(folder: Path) -> None:
+def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
     found = read(folder, SMALL).registration()
     assert found == {
         "id": "small",
@@ -172,15 +172,15 @@ def test_a_study_without_a_game_needs_no_trial_and_no_server(folder: Path) -> No
     assert found.registration()["trial"]["game"] is None
 
 
-def test_servers_that_no_participant_would_take_are_not_kept_warm(folder: Path) -> None:
+def test_warm_servers_without_a_game_are_refused(folder: Path) -> None:
     text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2}"
-    said = "project.warmServers: must be 0: no step of this study starts a server, so no participant would take one"
-    assert one(folder, text) == said
+    expected = "project.warmServers: must be 0: no step of this study starts a server, so no participant would take one"
+    assert only_mistake(folder, text) == expected
     text = "project: {id: paper, steps: {1: consent, 2: survey}, warmServers: 2, events: {startServerStep: 1}}"
     assert read(folder, text).project.warm_servers == 2
 
 
-def test_what_steps_a_study_has_is_mended_before_its_warm_servers(folder: Path) -> None:
+def test_while_its_steps_are_wrong_a_study_gets_no_message_about_warm_servers(folder: Path) -> None:
     text = "project: {id: paper, steps: {1: consent, two: game, 3: survey}, warmServers: 2}"
     assert not any("warmServers" in line for line in mistakes(folder, text))
 
@@ -203,7 +203,7 @@ def test_numbers_may_be_written_as_text(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("written", "meant"), [("yes", True), ("True", True), ('"no"', False), ("'False'", False), ("on", True)]
 )
-def test_true_and_false_as_people_write_them(folder: Path, written: str, meant: bool) -> None:
+def test_true_and_false_may_be_written_in_several_ways(folder: Path, written: str, meant: bool) -> None:
     assert read(folder, small(project=f"live: {written}\n")).project.live is meant
 
 
@@ -224,7 +224,7 @@ def test_the_team_is_a_name_or_a_list(folder: Path) -> None:
     )
 
 
-def test_keys_left_empty_are_keys_not_given(folder: Path) -> None:
+def test_empty_keys_count_as_not_given(folder: Path) -> None:
     text = small(project='useAWS:\nname: ""\nssl:\n  sslBucket:\nevents:\n', trial="actionSpace:\nui:\nmaxEpisodes: \n")
     assert read(folder, text).registration() == read(folder, SMALL).registration()
 
@@ -249,7 +249,7 @@ def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(folder: Path) -> Non
     assert read_project(folder).project.id == "small"
 
 
-def test_only_safe_yaml_is_read_and_nothing_is_run(folder: Path) -> None:
+def test_yaml_tags_are_refused_and_run_nothing(folder: Path) -> None:
     (line,) = mistakes(folder, small(project=f"name: !!python/object/apply:os.mkdir [{folder}/made]\n"))
     assert (
         line
@@ -258,7 +258,7 @@ def test_only_safe_yaml_is_read_and_nothing_is_run(folder: Path) -> None:
     assert not (folder / "made").exists()
 
 
-# Options of the agent's own
+# The agent's own options
 
 
 def test_options_are_whatever_the_agent_needs(folder: Path) -> None:
@@ -284,13 +284,13 @@ def test_options_are_whatever_the_agent_needs(folder: Path) -> None:
     }
 
 
-def test_options_left_empty_are_none(folder: Path) -> None:
+def test_empty_options_are_none(folder: Path) -> None:
     for text in ("options:\n", "options: {}\n"):
         assert read(folder, small(trial=text)).trial.options == {}
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         ("[a, b]", "must be a map: indented lines such as \"difficulty: 3\" below it, not a list"),
         ("fast", "must be a map: indented lines such as \"difficulty: 3\" below it, not \"fast\""),
@@ -301,11 +301,11 @@ def test_options_left_empty_are_none(folder: Path) -> None:
         ('{"\\ud800": 1}', "must be text, numbers, true or false, lists and maps; one of the values is none of these"),
     ],
 )  # fmt: skip
-def test_options_that_cannot_be(folder: Path, options: str, said: str) -> None:
-    assert one(folder, small(trial=f"options: {options}\n")) == f"trial.options: {said}"
+def test_wrong_options_get_a_message(folder: Path, options: str, expected: str) -> None:
+    assert only_mistake(folder, small(trial=f"options: {options}\n")) == f"trial.options: {expected}"
 
 
-def test_options_may_be_just_that_large_and_that_deep(folder: Path) -> None:
+def test_options_may_be_as_large_and_as_deep_as_the_limits(folder: Path) -> None:
     for options in (f"{{a: {'x' * 4088}}}", "{a: [[[[[[[1]]]]]]]}"):
         assert read(folder, small(trial=f"options: {options}\n")).trial.options
 
@@ -313,7 +313,7 @@ def test_options_may_be_just_that_large_and_that_deep(folder: Path) -> None:
 # All at once, with their lines
 
 
-def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
+def test_all_mistakes_are_named_at_once_in_the_order_of_lines(folder: Path) -> None:
     text = """\
         project:
           useAWS: true
@@ -357,7 +357,7 @@ def test_all_mistakes_come_at_once_in_line_order(folder: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_problem_says_where_it_is(folder: Path) -> None:
+def test_a_message_names_the_place_of_the_mistake(folder: Path) -> None:
     (folder / "config.yml").write_text(small(trial="maxEpisodes: many\n"))
     with pytest.raises(ConfigErrors) as caught:
         read_project(folder)
@@ -367,8 +367,8 @@ def test_a_problem_says_where_it_is(folder: Path) -> None:
     assert str(problem) == f"config.yml:9: trial.maxEpisodes: {problem.message}"
 
 
-def test_a_message_never_carries_invisible_or_endless_text(folder: Path) -> None:
-    line = one(folder, small(project=f'live: "\\e[31m\\u202e{"x" * 500}"\n'))
+def test_a_message_is_short_and_has_no_invisible_characters(folder: Path) -> None:
+    line = only_mistake(folder, small(project=f'live: "\\e[31m\\u202e{"x" * 500}"\n'))
     assert line.isprintable()
     assert len(line) < 120
 
@@ -376,7 +376,7 @@ def test_a_message_never_carries_invisible_or_endless_text(folder: Path) -> None
 # The command line
 
 
-def test_check_says_that_all_is_well(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_a_project_without_mistakes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "config.yml").write_text(HIPPO, encoding="utf-8")
     assert main(["check", str(folder)]) == 0
     assert capsys.readouterr().out == (
@@ -385,7 +385,7 @@ def test_check_says_that_all_is_well(folder: Path, capsys: pytest.CaptureFixture
     )
 
 
-def test_check_says_how_many_servers_wait(folder: Path) -> None:
+def test_check_prints_the_number_of_warm_servers(folder: Path) -> None:
     summary = read(folder, small(project="warmServers: 4\n")).summary()
     assert summary.endswith("a server from step 2 to step 3, at most 60 minutes, 4 kept warm")
 

@@ -70,10 +70,10 @@ def refused(data: object) -> list[str]:
     return str(caught.value).splitlines()
 
 
-# --- there and back ---------------------------------------------------------------------------------
+# --- a registration and its check -------------------------------------------------------------------
 
 
-def test_a_registration_survives_json_and_its_own_check(registration: dict[str, Any]) -> None:
+def test_a_registration_is_unchanged_after_json_and_its_own_check(registration: dict[str, Any]) -> None:
     assert parse_registration(json.loads(json.dumps(registration))) == registration
 
 
@@ -83,7 +83,7 @@ def test_warm_servers_are_registered(folder: Path) -> None:
     assert msgspec.convert(parse_registration(registration), Project).warm_servers == 4
 
 
-def test_a_registration_is_what_the_other_parts_read(registration: dict[str, Any]) -> None:
+def test_a_registration_converts_to_a_project(registration: dict[str, Any]) -> None:
     project = msgspec.convert(registration, Project)
     assert [(step.key, step.page, step.variants) for step in project.steps][1] == ("2", "rules", 2)
     assert project.final.page == "thanks"
@@ -124,12 +124,12 @@ def test_the_port_of_the_servers_is_passed_on_and_that_of_earlier_registrations_
     assert msgspec.convert(parse_registration(registration), Project).server_port == 5000
 
 
-def test_a_task_definition_is_not_for_the_researcher_to_choose(folder: Path) -> None:
+def test_a_researcher_cannot_choose_the_task_definition(folder: Path) -> None:
     (folder / "config.yml").write_text(EXAMPLE.replace("project:", "project:\n  taskDefinition: maze"))
     assert "taskDefinition" not in read_project(folder).registration()
 
 
-def test_options_reach_the_registration_as_they_are(registration: dict[str, Any]) -> None:
+def test_options_are_registered_unchanged(registration: dict[str, Any]) -> None:
     options = {"a": [1, 2.5, True, None, {"b": "ü", "": []}], "maxEpisodes": "mine", "": -(2**53)}
     registration["trial"]["options"] = options
     found = parse_registration(registration)
@@ -153,7 +153,7 @@ pages = st.text(string.ascii_lowercase + string.digits + "_-", min_size=1, max_s
 
 @st.composite
 def registrations(draw: st.DrawFn) -> dict[str, Any]:
-    """A valid registration of any kind of project."""
+    """A correct registration of any kind of project."""
     order = [*draw(st.lists(st.one_of(st.just("game"), pages), max_size=8)), draw(pages)]
     steps = [{"key": str(k), "page": page, "variants": 0} for k, page in enumerate(order, 1)]
     for step in steps:
@@ -199,7 +199,7 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
 
 
 @given(registrations())
-def test_whatever_is_right_comes_back_the_same(data: dict[str, Any]) -> None:
+def test_a_correct_registration_stays_the_same_when_it_is_checked_again(data: dict[str, Any]) -> None:
     first = parse_registration(data)
     assert parse_registration(json.loads(json.dumps(first))) == first
     for key in ("id", "name", "researcher", "teamMembers", "live", "maxRuntime", "awsSetup", "steps"):
@@ -223,7 +223,7 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
         ({"id": "../etc"}, 'id: may hold only letters, digits, dashes and underscores, not "../etc"; write for example "etc"'),
         ({"id": {"$ne": ""}}, "id: must be letters, digits, dashes and underscores, not a map"),
@@ -259,8 +259,8 @@ def test_an_empty_message_lacks_what_is_needed() -> None:
         ({"trial": "x"}, 'trial: must be a section: indented lines such as "actionBufferLifespan: …" below it, not "x"'),
     ],
 )  # fmt: skip
-def test_a_wrong_message_is_refused(registration: dict[str, Any], change: dict[str, Any], said: str) -> None:
-    assert f"message: {said}" in refused(registration | change)
+def test_a_wrong_message_is_refused(registration: dict[str, Any], change: dict[str, Any], expected: str) -> None:
+    assert f"message: {expected}" in refused(registration | change)
 
 
 json_values = st.recursive(
@@ -282,7 +282,7 @@ known_keys = st.sampled_from(
 
 
 @given(st.dictionaries(known_keys | st.text(), json_values, max_size=8) | json_values)
-def test_no_message_raises_anything_else(data: object) -> None:
+def test_any_message_is_accepted_or_raises_config_errors(data: object) -> None:
     try:
         found = parse_registration(data)
     except ConfigErrors as errors:
@@ -293,7 +293,9 @@ def test_no_message_raises_anything_else(data: object) -> None:
 
 
 @given(registrations(), known_keys, json_values)
-def test_no_spoilt_message_raises_anything_else(data: dict[str, Any], key: str, value: object) -> None:
+def test_a_damaged_registration_is_accepted_or_raises_config_errors(
+    data: dict[str, Any], key: str, value: object
+) -> None:
     for spoilt in (
         data | {key: value},
         data | {"trial": data["trial"] | {key: value}},
@@ -311,7 +313,7 @@ def test_a_message_with_very_many_keys_is_refused_in_time(registration: dict[str
     assert len(refused(registration | {f"key{n}": n for n in range(20_000)})) == 20_000
 
 
-def test_a_message_without_end_is_refused(registration: dict[str, Any]) -> None:
+def test_a_message_that_is_nested_too_deeply_is_refused(registration: dict[str, Any]) -> None:
     deep: Any = "x"
     for _ in range(50_000):
         deep = [deep]
@@ -350,7 +352,7 @@ trees = st.dictionaries(
 @example(b"project: {steps: {1: !!binary x, 2: !!int y, 3: !!float z, 4: !!null w, 5: !!bool v}}")
 @example(b"project: {? : x, ~: y, 1.5: z, 2001-01-01: w}")
 @example(b"? &a [*a]\n: *a")
-def test_no_file_raises_anything_else(folder: Path, data: bytes) -> None:
+def test_any_file_is_accepted_or_raises_config_errors(folder: Path, data: bytes) -> None:
     (folder / "config.yml").write_bytes(data)
     try:
         found = read_project(folder)
@@ -369,13 +371,13 @@ def as_an_editor_sees_it(text: str) -> Any:
     return json.loads(json.dumps(yaml.safe_load(text)))
 
 
-def test_the_schema_accepts_what_is_accepted(folder: Path) -> None:
+def test_the_schema_accepts_configurations_that_are_accepted(folder: Path) -> None:
     schema = config_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(as_an_editor_sees_it((folder / "config.yml").read_text()), schema)
 
 
-def test_the_schema_accepts_a_control_of_the_projects_own(folder: Path) -> None:
+def test_the_schema_accepts_a_projects_own_control(folder: Path) -> None:
     text = EXAMPLE.replace("good: true", "good: true, reallyGood: true, dull: false, hue: , toggle: false")
     (folder / "config.yml").write_text(text)
     assert read_project(folder).trial.ui.own == ("reallyGood",)
@@ -395,14 +397,14 @@ def test_the_schema_accepts_a_control_of_the_projects_own(folder: Path) -> None:
         "trial: {}",
     ],
 )
-def test_the_schema_refuses_what_is_refused(folder: Path, text: str) -> None:
+def test_the_schema_refuses_configurations_that_are_refused(folder: Path, text: str) -> None:
     (folder / "config.yml").write_text(text)
     with pytest.raises(ConfigErrors):
         read_project(folder)
     assert not jsonschema.Draft202012Validator(config_schema()).is_valid(as_an_editor_sees_it(text))
 
 
-def test_the_schema_in_the_documents_is_the_present_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_schema_in_the_docs_is_the_current_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
     assert capsys.readouterr().out == (DOCS / "config.schema.json").read_text(encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""Several participants in one environment: keys that depend on each other, and the message about each mistake."""
+"""Several participants in one environment: which keys go together, and the message for each mistake."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from hippodrome.config import ConfigErrors, parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
-from tests.hippodrome.config.folder import folder, mistakes, one, read, small
+from tests.hippodrome.config.folder import folder, mistakes, only_mistake, read, small
 
 __all__ = ["folder"]
 
@@ -23,10 +23,14 @@ def pair(project: str = "", trial: str = TWO, steps: str = STEPS) -> str:
 
 def remarked(folder: Path, text: str) -> list[str]:
     config = read(folder, text)
-    return [str(said).partition("remark: ")[2] for said in remarks_on(folder, config) if "useAWS" not in str(said)]
+    return [
+        str(expected).partition("remark: ")[2]
+        for expected in remarks_on(folder, config)
+        if "useAWS" not in str(expected)
+    ]
 
 
-def test_two_people_in_one_game(folder: Path) -> None:
+def test_a_study_of_two_participants_in_one_game_is_read(folder: Path) -> None:
     found = read(folder, pair(project="matching: {same: language}\npatience: 60\n"))
     assert "step 2 is the game (CartPole-v1) for 2 participants together" in found.summary()
     registered = found.registration()
@@ -36,7 +40,7 @@ def test_two_people_in_one_game(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("project", "trial", "said"),
+    ("project", "trial", "expected"),
     [
         (
             "", "",
@@ -116,9 +120,9 @@ def test_two_people_in_one_game(folder: Path) -> None:
         ),
     ],
 )  # fmt: skip
-def test_what_does_not_go_together(folder: Path, project: str, trial: str, said: str) -> None:
+def test_keys_that_do_not_go_together_get_a_message(folder: Path, project: str, trial: str, expected: str) -> None:
     steps = GROUPS if "group" in project or "0:" in trial else STEPS
-    assert one(folder, pair(project, trial, steps)) == said
+    assert only_mistake(folder, pair(project, trial, steps)) == expected
 
 
 def test_each_of_three_groups_has_its_players(folder: Path) -> None:
@@ -127,14 +131,14 @@ def test_each_of_three_groups_has_its_players(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("matching", "seats"), [("mixed", "group"), ("match", "group"), ("match", "match")])
-def test_seats_may_follow_from_groups_or_from_a_function(folder: Path, matching: str, seats: str) -> None:
+def test_seats_may_be_given_by_group_or_by_a_function(folder: Path, matching: str, seats: str) -> None:
     project = read(folder, pair(f"matching: {matching}\nseats: {seats}\n", TWO, GROUPS)).project
     assert (project.matching, project.seats) == (matching, seats)
 
 
 def test_seats_by_group_need_groups(folder: Path) -> None:
-    said = one(folder, pair("matching: match\nseats: group\n"))
-    assert said == (
+    expected = only_mistake(folder, pair("matching: match\nseats: group\n"))
+    assert expected == (
         "project.seats: group, and there are no groups; write two versions of a page, such as rules-0.html and "
         "rules-1.html, or seats: match"
     )
@@ -142,7 +146,7 @@ def test_seats_by_group_need_groups(folder: Path) -> None:
 
 @pytest.mark.parametrize("matching", ["group", "mixed"])
 def test_matching_by_groups_needs_groups(folder: Path, matching: str) -> None:
-    assert one(folder, pair(f"matching: {matching}\n")) == (
+    assert only_mistake(folder, pair(f"matching: {matching}\n")) == (
         f"project.matching: {matching}, and there are no groups; write two versions of a page, such as rules-0.html and "
         "rules-1.html, or matching: arrival"
     )
@@ -158,7 +162,7 @@ def test_a_function_of_agent_py_may_match(folder: Path) -> None:
     assert read(folder, pair("matching: match\n")).project.matching == "match"
 
 
-def test_a_registration_is_checked_alike(folder: Path) -> None:
+def test_a_registration_is_checked_as_the_file_is(folder: Path) -> None:
     data = read(folder, pair("matching: group\n", steps=GROUPS)).registration()
     assert parse_registration(data)["players"] == 2
     with pytest.raises(ConfigErrors, match="matching: group, and there are no groups"):
@@ -167,20 +171,22 @@ def test_a_registration_is_checked_alike(folder: Path) -> None:
         parse_registration({**data, "players": 3})
 
 
-def test_one_value_that_is_wrong_hides_what_it_is_compared_with(folder: Path) -> None:
-    assert one(folder, pair(trial="players: {a: human, b: nobody}\n")).startswith("trial.players: b must be human,")
-    assert one(folder, pair("matching: groups\n")).startswith("project.matching: must be arrival")
+def test_a_wrong_value_gets_one_message_and_none_about_keys_that_are_compared_with_it(folder: Path) -> None:
+    assert only_mistake(folder, pair(trial="players: {a: human, b: nobody}\n")).startswith(
+        "trial.players: b must be human,"
+    )
+    assert only_mistake(folder, pair("matching: groups\n")).startswith("project.matching: must be arrival")
     assert len(mistakes(folder, pair(trial="").replace("players: 2", "players: many"))) == 1
 
 
-def test_nothing_is_said_of_two_people_who_wait_play_and_leave(folder: Path) -> None:
+def test_a_complete_study_of_two_participants_gets_no_remark(folder: Path) -> None:
     trial = TWO + "substitute: random\nafterAbsent: policy\ncountdown: 5\nmaxPing: 200\n"
     trial += "episodeSeconds: 240\nbetweenEpisodes: 5\nmaxEpisodes: 3\n"
     assert remarked(folder, pair("patience: 60\nmaxParticipants: 40\nmaxServers: 2\n", trial)) == []
 
 
 @pytest.mark.parametrize(
-    ("project", "trial", "said"),
+    ("project", "trial", "expected"),
     [
         (
             "maxParticipants: 1\n", "",
@@ -208,8 +214,8 @@ def test_nothing_is_said_of_two_people_who_wait_play_and_leave(folder: Path) -> 
         ),
     ],
 )  # fmt: skip
-def test_what_works_but_may_not_be_meant(folder: Path, project: str, trial: str, said: str) -> None:
-    assert remarked(folder, pair(project, TWO + trial)) == [said]
+def test_settings_that_may_not_be_intended_get_a_remark(folder: Path, project: str, trial: str, expected: str) -> None:
+    assert remarked(folder, pair(project, TWO + trial)) == [expected]
 
 
 def test_players_without_a_game_have_no_effect(folder: Path) -> None:
@@ -217,7 +223,7 @@ def test_players_without_a_game_have_no_effect(folder: Path) -> None:
     assert remarked(folder, text) == ["project.players: no effect: no step is game, so no participant plays"]
 
 
-def test_keys_of_sessions_have_no_effect_on_one_who_plays_alone(folder: Path) -> None:
+def test_keys_of_sessions_have_no_effect_for_one_player(folder: Path) -> None:
     text = small(project="patience: 60\nmatching: arrival\n", trial="absent: 10\nsubstitute: random\n")
     why = "no effect: project.players is 1, so each participant plays alone; write players: 2 under project"
     assert sorted(remarked(folder, text)) == [
@@ -225,17 +231,17 @@ def test_keys_of_sessions_have_no_effect_on_one_who_plays_alone(folder: Path) ->
     ]
 
 
-def test_keys_of_sessions_name_as_many_players_as_are_human(folder: Path) -> None:
+def test_remarks_on_keys_of_sessions_propose_the_number_of_human_players(folder: Path) -> None:
     text = small(project="patience: 60\n", trial="players: {a: human, b: human, c: human}\n")
-    said = [line for line in remarked(folder, text) if line.startswith("project.patience: ")]
-    assert said[0].endswith("; write players: 3 under project")
+    expected = [line for line in remarked(folder, text) if line.startswith("project.patience: ")]
+    assert expected[0].endswith("; write players: 3 under project")
 
 
 @pytest.mark.parametrize(
     ("written", "meant"),
     [("Partner", "; a class of agent.py is agent:Partner"), ("randm", "; did you mean random?"), ("a b", "")],
 )
-def test_what_can_be_no_policy_is_told_with_what_was_meant(folder: Path, written: str, meant: str) -> None:
+def test_a_wrong_policy_gets_a_message_with_a_proposal(folder: Path, written: str, meant: str) -> None:
     (line,) = mistakes(folder, pair(trial=TWO + f"substitute: {written}\n"))
     assert line.endswith(f', not "{written}"{meant}')
 

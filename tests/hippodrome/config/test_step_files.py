@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import remarks
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, one, read, small
+from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
 
 __all__ = ["folder"]
 
@@ -42,14 +42,14 @@ def test_a_final_step_follows_the_game(folder: Path) -> None:
         ("1: consent\n2: game\n3: thanks\nfinalStep: thanks\n", 4, "3"),
     ],
 )
-def test_one_past_the_last_number_is_the_final_step_as_hippo_has_it(
+def test_one_past_the_last_number_is_the_final_step_as_in_hippo(
     folder: Path, steps: str, event: int, meant: str
 ) -> None:
     found = read(folder, small(steps=steps, project=f"events: {{stopServerStep: {event}}}\n"))
     assert found.events.stop_server_step == found.registration()["events"]["stopServerStep"] == meant
 
 
-def test_one_past_the_greatest_number_of_steps_is_an_event_too(folder: Path) -> None:
+def test_an_event_may_be_one_past_the_greatest_number_of_steps(folder: Path) -> None:
     steps = "1: game\n" + "".join(f"{k}: survey\n" for k in range(2, 501)) + "finalStep: thanks\n"
     assert read(folder, small(steps=steps, project="events: {stopServerStep: 501}\n")).events.stop_server_step == (
         "finalStep"
@@ -82,7 +82,7 @@ AT_LINK = "every opened link starts a server, also for people who look and leave
 
 
 @pytest.mark.parametrize(
-    ("steps", "project", "said"),
+    ("steps", "project", "expected"),
     [
         ("1: consent\n2: survey\n3: game\n4: thanks\n", "", []),
         ("1: consent\n2: game\n3: thanks\n", "", []),
@@ -120,39 +120,39 @@ AT_LINK = "every opened link starts a server, also for people who look and leave
         ("1: consent\n2: game\n3: thanks\n", "useAWS: true\nawsSetup: {cpu: 1, memory: 2}\nwarmServers: 1\n", []),
     ],
 )
-def test_what_the_steps_mean_for_the_servers_is_remarked(
-    folder: Path, steps: str, project: str, said: list[str]
+def test_steps_and_events_that_waste_servers_or_time_get_a_remark(
+    folder: Path, steps: str, project: str, expected: list[str]
 ) -> None:
     found = remarks.remarks_on(folder, read(folder, small(steps=steps, project=project)))
-    assert [f"{problem.where}: {problem.message}" for problem in found] == said
+    assert [f"{problem.where}: {problem.message}" for problem in found] == expected
     assert all(problem.remark and problem.line for problem in found)
 
 
 @pytest.mark.parametrize(
-    ("signed", "said"), [("", "; "), ("signedLinks: true\n", "; signedLinks does not protect the game then; ")]
+    ("signed", "expected"), [("", "; "), ("signedLinks: true\n", "; signedLinks does not protect the game then; ")]
 )
-def test_what_a_front_end_without_tokens_costs_is_remarked(folder: Path, signed: str, said: str) -> None:
+def test_a_front_end_without_tokens_gets_a_remark(folder: Path, signed: str, expected: str) -> None:
     keys = f"plainClients: true\nfrontEnd: https://play.example.org\nsubdomain: userId\n{signed}"
     (found,) = remarks.remarks_on(folder, read(folder, small(project=keys)))
     who = "whoever knows a participant's id can play in that participant's place"
-    assert f"{found.where}: {found.message}" == f"project.plainClients: {who}{said}see docs/security.md#identity"
+    assert f"{found.where}: {found.message}" == f"project.plainClients: {who}{expected}see docs/security.md#identity"
     assert found.remark
 
 
 @pytest.mark.parametrize(
-    ("use", "said"), [("useAWS: true\nawsSetup: {cpu: 1, memory: 2}", 1), ("", 1), ("useAWS: false", 0)]
+    ("use", "expected"), [("useAWS: true\nawsSetup: {cpu: 1, memory: 2}", 1), ("", 1), ("useAWS: false", 0)]
 )
-def test_that_servers_get_no_other_certificate_is_remarked(folder: Path, use: str, said: int) -> None:
+def test_a_certificate_of_the_projects_own_gets_a_remark(folder: Path, use: str, expected: int) -> None:
     ssl = "ssl: {sslBucket: lab, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}\n"
     found = [
         f"{one.where}: {one.message}"
         for one in remarks.remarks_on(folder, read(folder, small(project=f"{ssl}{use}\n")))
     ]
     text = "project.ssl: no effect: servers get the certificate of the installation"
-    assert [one for one in found if "ssl" in one] == [text] * said
+    assert [one for one in found if "ssl" in one] == [text] * expected
 
 
-def test_an_empty_section_ssl_is_not_remarked(folder: Path) -> None:
+def test_an_empty_section_ssl_gets_no_remark(folder: Path) -> None:
     found = remarks.remarks_on(folder, read(folder, small(project="ssl:\n  sslBucket:\n")))
     assert [one for one in found if "ssl" in one.where] == []
 
@@ -162,29 +162,29 @@ def test_an_empty_section_ssl_is_not_remarked(folder: Path) -> None:
 
 def test_consent_never_matches_consent2(folder: Path) -> None:
     (folder / "steps" / "consent.html").rename(folder / "steps" / "consent2.html")
-    assert one(folder, SMALL) == "project.steps.1: there is no consent.html in steps/; did you mean consent2?"
+    assert only_mistake(folder, SMALL) == "project.steps.1: there is no consent.html in steps/; did you mean consent2?"
 
 
-def test_the_name_of_all_versions_is_suggested(folder: Path) -> None:
+def test_for_pages_of_groups_the_name_without_the_number_is_suggested(folder: Path) -> None:
     text = small(steps="1: brifing\n2: game\n3: thanks\n")
-    assert one(folder, text) == "project.steps.1: there is no brifing.html in steps/; did you mean briefing?"
+    assert only_mistake(folder, text) == "project.steps.1: there is no brifing.html in steps/; did you mean briefing?"
 
 
 @pytest.mark.parametrize("page", ["surround", "instructions", "banks", "welcome"])
-def test_unlike_names_are_not_suggested(folder: Path, page: str) -> None:
+def test_names_that_differ_much_are_not_suggested(folder: Path, page: str) -> None:
     text = small(steps=f"1: {page}\n2: game\n3: thanks\n")
-    assert one(folder, text) == f"project.steps.1: there is no {page}.html in steps/"
+    assert only_mistake(folder, text) == f"project.steps.1: there is no {page}.html in steps/"
 
 
 def test_only_pages_are_suggested(folder: Path) -> None:
     (folder / "steps" / "survay.png").touch()
     text = small(steps="1: survay\n2: game\n3: thanks\n")
-    assert one(folder, text) == "project.steps.1: there is no survay.html in steps/; did you mean survey?"
+    assert only_mistake(folder, text) == "project.steps.1: there is no survay.html in steps/; did you mean survey?"
 
 
-def test_letters_of_another_size_are_another_file(folder: Path) -> None:
+def test_upper_and_lower_case_letters_are_different_files(folder: Path) -> None:
     text = small(steps="1: Consent\n2: game\n3: thanks\n")
-    assert one(folder, text) == "project.steps.1: there is no Consent.html in steps/; did you mean consent?"
+    assert only_mistake(folder, text) == "project.steps.1: there is no Consent.html in steps/; did you mean consent?"
 
 
 def test_a_single_group_is_a_group(folder: Path) -> None:
@@ -198,9 +198,9 @@ def test_a_page_whose_name_ends_in_a_number_is_a_page(folder: Path) -> None:
     assert [(step.page, step.variants) for step in found.steps] == [("survey", 0), ("survey-2", 0), ("briefing-1", 0)]
 
 
-def test_one_page_for_all_and_groups_are_a_contradiction(folder: Path) -> None:
+def test_a_page_for_all_beside_pages_of_groups_is_refused(folder: Path) -> None:
     (folder / "steps" / "briefing.html").touch()
-    assert one(folder, small(steps="1: briefing\n")) == (
+    assert only_mistake(folder, small(steps="1: briefing\n")) == (
         "project.steps.1: both briefing.html and briefing-0.html are in steps/; keep briefing.html for one page for "
         "all participants, or briefing-0.html, briefing-1.html … for groups"
     )
@@ -208,7 +208,7 @@ def test_one_page_for_all_and_groups_are_a_contradiction(folder: Path) -> None:
 
 def test_a_gap_in_the_groups_is_named(folder: Path) -> None:
     (folder / "steps" / "briefing-1.html").unlink()
-    assert one(folder, small(steps="1: briefing\n")) == (
+    assert only_mistake(folder, small(steps="1: briefing\n")) == (
         "project.steps.1: there is no briefing.html in steps/; if briefing-2.html is the page of a group, briefing-1.html "
         "is missing (groups are numbered 0, 1, 2 … without gaps)"
     )
@@ -222,7 +222,7 @@ def test_ten_groups_and_more_are_counted_as_numbers(folder: Path) -> None:
     assert step.files[10].name == "many-10.html"
 
 
-def test_without_a_folder_of_pages(folder: Path) -> None:
+def test_a_missing_folder_of_pages_gets_a_message(folder: Path) -> None:
     (folder / "steps").rename(folder / "elsewhere")
     assert mistakes(folder, SMALL) == [
         "config.yml:3: project.steps: there is no folder steps (or StepFiles) beside the file; put the pages there"
@@ -230,7 +230,7 @@ def test_without_a_folder_of_pages(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         (b"fine\ncaf\xe9", "steps/consent.html is not UTF-8 text (line 2); save it as UTF-8"),
         (
@@ -239,19 +239,19 @@ def test_without_a_folder_of_pages(folder: Path) -> None:
         ),
     ],
 )
-def test_a_page_must_be_text_of_a_decent_size(folder: Path, content: bytes, said: str) -> None:
+def test_a_page_must_be_text_of_a_limited_size(folder: Path, content: bytes, expected: str) -> None:
     (folder / "steps" / "consent.html").write_bytes(content)
-    assert one(folder, SMALL) == f"project.steps.1: {said}"
+    assert only_mistake(folder, SMALL) == f"project.steps.1: {expected}"
 
 
 def test_a_folder_is_not_a_page(folder: Path) -> None:
     (folder / "steps" / "consent.html").unlink()
     (folder / "steps" / "consent.html").mkdir()
-    assert one(folder, SMALL) == "project.steps.1: steps/consent.html is not a file"
+    assert only_mistake(folder, SMALL) == "project.steps.1: steps/consent.html is not a file"
 
 
 @pytest.mark.parametrize(
-    ("page", "said"),
+    ("page", "expected"),
     [
         ("../secret", "there is no secret.html in steps/"),
         (
@@ -264,5 +264,5 @@ def test_a_folder_is_not_a_page(folder: Path) -> None:
         ("[a]", "must be the name of a file, or game, not a list"),
     ],
 )
-def test_a_page_is_a_plain_file_name(folder: Path, page: str, said: str) -> None:
-    assert one(folder, small(steps=f"1: {page}\n2: thanks\n")) == f"project.steps.1: {said}"
+def test_a_page_is_a_plain_file_name(folder: Path, page: str, expected: str) -> None:
+    assert only_mistake(folder, small(steps=f"1: {page}\n2: thanks\n")) == f"project.steps.1: {expected}"

@@ -1,4 +1,4 @@
-"""The key `texts`: the message about each mistake, and texts that a study in another language leaves in English."""
+"""The key `texts`: the message for each mistake, and the remarks on texts that stay English."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hippodrome.config import english, parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
 from hippodrome.model.project import Project
 from hippodrome.model.texts import ENGLISH, texts_of
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, one, read, small
+from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
 
 __all__ = ["folder"]
 
@@ -27,7 +27,7 @@ project:
 """
 
 
-def with_texts(config: str, texts: str) -> str:
+def with_lines_of_texts(config: str, texts: str) -> str:
     """The configuration with these lines of texts."""
     return config.replace("project:\n", f"project:\n  texts:\n{texts}", 1)
 
@@ -85,23 +85,25 @@ def remarks(folder: Path, config: str) -> list[str]:
         ("Los", 'project.texts: must be a section: indented lines such as "start: "Los"" below it, not "Los"'),
     ],
 )
-def test_a_mistake_in_texts(folder: Path, texts: str, said: str) -> None:
-    assert one(folder, small(project=f"texts: {texts}\n")) == said
+def test_a_mistake_in_texts_gets_a_message(folder: Path, texts: str, said: str) -> None:
+    assert only_mistake(folder, small(project=f"texts: {texts}\n")) == said
 
 
 def test_a_mistake_is_named_with_its_line(folder: Path) -> None:
-    (folder / "config.yml").write_text(with_texts(SMALL, '    start: Los\n    seconds: "{s}"\n'))
+    (folder / "config.yml").write_text(with_lines_of_texts(SMALL, '    start: Los\n    seconds: "{s}"\n'))
     with pytest.raises(Exception, match=r"config\.yml:4: project\.texts\.seconds: nothing stands for \{s\}"):
         read_project(folder)
 
 
-def test_texts_that_are_empty_are_not_given(folder: Path) -> None:
-    config = read(folder, with_texts(SMALL, "    start: Los\n    pause:\n    goOn: ''\n    second: 1\n"))
+def test_empty_texts_count_as_not_given(folder: Path) -> None:
+    config = read(folder, with_lines_of_texts(SMALL, "    start: Los\n    pause:\n    goOn: ''\n    second: 1\n"))
     assert config.registration()["texts"] == {"start": "Los", "second": "1"}
 
 
-def test_texts_reach_the_pages_as_they_are(folder: Path) -> None:
-    registration = read(folder, with_texts(SMALL, "    start: <b> & „Los“\n    language: pt-BR\n")).registration()
+def test_texts_are_registered_unchanged(folder: Path) -> None:
+    registration = read(
+        folder, with_lines_of_texts(SMALL, "    start: <b> & „Los“\n    language: pt-BR\n")
+    ).registration()
     found = parse_registration(json.loads(json.dumps(registration)))
     assert msgspec.convert(found, Project).texts == {"start": "<b> & „Los“", "language": "pt-BR"}
 
@@ -115,8 +117,8 @@ def test_the_german_texts_are_without_mistakes_and_remarks(folder: Path) -> None
 
 def test_texts_that_stay_english_get_one_remark(folder: Path) -> None:
     pages = texts_of(has_game=False, has_sessions=False)
-    said = remarks(folder, with_texts(PAGES, "    language: de\n    step: Schritt\n    continue: Weiter\n"))
-    which = f"the study is in another language (de), and {len(pages) - 3} of Hippodrome's texts stay English"
+    said = remarks(folder, with_lines_of_texts(PAGES, "    language: de\n    step: Schritt\n    continue: Weiter\n"))
+    which = f"the study is in another language (de), and {len(pages) - 3} texts of ours stay English"
     assert said == [f"config.yml:2: remark: project.texts: {which}: titleStep, studyBy, send …; see docs/texts.md"]
 
 
@@ -141,20 +143,22 @@ def test_only_one_text_that_stays_english_is_named(folder: Path) -> None:
     own = "".join(
         f"    {name}: x\n" for name in texts_of(has_game=False, has_sessions=False) if name not in ("send", "language")
     )
-    (said,) = remarks(folder, with_texts(PAGES, f"    language: de\n{own}"))
-    assert said.endswith("and one of Hippodrome's texts stays English: send; see docs/texts.md")
+    (said,) = remarks(folder, with_lines_of_texts(PAGES, f"    language: de\n{own}"))
+    assert said.endswith("and one text of ours stays English: send; see docs/texts.md")
 
 
 @pytest.mark.parametrize("texts", ["    continue: Next page\n", "    language: en-GB\n    continue: Next page\n"])
 def test_a_study_in_english_gets_no_remark(folder: Path, texts: str) -> None:
-    assert remarks(folder, with_texts(SMALL, texts)) == []
+    assert remarks(folder, with_lines_of_texts(SMALL, texts)) == []
 
 
 @pytest.mark.parametrize(
     "language", ["en", "fil", "pt-BR", "es-419", "zh-Hant-TW", "sr-Latn", "de-CH-1996", "ca-ES-valencia"]
 )
 def test_a_language_with_its_script_region_and_variant(folder: Path, language: str) -> None:
-    assert read(folder, with_texts(SMALL, f"    language: {language}\n")).project.own_texts == {"language": language}
+    assert read(folder, with_lines_of_texts(SMALL, f"    language: {language}\n")).project.own_texts == {
+        "language": language
+    }
 
 
 FRENCH = (
@@ -166,8 +170,8 @@ FRENCH = (
 NOT_ENGLISH = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are; "
 
 
-def unnamed(folder: Path, config: str) -> list[str]:
-    """The remarks on a study that does not name its language."""
+def remarks_on_language(folder: Path, config: str) -> list[str]:
+    """The remarks of this configuration that are about a missing language."""
     found = [str(said) for said in remarks_on(folder, read(folder, config))]
     return [said for said in found if NOT_ENGLISH in said]
 
@@ -175,22 +179,22 @@ def unnamed(folder: Path, config: str) -> list[str]:
 def test_a_study_in_another_language_that_does_not_name_it_gets_a_remark(folder: Path) -> None:
     (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
     how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
-    assert unnamed(folder, PAGES) == [f"config.yml:1: remark: project: {NOT_ENGLISH}{how}"]
+    assert remarks_on_language(folder, PAGES) == [f"config.yml:1: remark: project: {NOT_ENGLISH}{how}"]
     how = "give the language of these texts, such as language: fr"
-    texts = with_texts(PAGES, "    continue: Continuer\n")
-    assert unnamed(folder, texts) == [f"config.yml:2: remark: project.texts: {NOT_ENGLISH}{how}"]
-    assert unnamed(folder, with_texts(PAGES, "    language: en\n")) == []
-    assert unnamed(folder, with_texts(PAGES, "    language: fr\n")) == []
+    texts = with_lines_of_texts(PAGES, "    continue: Continuer\n")
+    assert remarks_on_language(folder, texts) == [f"config.yml:2: remark: project.texts: {NOT_ENGLISH}{how}"]
+    assert remarks_on_language(folder, with_lines_of_texts(PAGES, "    language: en\n")) == []
+    assert remarks_on_language(folder, with_lines_of_texts(PAGES, "    language: fr\n")) == []
     (folder / "steps" / "thanks.html").write_text("<html lang=fr><p>Merci.", encoding="utf-8")
-    assert unnamed(folder, PAGES) == []
+    assert remarks_on_language(folder, PAGES) == []
 
 
-def test_texts_alone_tell_that_their_language_is_missing(folder: Path) -> None:
+def test_texts_without_a_language_get_a_remark_whatever_the_pages_are(folder: Path) -> None:
     texts = GERMAN[GERMAN.index("  texts:\n") :].replace("    language: de\n", "")
-    (said,) = unnamed(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
+    (said,) = remarks_on_language(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
     assert said.startswith("config.yml:3: remark: project.texts: ")
     (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
-    (said,) = unnamed(folder, PAGES.replace("  id: small\n", f"  id: small\n{ALL_ENGLISH}"))
+    (said,) = remarks_on_language(folder, PAGES.replace("  id: small\n", f"  id: small\n{ALL_ENGLISH}"))
     assert said.endswith("; give the language of these texts, such as language: fr")
 
 
@@ -198,13 +202,13 @@ STEPS = [ROOT / "steps", *sorted(ROOT.glob("examples/*/steps"))]
 
 
 @pytest.mark.parametrize("steps", STEPS, ids=lambda path: path.parent.name)
-def test_english_pages_are_far_from_seeming_another_language(steps: Path) -> None:
+def test_english_pages_are_clearly_recognized_as_english(steps: Path) -> None:
     words = [word for file in steps.glob("*.html") for word in english.words_of(file.read_text(encoding="utf-8"))]
     assert len(words) >= english.ENOUGH
     assert english.share(words) > 1.5 * english.LEAST
 
 
-def test_other_languages_are_far_from_seeming_english() -> None:
+def test_texts_in_other_languages_are_clearly_recognized_as_not_english() -> None:
     dutch = "Wilt u meedoen? U speelt een spel met een ander. Het is kort. We bewaren of u dat wilt uw antwoorden in de data."
     for text in (FRENCH, GERMAN[GERMAN.index("language: de") :], dutch):
         assert english.share(english.words_of(text)) < english.LEAST / 4
@@ -221,18 +225,20 @@ def test_other_languages_are_far_from_seeming_english() -> None:
         ("Wenn 1 < 2 & 3 > 2, „weiter“!", None),
     ],
 )
-def test_signs_that_are_meant_for_a_program_get_a_remark(folder: Path, text: str, said: str | None) -> None:
-    found = [str(each) for each in remarks_on(folder, read(folder, with_texts(SMALL, f"    continue: '{text}'\n")))]
+def test_characters_that_are_meant_for_a_program_get_a_remark(folder: Path, text: str, said: str | None) -> None:
+    found = [
+        str(each) for each in remarks_on(folder, read(folder, with_lines_of_texts(SMALL, f"    continue: '{text}'\n")))
+    ]
     expected = [f"config.yml:3: remark: project.texts.continue: {said}"] if said else []
     assert [each for each in found if "project.texts.continue" in each] == expected
 
 
-def test_texts_that_are_not_indented_far_enough_are_told_where_they_belong(folder: Path) -> None:
+def test_texts_with_too_little_indentation_get_a_message_on_where_they_belong(folder: Path) -> None:
     belongs = "unknown key; it belongs under project.texts (check the indentation)"
     text = SMALL.replace("project:\n", "project:\n  texts:\n  language: de\n  waited: Gewartet\n", 1)
     expected = [f"config.yml:3: project.language: {belongs}", f"config.yml:4: project.waited: {belongs}"]
     assert mistakes(folder, text) == expected
-    assert one(folder, f"{SMALL}continue: Weiter\n") == f"continue: {belongs}"
+    assert only_mistake(folder, f"{SMALL}continue: Weiter\n") == f"continue: {belongs}"
 
 
 def test_a_study_needs_only_the_texts_that_its_participants_may_read() -> None:

@@ -72,7 +72,7 @@ SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: eac
 
 
 def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
-    """The section that servers get, or the mistakes in it."""
+    """The section that the study's servers get after registration, or the list of problems."""
     try:
         return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
     except ConfigErrors as errors:
@@ -80,19 +80,19 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
 
 
 def started(section: dict[str, Any]) -> trial.TrialSection | str:
-    """The settings that a server reads from the section, or the mistakes in it."""
+    """The settings that a server reads from it, or the first problem."""
     try:
         return trial_section(section)
     except SettingsError as error:
         return str(error)
 
 
-def test_every_key_is_tried_here() -> None:
+def test_these_tests_try_every_key() -> None:
     assert set(KEYS) | {"game"} == trial_keys.names(trial.TrialSection) | {trial.RATE_CHANGE_MISSPELT}
 
 
 @given(SECTIONS)
-def test_the_same_section_gives_the_same_at_both_ends(section: dict[str, Any]) -> None:
+def test_registration_and_server_read_the_same_from_a_section(section: dict[str, Any]) -> None:
     told, made = registered(section), started(section)
     if isinstance(told, list):
         assert made == told[0]
@@ -102,7 +102,7 @@ def test_the_same_section_gives_the_same_at_both_ends(section: dict[str, Any]) -
 
 
 @given(SECTIONS)
-def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> None:
+def test_a_wrong_value_is_replaced_by_its_default(section: dict[str, Any]) -> None:
     found, problems = trial_check.check(section)
     wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
     defaults = trial.TrialSection().document()
@@ -112,20 +112,20 @@ def test_what_is_wrong_is_replaced_by_its_default(section: dict[str, Any]) -> No
     }
 
 
-def test_a_rate_beyond_a_default_is_refused_at_both_ends() -> None:
-    said = "trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; set startingFrameRate too"
-    assert registered({"game": "x/Y-v0", "minFrameRate": 50}) == [said]
-    assert started({"minFrameRate": 50}) == said
+def test_registration_and_server_refuse_a_rate_beyond_a_default() -> None:
+    expected = "trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; set startingFrameRate too"
+    assert registered({"game": "x/Y-v0", "minFrameRate": 50}) == [expected]
+    assert started({"minFrameRate": 50}) == expected
 
 
-def test_both_spellings_at_once_are_refused_at_both_ends() -> None:
+def test_registration_and_server_refuse_both_spellings_at_once() -> None:
     section = {"game": "x/Y-v0", trial.RATE_CHANGE: True, trial.RATE_CHANGE_MISSPELT: False}
-    said = "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"
-    assert registered(section) == [said]
-    assert started(section) == said
+    expected = "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"
+    assert registered(section) == [expected]
+    assert started(section) == expected
 
 
-def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
+def test_registration_and_server_read_an_action_that_is_a_number_as_a_name() -> None:
     told = registered({"game": "x/Y-v0", "actionSpace": [0, "1"]})
     assert isinstance(told, dict)
     assert told["actionSpace"] == ["0", "1"]
@@ -134,7 +134,7 @@ def test_an_action_that_is_a_number_is_a_name_at_both_ends() -> None:
     assert made.action_space == ("0", "1")
 
 
-def test_a_number_that_names_an_action_is_the_same_text_wherever_it_stands() -> None:
+def test_a_number_that_names_an_action_is_the_same_text_in_every_key() -> None:
     one = Plain(1, "01")  # as YAML reads 01
     found, problems = trial_check.check(
         {"actionSpace": [Plain(0, "00"), one], "idleAction": one, "keys": {"a": one}, "labels": {"01": "Go"}}
@@ -149,13 +149,13 @@ def test_a_number_that_names_an_action_is_the_same_text_wherever_it_stands() -> 
 
 
 @pytest.mark.parametrize("section", ["x", [1], 3, True])
-def test_what_is_no_section_is_a_problem_of_its_own(section: object) -> None:
+def test_a_section_that_is_no_map_is_one_problem(section: object) -> None:
     found, problems = trial_check.check(section)
     assert found == trial.TrialSection()
     assert [problem.path for problem in problems] == [()]
 
 
-def test_a_policy_that_may_not_think_at_all_is_a_mistake() -> None:
+def test_a_policy_time_of_zero_seconds_is_a_mistake() -> None:
     (problem,) = trial_check.check({"policySeconds": 0})[1]
     assert problem.path == ("policySeconds",)
 
@@ -169,7 +169,7 @@ def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) 
 
 
 @pytest.mark.parametrize("value", [True, [], {}, float("nan"), None])
-def test_a_break_of_no_length_is_named(value: Any) -> None:
+def test_a_wrong_length_of_a_break_gets_a_message_and_an_empty_one_is_the_default(value: Any) -> None:
     if value is None:
         assert trial_section({"betweenEpisodes": value}).between_episodes == 3
         return
@@ -180,10 +180,10 @@ def test_a_break_of_no_length_is_named(value: Any) -> None:
         trial_section({"betweenEpisodes": value})
 
 
-# ---- what happens while no key is pressed
+# ---- the action that is taken while no key is pressed
 
 
-def said(*actions: str, **trial: Any) -> str | None:
+def idle_remark(*actions: str, **trial: Any) -> str | None:
     tree = {
         "project": {"id": "p", "steps": {"1": "hello", "2": "game", "finalStep": "bye"}},
         "trial": {"game": "x/Y-v0", "actionSpace": list(actions), **trial},
@@ -195,24 +195,24 @@ def said(*actions: str, **trial: Any) -> str | None:
     return None if found is None else found.message
 
 
-def test_an_action_that_is_taken_without_a_key_is_named() -> None:
-    text = said("left", "right", startingFrameRate=50)
+def test_an_action_that_is_taken_while_no_key_is_pressed_is_named() -> None:
+    text = idle_remark("left", "right", startingFrameRate=50)
     assert text is not None
     assert text.startswith('while no key is pressed, the game takes "left", 50 times a second')
     assert "name it as idleAction" in text
 
 
-def test_an_idle_action_of_another_name_is_proposed() -> None:
-    text = said("left", "right", "stay")
+def test_an_action_that_looks_idle_is_proposed_as_idle_action() -> None:
+    text = idle_remark("left", "right", "stay")
     assert text is not None
     assert "write idleAction: stay, and that is taken instead" in text
 
 
 @pytest.mark.parametrize("given", [{"idleAction": "left"}, {"pace": "turns"}])
-def test_a_study_that_says_what_happens_without_a_key_is_not_remarked(given: dict[str, Any]) -> None:
-    assert said("left", "right", **given) is None
+def test_a_study_that_sets_the_idle_behaviour_gets_no_remark(given: dict[str, Any]) -> None:
+    assert idle_remark("left", "right", **given) is None
 
 
 @pytest.mark.parametrize("actions", [(), ("noop", "left"), ("left", "NOOP"), ("nothing", "left")])
-def test_games_that_stand_still_without_a_key_are_not_remarked(actions: tuple[str, ...]) -> None:
-    assert said(*actions) is None
+def test_games_whose_first_action_is_idle_get_no_remark(actions: tuple[str, ...]) -> None:
+    assert idle_remark(*actions) is None

@@ -1,4 +1,4 @@
-"""Limits of a project: never exceeded, however many come at once; nothing is paid where there are none."""
+"""A project's limits are never exceeded, however many participants come at once; without limits no AWS call is made for them."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def claimed(project: Project, user: str, attempt: int = 1) -> Server:
     return server.new_attempt(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
 
 
-def running(platform: FakePlatform) -> ServerSlots:
+def server_slots(platform: FakePlatform) -> ServerSlots:
     found = platform.documents.kept.get("_places/maze.json")
     return from_json(found[0], ServerSlots) if found else ServerSlots()
 
 
-def people(platform: FakePlatform) -> list[str]:
+def labels_with_slots(platform: FakePlatform) -> list[str]:
     kept = platform.documents.kept
     return [
         label
@@ -74,8 +74,8 @@ def record(platform: FakePlatform, user: str = "alice") -> Server:
     return from_json(platform.documents.kept[server.key(ids.server_label("maze", user))][0], Server)
 
 
-def begin(platform: FakePlatform, user: str) -> str:
-    """Start the user's server and let it run; its task, or "" if there was no place."""
+def start_and_run(platform: FakePlatform, user: str) -> str:
+    """Start the user's server and let it run; its task, or "" if there was no slot."""
     servers = Servers(platform)
     servers.start(StartServer("maze", user))
     for task, request in platform.tasks.running.items():
@@ -85,7 +85,7 @@ def begin(platform: FakePlatform, user: str) -> str:
     return ""
 
 
-def lost(platform: FakePlatform, task: str, attempt: int = 1, user: str = "alice") -> TaskChanged:
+def lost_event(platform: FakePlatform, task: str, attempt: int = 1, user: str = "alice") -> TaskChanged:
     name = ids.server_name(ids.server_label("maze", user), attempt)
     platform.tasks.running.pop(task, None)
     return TaskChanged(task, "hippodrome", name, "STOPPED", None, "SpotInterruption", "", None)
@@ -115,12 +115,12 @@ def test_servers_and_hours_never_exceed_their_limits(steps: list[tuple[str, int,
             attempts[who] += 1
         else:
             now = now.released(record, seconds, keep=what == "keep")
-            assert now.released(record, 2700, keep=what == "keep") == now  # said twice, counted once
+            assert now.released(record, 2700, keep=what == "keep") == now  # done twice, counted once
         assert len(now.slots) <= most
         assert now.used + sum(held.reserved for held in now.slots.values()) <= hours * 3600
 
 
-def test_a_server_counts_what_it_used_and_no_more_than_it_reserved() -> None:
+def test_a_server_counts_the_time_it_used_and_no_more_than_it_reserved() -> None:
     project = study(max_server_hours=1)
     record = claimed(project, "alice")
     taken = ServerSlots().with_server(project, record)
@@ -151,7 +151,7 @@ def test_the_shares_of_all_shards_are_the_limit(limit: int) -> None:
     st.sets(st.sampled_from(USERS), max_size=15),
 )
 def test_whatever_the_limit_becomes_no_newcomer_exceeds_it(steps: list[str | int], before: set[str]) -> None:
-    """Numbers are new limits; `before` came when there was none."""
+    """Numbers are new limits; `before` are participants who came before there was a limit."""
     platform, inside, limit = installed(), set(before), 0
     came: set[str] = set()  # under the present limit
     for step in [5, *steps]:
@@ -164,10 +164,10 @@ def test_whatever_the_limit_becomes_no_newcomer_exceeds_it(steps: list[str | int
             if room:
                 inside.add(step)
                 came.add(step)
-        assert sorted(people(platform)) == sorted(ids.server_label("maze", user) for user in inside)
+        assert sorted(labels_with_slots(platform)) == sorted(ids.server_label("maze", user) for user in inside)
 
 
-def test_a_full_study_is_not_asked_again_for_a_moment() -> None:
+def test_a_function_remembers_for_ten_seconds_that_a_study_is_full() -> None:
     platform = installed()
     slots, project = Slots(platform), study(max_participants=1)
     assert slots.admit(project, "alice")
@@ -182,7 +182,7 @@ def test_a_full_study_is_not_asked_again_for_a_moment() -> None:
     assert slots.admit(project, "carol")
 
 
-def test_a_newcomer_to_a_full_study_is_told_and_nothing_is_kept() -> None:
+def test_a_newcomer_to_a_full_study_sees_that_it_is_full_and_nothing_is_stored() -> None:
     platform = installed(study(max_participants=1, events=study().events))
     Browser(platform, "projectId=maze&userId=alice").get()
     keys, sent = set(platform.documents.kept), len(platform.bus.sent)
@@ -195,21 +195,21 @@ def test_a_newcomer_to_a_full_study_is_told_and_nothing_is_kept() -> None:
     assert "This study is full" not in Browser(platform, "projectId=maze&userId=alice").get()
 
 
-def test_who_crashed_between_place_and_record_has_one_place() -> None:
+def test_a_crash_between_slot_and_record_takes_no_second_slot() -> None:
     platform = installed(study(max_participants=2))
     platform.documents.before_write = [lambda: None, _crash]
     alice = Browser(platform)
     assert alice.send()["statusCode"] == 500
     assert not any("users/" in key for key in platform.documents.kept)
     alice.get()
-    assert len(people(platform)) == 1
+    assert len(labels_with_slots(platform)) == 1
 
 
 def _crash() -> None:
     raise ConnectionError
 
 
-def test_those_who_came_before_the_limit_count() -> None:
+def test_participants_who_came_before_the_limit_count() -> None:
     platform = installed()
     for user in ("alice", "bob"):
         Browser(platform, f"projectId=maze&userId={user}").get()
@@ -219,7 +219,9 @@ def test_those_who_came_before_the_limit_count() -> None:
         answer = registry.register(platform, _registration(maxParticipants=limit))
         assert answer.max_participants == limit
         assert Slots(platform).admit(answer, "carol") is carol
-    assert sorted(people(platform)) == sorted(ids.server_label("maze", user) for user in ("alice", "bob", "carol"))
+    assert sorted(labels_with_slots(platform)) == sorted(
+        ids.server_label("maze", user) for user in ("alice", "bob", "carol")
+    )
     assert not Slots(platform).admit(answer, "dave")
 
 
@@ -236,13 +238,13 @@ def _registration(**changes: object) -> dict[str, Any]:
 # Servers
 
 
-def test_beyond_max_servers_nothing_is_started_and_the_page_says_so_until_there_is_room() -> None:
+def test_beyond_max_servers_no_server_starts_and_the_page_says_so_until_there_is_room() -> None:
     platform = installed(study(max_servers=1))
-    assert begin(platform, "bob")
+    assert start_and_run(platform, "bob")
     alice = Browser(platform)
     to_game(alice)
     platform.bus.sent.clear()
-    assert begin(platform, "alice") == ""
+    assert start_and_run(platform, "alice") == ""
     assert (record(platform).state, record(platform).reason) == (ServerState.CLOSED, Reason.FULL)
     assert set(platform.timers.due) == {ids.server_name(ids.server_label("maze", "bob"), 1)}
     page = alice.get()
@@ -256,38 +258,38 @@ def test_beyond_max_servers_nothing_is_started_and_the_page_says_so_until_there_
     assert platform.bus.sent.pop() == (Topic.START, {"projectId": "maze", "userId": "alice"})
     alice.answer(page)  # or press the button
     assert platform.bus.sent.pop(0) == (Topic.START, {"projectId": "maze", "userId": "alice"})
-    assert begin(platform, "alice") == ""
+    assert start_and_run(platform, "alice") == ""
     Servers(platform).stop([StopServer("maze", "bob")])
-    assert begin(platform, "alice")
+    assert start_and_run(platform, "alice")
     assert record(platform).attempt == 1
-    assert list(running(platform).slots) == [ids.server_label("maze", "alice")]
+    assert list(server_slots(platform).slots) == [ids.server_label("maze", "alice")]
 
 
-def test_a_server_that_is_lost_keeps_its_place_for_the_next_attempt() -> None:
+def test_a_lost_server_keeps_its_slot_for_the_next_attempt() -> None:
     platform = installed(study(max_servers=1, max_server_hours=2))
-    task = begin(platform, "alice")
+    task = start_and_run(platform, "alice")
     platform.wait(minutes=10)
-    Servers(platform).tasks_changed([lost(platform, task)])
-    assert running(platform) == ServerSlots({record(platform).label: ServerSlot(1)}, 600)
-    assert begin(platform, "bob") == ""
+    Servers(platform).tasks_changed([lost_event(platform, task)])
+    assert server_slots(platform) == ServerSlots({record(platform).label: ServerSlot(1)}, 600)
+    assert start_and_run(platform, "bob") == ""
     Servers(platform).start(StartServer("maze", "alice", 2))
     assert record(platform).state is ServerState.STARTING
-    assert running(platform) == ServerSlots({record(platform).label: ServerSlot(2, 1800)}, 600)
+    assert server_slots(platform) == ServerSlots({record(platform).label: ServerSlot(2, 1800)}, 600)
 
 
-def test_a_place_that_waits_in_vain_is_given_back_by_the_sweep() -> None:
+def test_the_sweep_gives_back_a_slot_that_no_next_attempt_takes() -> None:
     platform = installed(study(max_servers=1))
-    Servers(platform).tasks_changed([lost(platform, begin(platform, "alice"))])
+    Servers(platform).tasks_changed([lost_event(platform, start_and_run(platform, "alice"))])
     assert Sweep(platform).run().slots == 0
     platform.wait(minutes=11)
     assert Sweep(platform).run().slots == 1
-    assert begin(platform, "bob")
+    assert start_and_run(platform, "bob")
     assert Sweep(platform).run().slots == 0
 
 
-def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sweep_frees_a_slot_only_if_its_server_is_known_to_be_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     platform = installed(study(max_servers=3))
-    begin(platform, "alice")
+    start_and_run(platform, "alice")
     platform.wait(minutes=11)
     get = platform.documents.get
 
@@ -302,37 +304,37 @@ def test_the_sweep_frees_only_what_it_knows_to_be_gone(monkeypatch: pytest.Monke
     assert Sweep(platform).run().slots == 0
     platform.documents.delete(server.key(ids.server_label("maze", "alice")))  # erased
     assert Sweep(platform).run().slots == 1
-    assert running(platform) == ServerSlots(used=1800)  # nobody knows what it used
+    assert server_slots(platform) == ServerSlots(used=1800)  # the time that it used is not known
     platform.documents.put("_places/other.json", b"what is this")
     Sweep(platform).run()
 
 
-def test_hours_that_are_used_up_end_the_study_for_newcomers() -> None:
+def test_no_server_starts_when_the_hours_are_used_up() -> None:
     platform = installed(study(max_server_hours=1))
     for user in ("alice", "bob"):
-        assert begin(platform, user)
-    assert begin(platform, "carol") == ""  # two reserve all of it
+        assert start_and_run(platform, user)
+    assert start_and_run(platform, "carol") == ""  # two servers reserve all of the hour
     platform.wait(minutes=20)
     Servers(platform).stop([StopServer("maze", "alice"), StopServer("maze", "bob")])
-    assert running(platform) == ServerSlots(used=2400)
-    assert begin(platform, "carol") == ""  # 20 minutes are not 30
-    assert begin(platform, "dave") == ""
-    assert running(platform).slots == {}
+    assert server_slots(platform) == ServerSlots(used=2400)
+    assert start_and_run(platform, "carol") == ""  # 20 minutes are left, and a server reserves 30
+    assert start_and_run(platform, "dave") == ""
+    assert server_slots(platform).slots == {}
 
 
-def test_what_aws_refuses_costs_no_hours() -> None:
+def test_a_server_that_aws_refuses_uses_no_hours() -> None:
     platform = installed(study(max_server_hours=1))
     platform.tasks.fail = [Refused("no such task definition")]
-    assert begin(platform, "alice") == ""
-    assert running(platform) == ServerSlots()
+    assert start_and_run(platform, "alice") == ""
+    assert server_slots(platform) == ServerSlots()
     platform.tasks.fail = [NoCapacity(), NoCapacity()]
-    assert begin(platform, "bob") == ""
-    assert running(platform) == ServerSlots({ids.server_label("maze", "bob"): ServerSlot(1)})
+    assert start_and_run(platform, "bob") == ""
+    assert server_slots(platform) == ServerSlots({ids.server_label("maze", "bob"): ServerSlot(1)})
 
 
-def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slot_is_given_back_once_and_before_the_record_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     platform = installed(study(max_server_hours=1))
-    begin(platform, "alice")
+    start_and_run(platform, "alice")
     platform.wait(minutes=5)
     stop = StopServer("maze", "alice")
     platform.documents.before_write = [lambda: None, _crash]
@@ -341,17 +343,17 @@ def test_a_place_goes_before_its_record_is_closed_and_only_once(monkeypatch: pyt
     platform.wait(minutes=5)
     assert Servers(platform).stop([stop]) == []
     assert record(platform).is_closed
-    assert running(platform) == ServerSlots(used=300)
+    assert server_slots(platform) == ServerSlots(used=300)
     monkeypatch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
     with pytest.raises(RetryLater):
         Slots(platform).acquire(study(max_servers=1), claimed(study(max_servers=1), "bob"))
 
 
-def test_many_leave_with_one_write() -> None:
+def test_the_slots_of_many_servers_are_given_back_with_one_write() -> None:
     platform = installed(study(max_servers=20))
     for user in USERS[:20]:
-        assert begin(platform, user)
-    assert begin(platform, USERS[20]) == ""
+        assert start_and_run(platform, user)
+    assert start_and_run(platform, USERS[20]) == ""
     before = dict(platform.documents.kept)
     writes: list[str] = []
     replace = platform.documents.replace
@@ -359,10 +361,10 @@ def test_many_leave_with_one_write() -> None:
     Servers(platform).stop([StopServer("maze", user) for user in USERS[:20]])
     assert writes.count("_places/maze.json") == 1
     assert set(platform.documents.kept) == set(before)
-    assert running(platform).slots == {}
+    assert server_slots(platform).slots == {}
 
 
-def test_without_limits_nothing_is_read_or_written_for_them() -> None:
+def test_without_limits_no_document_of_slots_is_read_or_written() -> None:
     platform = installed()
     touched: list[str] = []
     for name in ("get", "create", "replace", "list"):
@@ -370,7 +372,7 @@ def test_without_limits_nothing_is_read_or_written_for_them() -> None:
         setattr(platform.documents, name, lambda key, *rest, act=act: touched.append(key) or act(key, *rest))
     alice = Browser(platform)
     to_game(alice)
-    Servers(platform).tasks_changed([lost(platform, begin(platform, "alice"))])
+    Servers(platform).tasks_changed([lost_event(platform, start_and_run(platform, "alice"))])
     Servers(platform).start(StartServer("maze", "alice", 2))
     Servers(platform).stop([StopServer("maze", "alice")])
     Sweep(platform).run()
@@ -381,7 +383,7 @@ def test_without_limits_nothing_is_read_or_written_for_them() -> None:
 
 
 def at_once(acts: list[Callable[[], bool]]) -> list[bool]:
-    """What each says; all of them run in threads of their own."""
+    """What each function returns; all of them run at the same time, each in a thread."""
     results: list[bool] = []
     threads = [threading.Thread(target=lambda act=act: results.append(act())) for act in acts]
     for thread in threads:
@@ -401,7 +403,7 @@ def documents(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Docume
         yield world.platform.documents
 
 
-def test_a_crowd_gets_exactly_the_places_there_are(documents: Documents) -> None:
+def test_a_crowd_gets_exactly_as_many_slots_as_there_are(documents: Documents) -> None:
     platform: Any = SimpleNamespace(documents=documents, now=FakePlatform().now)
     project = study(max_participants=11, max_servers=7, max_server_hours=5)
     crowd = [lambda user=user: Slots(platform).admit(project, user) for user in USERS[:24]]
@@ -427,22 +429,22 @@ def _leave(platform: Any, record: Server) -> bool:
     return True
 
 
-def test_a_conflict_is_read_anew_and_decided_anew() -> None:
+def test_after_a_conflict_the_document_is_read_and_decided_again() -> None:
     platform = installed()
     project = study(max_servers=1)
 
-    def faster() -> None:
+    def other_function_writes() -> None:
         platform.documents.kept["_places/maze.json"] = (b'{"held": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
 
-    platform.documents.before_write = [faster]
+    platform.documents.before_write = [other_function_writes]
     assert not Slots(platform).acquire(project, claimed(project, "alice"))
     with pytest.raises(Conflict):
         platform.documents.create("_places/maze.json", b"")
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_crowd_larger_than_the_limits(seed: int) -> None:
-    """Never more than maxServers tasks at once, never more hours, and everybody is served or told."""
+def test_a_crowd_that_is_larger_than_the_limits_never_exceeds_them(seed: int) -> None:
+    """There are never more tasks than maxServers nor more hours than the limit; each participant is served or told why not."""
     level = logger.log_level
     logger.setLevel(logging.CRITICAL)
     project = msgspec.structs.replace(SIMULATED, max_participants=50, max_servers=8, max_server_hours=9)
@@ -478,7 +480,7 @@ def test_a_crowd_larger_than_the_limits(seed: int) -> None:
     assert total.used == pytest.approx(ran, rel=0.25)
 
 
-def test_an_attempt_that_never_said_what_it_used_is_charged_when_the_next_takes_its_place() -> None:
+def test_an_attempt_of_unknown_use_counts_in_full_when_the_next_attempt_takes_its_slot() -> None:
     project = study(max_server_hours=1, max_runtime=15)
     first, second = claimed(project, "alice"), claimed(project, "alice", 2)
     now = ServerSlots().with_server(project, first)

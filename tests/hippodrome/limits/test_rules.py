@@ -1,4 +1,4 @@
-"""The rules of places, one by one, without a platform."""
+"""The rules of slots, one by one, without a platform."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def claimed(user: str = "alice", attempt: int = 1) -> Server:
 ALICE, BOB = claimed().label, claimed("bob").label
 
 
-def test_where_places_lie() -> None:
+def test_the_keys_of_the_documents_of_slots() -> None:
     assert limits.participant_slots_folder("maze") == "maze/places/"
     assert limits.participant_slots_key("maze", 3) == "maze/places/3.json"
     assert limits.server_slots_key("maze") == "_places/maze.json"
@@ -39,7 +39,7 @@ def test_where_places_lie() -> None:
 # Participants
 
 
-def test_a_place_is_taken_once_and_only_where_there_is_room() -> None:
+def test_a_slot_is_taken_once_and_only_where_there_is_room() -> None:
     one = ParticipantSlots().with_participant("a", usual=2)
     assert one == ParticipantSlots(("a",), 2)
     assert one.with_participant("a", usual=2) is one
@@ -50,7 +50,7 @@ def test_a_place_is_taken_once_and_only_where_there_is_room() -> None:
     assert ParticipantSlots().with_participant("a", usual=0) == ParticipantSlots()
 
 
-def test_those_who_came_before_the_limit_keep_their_places() -> None:
+def test_participants_who_came_before_the_limit_keep_their_slots() -> None:
     frozen = ParticipantSlots(("a",), 9).without_room(["b", "a"])
     assert frozen == ParticipantSlots(("a", "b"), 2)
     assert frozen.with_room_for(3) == ParticipantSlots(("a", "b"), 5)
@@ -67,7 +67,7 @@ def test_the_shards_share_the_limit_as_evenly_as_they_can(limit: int) -> None:
     assert set(homes) == set(range(min(limits.SHARDS, limit)))
 
 
-def test_a_limit_is_divided_when_the_rooms_add_up_to_it() -> None:
+def test_a_limit_is_divided_when_the_rooms_of_all_shards_add_up_to_it() -> None:
     usual = [ParticipantSlots() for _ in range(limits.SHARDS)]
     assert limits.is_divided(20, usual)
     assert not limits.is_divided(20, [ParticipantSlots(room=3), *usual[1:]])
@@ -92,7 +92,7 @@ def test_a_server_reserves_what_it_may_use_and_counts_what_it_has_used() -> None
     ]
 
 
-def test_a_server_takes_a_place_while_there_are_any() -> None:
+def test_a_server_takes_a_slot_while_one_is_free() -> None:
     two = study(max_servers=2)
     one = ServerSlots(used=5).with_server(two, claimed())
     assert one == ServerSlots({ALICE: ServerSlot(1, 1800)}, 5)
@@ -117,7 +117,7 @@ def test_hours_are_reserved_to_the_second() -> None:
     assert ServerSlots({ALICE: ServerSlot(1, 1800)}, 1).with_server(hour, claimed(attempt=2)) is None
 
 
-def test_warm_servers_keep_no_participant_out_and_are_kept_out_by_all() -> None:
+def test_warm_servers_keep_no_participant_out_and_get_only_slots_that_are_left() -> None:
     one = study(max_servers=1, max_server_hours=1)
     warm_server = ServerSlots().with_server(one, claimed(WARM_SERVER))
     assert warm_server == ServerSlots({claimed(WARM_SERVER).label: ServerSlot(1, 3600, True)})
@@ -139,12 +139,14 @@ def test_warm_servers_keep_no_participant_out_and_are_kept_out_by_all() -> None:
         ({"max_servers": 9, "max_server_hours": 2}, 600, 5),
     ],
 )
-def test_for_how_many_more_there_is_room(changes: dict[str, int], seconds: int, room: int | None) -> None:
+def test_the_number_of_free_slots_follows_from_servers_and_hours(
+    changes: dict[str, int], seconds: int, room: int | None
+) -> None:
     running = ServerSlots({ALICE: ServerSlot(1, 1800), BOB: ServerSlot(1, 1800, True)}, 300)
     assert running.free_slots(study(**changes), seconds) == room
 
 
-def test_a_server_that_leaves_counts_once_and_no_more_than_it_reserved() -> None:
+def test_a_server_that_ends_counts_once_and_no_more_than_it_reserved() -> None:
     running = ServerSlots({ALICE: ServerSlot(2, 1800), BOB: ServerSlot(1, 1800)}, 100)
     left = running.released(claimed(attempt=2), 60)
     assert left == ServerSlots({BOB: ServerSlot(1, 1800)}, 160)
@@ -156,7 +158,7 @@ def test_a_server_that_leaves_counts_once_and_no_more_than_it_reserved() -> None
     )
 
 
-def test_a_server_of_which_nothing_is_known_counts_with_all_that_it_reserved() -> None:
+def test_a_server_of_unknown_use_counts_with_all_that_it_reserved() -> None:
     running = ServerSlots({ALICE: ServerSlot(2, 1800), BOB: ServerSlot(1, 60)}, 100)
     assert running.without(ALICE) == ServerSlots({BOB: ServerSlot(1, 60)}, 1900)
     assert running.without("unknown") is running

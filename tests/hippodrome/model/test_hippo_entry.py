@@ -36,7 +36,7 @@ def project(**changes: Any) -> Project:
     return found
 
 
-def test_it_is_a_project() -> None:
+def test_an_entry_is_read_as_a_project() -> None:
     found = project()
     assert [(step.key, step.page) for step in found.steps] == [("1", "consent"), ("2", "game"), ("3", "thank")]
     assert (found.live, found.max_runtime, found.events, found.page_folder) == (True, 30, Events("1", "3"), "")
@@ -52,11 +52,11 @@ def test_it_is_a_project() -> None:
         (None, ("2", "3")),
     ],
 )
-def test_the_server_runs_around_the_game(given_events: Any, events: tuple[str, str]) -> None:
+def test_events_that_leave_the_game_without_a_server_are_replaced(given_events: Any, events: tuple[str, str]) -> None:
     assert project(events=given_events).events == Events(*events)
 
 
-def test_steps_without_a_page_are_left_out_and_events_move_with_the_others() -> None:
+def test_steps_without_a_page_are_left_out_and_events_are_renumbered() -> None:
     steps = {"1": "a.html", "2": "", "3": "b.html", "4": "game", "5": "c.html", "finalStep": "d.html"}
     found = project(steps=steps, events={"startServerStep": 3, "stopServerStep": 5})
     assert [step.key for step in found.steps] == ["1", "2", "3", "4", "finalStep"]
@@ -82,7 +82,7 @@ def test_a_page_is_a_file_in_the_folder_of_the_project(page: str) -> None:
         ({"id": "../x"}, "id"),
     ],
 )
-def test_an_entry_that_makes_no_study_hurts_no_other(changes: dict[str, Any], why: str) -> None:
+def test_an_entry_that_is_no_study_is_kept_and_affects_no_other(changes: dict[str, Any], why: str) -> None:
     raw = {**ENTRY, **changes}
     listed = read(raw, {**ENTRY, "id": "other"})
     assert [found.id for found in listed.projects] == ["other"]
@@ -102,14 +102,14 @@ STEPS = st.dictionaries(
 
 
 @given(st.fixed_dictionaries({"steps": STEPS}, optional={key: JSON for key in ENTRY if key != "steps"}))
-def test_whatever_stands_there_is_kept_and_hurts_no_other(entry: dict[str, Any]) -> None:
+def test_any_entry_is_kept_and_affects_no_other(entry: dict[str, Any]) -> None:
     listed = read(entry, {**ENTRY, "id": "other"})
     assert "other" in [found.id for found in listed.projects]
     again = json.loads(write_list(listed))["projects"]
     assert sorted(map(json.dumps, again)) == sorted(map(json.dumps, [entry, {**ENTRY, "id": "other"}]))
 
 
-def test_of_two_entries_with_one_id_ours_counts_and_both_are_kept() -> None:
+def test_of_two_entries_with_one_id_hippodromes_counts_and_both_are_kept() -> None:
     ours = json.loads(write_list(MasterList([study(id="flight", secret="")])))["projects"][0]
     listed = read(ENTRY, ours)
     assert [len(found.steps) for found in listed.projects] == [5]
@@ -129,7 +129,7 @@ def platform() -> FakePlatform:
     return platform
 
 
-def test_its_pages_are_shown(platform: FakePlatform) -> None:
+def test_the_pages_of_an_entry_are_shown(platform: FakePlatform) -> None:
     answer = Browser(platform, "projectId=flight&userId=u1").send()
     assert answer["statusCode"] == 200
     assert "page consent" in answer["body"]
@@ -142,7 +142,7 @@ def test_registering_another_project_keeps_the_entry(platform: FakePlatform) -> 
     assert ENTRY in json.loads(platform.documents.kept[MASTER_LIST][0])["projects"]
 
 
-def test_registering_it_replaces_the_entry_and_tickets_stay_valid(platform: FakePlatform) -> None:
+def test_registering_the_project_replaces_the_entry_and_tickets_stay_valid(platform: FakePlatform) -> None:
     before = ProjectCache(platform, SecretCache(platform.documents)).project("flight")
     answer = update_project_master_list.handler({**ENTRY, "bucket": None}, None)
     assert answer["statusCode"] == 200, answer

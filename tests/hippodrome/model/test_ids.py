@@ -17,7 +17,7 @@ def test_malformed_user_ids_are_not_ids(text: object) -> None:
 
 
 @given(user_ids, st.integers(1, 7))
-def test_a_participant_stays_in_one_group_whatever_the_id_looks_like(user: str, variants: int) -> None:
+def test_a_participant_of_any_id_stays_in_one_group(user: str, variants: int) -> None:
     assert ids.group("p", user, variants) == ids.group("p", user, variants) < variants
 
 
@@ -41,14 +41,14 @@ def test_a_servers_name_is_a_dns_label_that_leads_back_and_shows_no_id(user: str
     assert len(user) < 4 or user.lower() not in name
 
 
-def test_both_timers_of_a_server_lead_to_it() -> None:
+def test_both_timers_of_a_server_are_recognized_as_its() -> None:
     name = ids.server_name(ids.server_label("maze", "ann"), 2)
     timers = [name, ids.delayed_timer(name)]
     assert len(set(timers)) == 2
     assert [ids.timer_server(timer) for timer in timers] == [name, name]
 
 
-def test_names_of_others_are_not_taken_for_servers() -> None:
+def test_other_names_are_not_taken_for_names_of_servers() -> None:
     for name in ("www", "s" + "a" * 20, "s" + "a" * 20 + "-0", "S" + "A" * 20 + "-1", "mail-1", "s" + "1" * 20 + "-1"):
         assert ids.parse_server_name(name) is None
 
@@ -57,7 +57,7 @@ def test_ids_that_differ_only_in_case_have_different_servers() -> None:
     assert ids.server_label("p", "abc") != ids.server_label("p", "ABC")
 
 
-def test_a_ticket_fits_one_person_one_step_and_one_project() -> None:
+def test_a_ticket_is_valid_for_one_participant_one_step_and_one_project() -> None:
     ticket = ids.ticket("secret", "alice", "2")
     assert ids.secrets_equal(ticket, ids.ticket("secret", "alice", "2"))
     for other in (("secret", "bob", "2"), ("secret", "alice", "3"), ("other", "alice", "2")):
@@ -65,7 +65,7 @@ def test_a_ticket_fits_one_person_one_step_and_one_project() -> None:
     assert not ids.secrets_equal("ü\ud800", ticket)
 
 
-def test_the_same_names_and_proofs_come_out_of_every_version() -> None:
+def test_names_and_tickets_are_the_same_in_every_version() -> None:
     """A study that runs keeps its links, its servers and its groups when Hippodrome is updated."""
     noon = datetime(2026, 11, 21, 12, tzinfo=UTC)
     assert ids.server_label("maze", "alice") == "s5go4w6wkgepm2vg3dun5"
@@ -83,7 +83,7 @@ def test_a_servers_name_ends_in_an_attempt_from_1_to_999() -> None:
         assert ids.parse_server_name(name) is None
 
 
-def test_the_id_of_a_warm_server_is_told_from_that_of_a_participant() -> None:
+def test_the_id_of_a_warm_server_is_distinguished_from_that_of_a_participant() -> None:
     warm_server = ids.warm_id("maze", datetime(2026, 11, 21, 12, tzinfo=UTC), 1)
     assert ids.is_warm_id(warm_server)
     assert not ids.is_user_id(warm_server)
@@ -104,13 +104,13 @@ def test_ids_may_have_underscores(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["_servers", "_builds", "_a", "_"])
-def test_no_project_is_called_like_a_folder_of_ours(text: str) -> None:
+def test_no_project_has_the_name_of_a_folder_of_hippodrome(text: str) -> None:
     assert ids.is_user_id(text)
     assert not ids.is_project_id(text)
 
 
 @pytest.mark.parametrize("text", ["a", "7", "alice", "p_1", "a-b", "a" * 63, "0" * 63, "ab--c"])
-def test_what_is_fit_to_be_a_servers_name(text: str) -> None:
+def test_host_labels(text: str) -> None:
     assert ids.is_host_label(text)
 
 
@@ -128,5 +128,5 @@ def test_what_is_fit_to_be_a_servers_name(text: str) -> None:
         pytest.param("s" + "a" * 20 + "-1", id="another server's own name"),
     ],
 )
-def test_what_is_not(text: str) -> None:
+def test_texts_that_are_no_host_labels(text: str) -> None:
     assert not ids.is_host_label(text)

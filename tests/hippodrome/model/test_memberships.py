@@ -1,4 +1,4 @@
-"""A participant's membership: in a session, or unmatched, and nothing between."""
+"""A participant's membership: in a session, or unmatched; there is no third kind."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SESSION = "s." + "0" * 20
     Membership(SESSION, 1, members=2, waited=2.5),
     Membership(unmatched=True, completion_code="ABC", waited=300.0),
 ])  # fmt: skip
-def test_what_is_written_is_what_is_read(membership: Membership) -> None:
+def test_a_membership_is_read_as_it_was_written(membership: Membership) -> None:
     assert read(to_json(membership)) == membership
 
 
@@ -28,6 +28,6 @@ def test_a_document_of_an_earlier_version_has_neither_a_code_nor_a_time() -> Non
     b"{}", b'{"session": null, "unmatched": false}', b'{"session": "%b", "unmatched": true}' % SESSION.encode(),
     b"", b"[]", b'{"unmatched": 1}',
 ])  # fmt: skip
-def test_a_document_that_says_neither_or_both_is_none(body: bytes) -> None:
+def test_a_document_that_says_neither_or_both_is_refused(body: bytes) -> None:
     with pytest.raises(ValueError):
         read(body)

@@ -59,13 +59,13 @@ def test_hippos_messages_without_an_attempt_are_understood() -> None:
 
 
 @pytest.mark.parametrize("user", ["../x", "", "a\0", 7, None])
-def test_messages_with_malformed_ids_are_not_ours(user: object) -> None:
+def test_messages_with_malformed_ids_are_not_parsed(user: object) -> None:
     assert messages.parse_start_server({"projectId": "maze", "userId": user}) is None
     assert messages.parse_stop_server({"projectId": "maze", "userId": user}) is None
 
 
 @given(st.from_regex(ids.PROJECT_ID, fullmatch=True), st.from_regex(ids.USER_ID, fullmatch=True), st.integers(1, 9))
-def test_messages_survive_the_way_through_topic_and_queue(project: str, user: str, attempt: int) -> None:
+def test_messages_are_parsed_with_and_without_the_envelope_of_sns(project: str, user: str, attempt: int) -> None:
     sent = StartServer(project, user, attempt)
     raw = json.dumps(to_message(sent))
     wrapped = json.dumps({"Type": "Notification", "Message": raw})
@@ -73,7 +73,7 @@ def test_messages_survive_the_way_through_topic_and_queue(project: str, user: st
     assert messages.parse_start_server(messages.body_of({"body": wrapped})) == sent
 
 
-def test_tasks_of_others_are_not_ours() -> None:
+def test_events_of_other_tasks_are_not_parsed() -> None:
     event = {"source": "aws.ecs", "detail": {"taskArn": "t", "clusterArn": "c", "lastStatus": "RUNNING"}}
     for started_by in ("ecs-svc/1", "", None):
         event["detail"]["startedBy"] = started_by  # type: ignore[index]
@@ -103,7 +103,7 @@ def ended(stop_code: str | None = "SpotInterruption", **container: object) -> di
         ended("EssentialContainerExited", exitCode=0),
     ],
 )
-def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dict[str, Any]) -> None:
+def test_a_task_has_ended_when_its_containers_have_and_the_event_says_why(event: dict[str, Any]) -> None:
     assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
@@ -115,7 +115,7 @@ def test_a_task_has_ended_when_its_containers_have_and_it_is_told_why(event: dic
         pytest.param(ended("EssentialContainerExited"), id="ended by itself, well or not is not told yet"),
     ],
 )
-def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -> None:
+def test_a_task_whose_event_does_not_tell_its_whole_end_counts_as_stopping(event: dict[str, Any]) -> None:
     assert messages.parse_task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
 
 
@@ -150,7 +150,7 @@ def test_a_task_whose_end_is_not_all_told_is_waited_for(event: dict[str, Any]) -
         ("TaskFailedToStart", "", "TaskFailedToStart"),
     ],
 )
-def test_where_an_event_has_no_stop_code_its_words_say_it(code: str | None, words: str, read: str | None) -> None:
+def test_a_missing_stop_code_is_read_from_the_stopped_reason(code: str | None, words: str, read: str | None) -> None:
     said = task(lastStatus="STOPPED", stopCode=code, stoppedReason=words)
     assert messages.parse_task_changed(said).stop_code == read  # type: ignore[union-attr]
     if code is None:
@@ -158,13 +158,13 @@ def test_where_an_event_has_no_stop_code_its_words_say_it(code: str | None, word
         assert messages.parse_task_changed(said).stop_code == read  # type: ignore[union-attr]
 
 
-def test_the_end_of_a_spot_server_without_a_stop_code_is_told_by_its_first_event() -> None:
+def test_an_interruption_of_spot_without_a_stop_code_is_read_from_its_first_event() -> None:
     event = ended(None, exitCode=137)
     event["detail"]["stoppedReason"] = "Your Spot Task was interrupted."
     assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
-def test_a_task_that_is_seen_to_run_is_like_an_event_that_says_so() -> None:
+def test_a_task_that_is_listed_as_running_gives_the_message_of_an_event() -> None:
     sent = messages.TaskSeen("arn:task", "own", NAME, "eni-1", 2)
     assert messages.parse_task_changed(json.loads(json.dumps(to_message(sent)))) == messages.TaskChanged(
         "arn:task", "own", NAME, "RUNNING", "eni-1", None, "", None, "", 2
@@ -189,7 +189,7 @@ def task(**detail: object) -> dict[str, Any]:
     return {"source": "aws.ecs", "detail": {**usual, **detail}}
 
 
-def test_an_event_of_a_task_is_read_whole() -> None:
+def test_all_fields_of_a_tasks_event_are_read() -> None:
     details = [{"name": "subnetId", "value": "subnet-1"}, {"name": "networkInterfaceId", "value": "eni-1"}]
     event = task(
         lastStatus="STOPPED",
@@ -216,7 +216,7 @@ def test_an_event_of_a_task_is_read_whole() -> None:
     assert messages.parse_task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
 
 
-def test_an_event_that_says_little_is_an_event() -> None:
+def test_an_event_with_only_the_necessary_fields_is_read() -> None:
     assert messages.parse_task_changed(task()) == messages.TaskChanged(
         "arn:task", "own", NAME, "RUNNING", None, None, "", None
     )
@@ -225,7 +225,7 @@ def test_an_event_that_says_little_is_an_event() -> None:
 
 
 @pytest.mark.parametrize("without", ["startedBy", "taskArn", "clusterArn", "lastStatus"])
-def test_an_event_that_lacks_what_is_needed_is_not_ours(without: str) -> None:
+def test_an_event_without_a_necessary_field_is_not_parsed(without: str) -> None:
     event = task()
     del event["detail"][without]
     assert messages.parse_task_changed(event) is None

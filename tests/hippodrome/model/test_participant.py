@@ -32,7 +32,7 @@ def test_each_answer_moves_on_by_one_step_up_to_the_last() -> None:
 
 
 @given(st.sets(st.sampled_from(["1", "2", "3", "4", "finalStep", "99", "x"])))
-def test_the_position_is_the_first_step_without_an_answer_whatever_else_lies_there(keys: set[str]) -> None:
+def test_the_position_is_the_first_step_without_an_answer_whatever_other_answers_exist(keys: set[str]) -> None:
     here = progress(*[f"answers/{key}.json" for key in keys]).due_step(study()).key
     before = [step.key for step in study().steps[: study().index(here)]]
     assert set(before) <= keys
@@ -95,13 +95,13 @@ def test_the_pages_of_the_last_minute_come_latest_first_and_games_not_at_all() -
     assert Progress(True, answered).recently_answered(many, NOW) == [str(number) for number in range(10)]
 
 
-def test_where_everything_of_a_participant_lies() -> None:
+def test_the_keys_of_a_participants_documents() -> None:
     assert participant_folder("maze", "alice") == FOLDER
     assert participant.participant_key("maze", "alice") == f"{FOLDER}participant.json"
     assert answer_key("maze", "alice", "2") == f"{FOLDER}answers/2.json"
 
 
-def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -> None:
+def test_a_new_participant_gets_a_group_and_a_code_and_keeps_the_fields_of_the_link() -> None:
     project = study()
     assert participant.new_participant(project, "alice", {"SESSION_ID": "7"}, NOW) == participant.Participant(
         project_id="maze",
@@ -113,7 +113,7 @@ def test_who_arrives_gets_a_group_and_a_code_and_keeps_what_the_link_carried() -
     )
 
 
-def test_an_answer_holds_what_was_sent_and_when() -> None:
+def test_an_answer_holds_the_form_and_its_time() -> None:
     project = study()
     record = participant.new_answer(project, "alice", project.steps[1], {"age": "3"}, NOW)
     assert (record.step, record.page, record.answered, record.answers, record.schema) == (
@@ -125,7 +125,7 @@ def test_an_answer_holds_what_was_sent_and_when() -> None:
     )
 
 
-def test_two_forms_are_the_same_in_whatever_order_their_fields_come() -> None:
+def test_two_forms_are_the_same_in_any_order_of_their_fields() -> None:
     assert participant.same_answers({"a": "1", "b": ["2", "3"]}, {"b": ["2", "3"], "a": "1"})
     assert not participant.same_answers({"a": ["1", "2"]}, {"a": ["2", "1"]})
 

@@ -61,7 +61,7 @@ def test_servers_are_counted_where_one_of_their_limits_is_set(limits: dict[str, 
     assert study(**limits).limits_servers is counts
 
 
-def test_a_project_takes_its_own_place_in_the_list() -> None:
+def test_a_project_is_entered_into_the_list_by_its_id() -> None:
     listed = MasterList([study(id="b"), study(id="d")])
     for added in (study(id="a"), study(id="c"), study(id="e")):
         assert [p.id for p in listed.with_project(added).projects] == sorted(["b", "d", added.id])
@@ -70,13 +70,13 @@ def test_a_project_takes_its_own_place_in_the_list() -> None:
     assert (renamed.find("b"), renamed.find("x")) == (renamed.projects[0], None)
 
 
-def test_where_a_page_lies() -> None:
+def test_the_keys_of_step_pages() -> None:
     assert step_key("maze", "consent-0") == "maze/steps/consent-0.html"
     assert study().page_key("consent-0") == "maze/steps/consent-0.html"
     assert study(page_folder="").page_key("consent-0") == "maze/consent-0.html"
 
 
-def test_what_a_registration_leaves_out_has_its_usual_value() -> None:
+def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
     assert msgspec.structs.asdict(from_json(b'{"id": "maze", "steps": []}', Project)) == {
         "id": "maze",
         "steps": [],
@@ -150,7 +150,7 @@ def test_a_first_registration_keeps_nothing() -> None:
     assert study().following(study()).other_numbers == ()
 
 
-def test_who_plays_alone_plays_on_as_it_was_registered_for_one() -> None:
+def test_a_participant_who_plays_alone_goes_on_with_the_registration_for_one_player() -> None:
     found = study(players=2, trial={"game": "two"}).following(study(trial={"game": "one"})).for_session(1)
     assert found is not None
     assert (found.has_sessions, found.trial) == (False, {"game": "one"})

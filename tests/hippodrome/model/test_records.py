@@ -1,4 +1,4 @@
-"""Reading records: by several threads at once, and in one place."""
+"""Reading records: by several threads at once, and only in `records.py`."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def test_two_threads_read_the_first_record_of_a_kind_at_once(second: str) -> Non
 
 
 @pytest.mark.parametrize("package", ["hippodrome", "lambdas", "protocol", "trial", "bots", "local", "deploy", "export"])
-def test_only_records_reads_into_types(package: str) -> None:
-    """`msgspec.json.decode` without a type is as good as `json.loads`."""
+def test_only_the_module_records_decodes_into_types(package: str) -> None:
+    """`msgspec.json.decode` without a type is allowed: it does what `json.loads` does."""
     into_types = re.compile(r"\bmsgspec\.(convert\b|\w+\.Decoder\b|\w+\.decode\b.*\btype=)")
     reading = {
         path.relative_to(ROOT).as_posix()

@@ -23,7 +23,7 @@ LABEL = ids.server_label("maze", "alice")
 WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 
-def claimed(user: str = "alice", attempt: int = 1, **project: object) -> Server:
+def new_record(user: str = "alice", attempt: int = 1, **project: object) -> Server:
     return server.new_attempt(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
 
 
@@ -33,8 +33,8 @@ def changes(before: Server, after: Server) -> dict[str, object]:
     return {name: new[name] for name in new if new[name] != old[name]}
 
 
-def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
-    record = claimed(aws_setup=AwsSetup(cpu=4, memory=16))
+def test_a_new_record_holds_all_that_is_known_before_anything_starts() -> None:
+    record = new_record(aws_setup=AwsSetup(cpu=4, memory=16))
     assert record == Server(
         project_id="maze",
         user_id="alice",
@@ -69,14 +69,14 @@ def test_a_claim_says_all_that_is_known_before_anything_starts() -> None:
         ("S" + "A" * 20 + "-1", None),
     ],
 )
-def test_only_an_id_that_is_fit_for_it_names_a_server(user: str, first: str | None) -> None:
+def test_only_an_id_that_is_a_host_label_names_a_server(user: str, first: str | None) -> None:
     settings = replace(SETTINGS, user_id_names=True)
     record = server.new_attempt(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
     assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
     assert record.has_default_name is (first is None)
 
 
-def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
+def test_a_server_whose_name_is_refused_gets_its_default_name() -> None:
     record = server.new_attempt(
         study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
     )
@@ -86,7 +86,7 @@ def test_a_server_whose_name_is_refused_gets_its_usual_one() -> None:
 
 @pytest.mark.parametrize(("attempt", "spot"), [(1, True), (2, True), (3, False), (8, False)])
 def test_spot_is_for_the_attempts_before_the_last_automatic_one(attempt: int, spot: bool) -> None:
-    assert claimed(attempt=attempt).spot is spot
+    assert new_record(attempt=attempt).spot is spot
 
 
 @pytest.mark.parametrize(
@@ -94,11 +94,11 @@ def test_spot_is_for_the_attempts_before_the_last_automatic_one(attempt: int, sp
     [({}, False), ({"max_servers": 0}, True), ({"max_server_hours": 5}, True), ({"max_participants": 5}, False)],
 )
 def test_a_server_is_counted_where_servers_are_limited(limits: dict[str, int], counted: bool) -> None:
-    assert claimed(**limits).counted is counted
+    assert new_record(**limits).counted is counted
 
 
-def test_an_attempt_is_open_until_it_is_closed_and_owns_what_has_its_name() -> None:
-    record = claimed(attempt=2)
+def test_an_attempt_is_open_until_it_is_closed_and_owns_resources_of_its_name() -> None:
+    record = new_record(attempt=2)
     assert [record.is_open(attempt) for attempt in (1, 2, 3)] == [False, True, False]
     assert [record.owns(name) for name in (f"{LABEL}-1", f"{LABEL}-2")] == [False, True]
     closed = server.close(record, Reason.STOPPED, LATER)
@@ -106,19 +106,19 @@ def test_an_attempt_is_open_until_it_is_closed_and_owns_what_has_its_name() -> N
 
 
 def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
-    assert claimed().dns_record is None
-    named = server.naming(claimed(), "task", Address("192.0.2.1", 5000), LATER)
+    assert new_record().dns_record is None
+    named = server.naming(new_record(), "task", Address("192.0.2.1", 5000), LATER)
     assert named.dns_record == DnsRecord(f"{LABEL}-1.{SETTINGS.servers_domain}", "192.0.2.1")
 
 
-def test_a_cluster_is_its_own_if_it_has_its_name() -> None:
-    own = claimed(cluster="participant")
+def test_a_cluster_of_the_servers_name_is_the_servers_own() -> None:
+    own = new_record(cluster="participant")
     assert (own.cluster, own.has_own_cluster) == (f"{LABEL}-1", True)
-    assert not claimed().has_own_cluster
+    assert not new_record().has_own_cluster
 
 
-def test_the_way_from_the_start_to_ready_and_closed() -> None:
-    first = claimed()
+def test_the_transitions_from_starting_to_ready_and_closed() -> None:
+    first = new_record()
     assert changes(first, server.on_demand(first)) == {"spot": False}
     named = server.naming(first, "task", Address("192.0.2.1", 5001), LATER)
     assert changes(first, named) == {
@@ -138,8 +138,8 @@ def test_the_way_from_the_start_to_ready_and_closed() -> None:
     assert server.close(named, Reason.LOST, LATER).cause == ""
 
 
-def test_a_server_listens_where_its_task_does_or_else_where_it_was_told_to() -> None:
-    told = claimed(server_port=443)
+def test_a_servers_port_is_that_of_its_task_or_else_the_registered_one() -> None:
+    told = new_record(server_port=443)
     assert server.naming(told, "task", Address("192.0.2.1"), LATER).port == 443
     assert server.naming(told, "task", Address("192.0.2.1", 40000), LATER).port == 40000
     of_an_earlier_version = msgspec.structs.replace(told, port=None)
@@ -161,12 +161,15 @@ def test_a_tombstone_is_closed_from_the_beginning() -> None:
     )
 
 
-def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
+def test_the_record_keeps_the_fields_of_earlier_attempts() -> None:
     first = msgspec.structs.replace(
-        claimed(aws_setup=AwsSetup(cpu=2, memory=4)), running=LATER, spot=False, warm_server_name="s" + "a" * 20 + "-1"
+        new_record(aws_setup=AwsSetup(cpu=2, memory=4)),
+        running=LATER,
+        spot=False,
+        warm_server_name="s" + "a" * 20 + "-1",
     )
     closed = server.close(first, Reason.LOST, LATER, "spot")
-    second = server.replacing(closed, claimed(attempt=2))
+    second = server.replacing(closed, new_record(attempt=2))
     assert second.earlier == (
         server.PastAttempt(
             attempt=1,
@@ -183,29 +186,29 @@ def test_what_an_earlier_attempt_was_is_remembered_field_by_field() -> None:
             game_steps=("3",),
         ),
     )
-    third = server.replacing(server.close(second, Reason.LOST, LATER), claimed(attempt=3))
+    third = server.replacing(server.close(second, Reason.LOST, LATER), new_record(attempt=3))
     assert [run.attempt for run in third.earlier] == [1, 2]
 
 
-def test_an_attempt_that_found_no_place_is_made_once_more_and_leaves_no_trace() -> None:
-    second = server.replacing(server.close(claimed(), Reason.LOST, NOW), claimed(attempt=2))
+def test_an_attempt_that_found_no_slot_is_repeated_and_is_no_earlier_attempt() -> None:
+    second = server.replacing(server.close(new_record(), Reason.LOST, NOW), new_record(attempt=2))
     full = server.close(second, Reason.FULL, LATER)
     assert [server.found_no_slot(full, attempt) for attempt in (1, 2, 3)] == [False, True, False]
     assert not server.found_no_slot(server.close(second, Reason.LOST, LATER), 2)
     assert not server.found_no_slot(msgspec.structs.replace(full, state=ServerState.STARTING), 2)
-    assert server.repeating(full, claimed(attempt=2)).earlier == second.earlier
+    assert server.repeating(full, new_record(attempt=2)).earlier == second.earlier
 
 
 # Warm servers
 
 
 def warm_server() -> Server:
-    named = server.naming(claimed(WARM_SERVER), "arn", Address("192.0.2.9", 5001), NOW)
+    named = server.naming(new_record(WARM_SERVER), "arn", Address("192.0.2.9", 5001), NOW)
     return msgspec.structs.replace(server.ready(named, NOW), nonce="spare's", spot=False, cluster="other")
 
 
-def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> None:
-    own, waiting = claimed(), warm_server()
+def test_a_server_takes_over_a_warm_servers_resources_and_gives_them_up_again() -> None:
+    own, waiting = new_record(), warm_server()
     wanting = server.reserving(own, waiting)
     assert changes(own, wanting) == {
         "warm_server_name": waiting.name,
@@ -220,11 +223,11 @@ def test_a_server_takes_over_a_warm_servers_things_and_gives_them_up_again() -> 
     assert own.warm_server_label == ""
     given = server.assigned(wanting, waiting, LATER)
     assert changes(wanting, given) == {"state": ServerState.READY, "nonce": "spare's", "running": LATER, "ready": LATER}
-    fresh = msgspec.structs.replace(claimed(), nonce="another")
+    fresh = msgspec.structs.replace(new_record(), nonce="another")
     assert server.without_warm_server(wanting, fresh) == own, "the nonce stays: a task may have been started with it"
 
 
-def test_a_warm_server_is_taken_or_told_to_go() -> None:
+def test_a_warm_server_is_assigned_or_drained() -> None:
     waiting = warm_server()
     assert changes(waiting, server.handed_over(waiting, LABEL, LATER)) == {
         "state": ServerState.CLOSED,
@@ -250,17 +253,19 @@ def test_a_warm_server_is_taken_or_told_to_go() -> None:
         (None, 0, Reason.LOST),
     ],
 )
-def test_what_to_make_of_a_task_that_ended(code: str | None, exit_code: int | None, reason: Reason) -> None:
+def test_the_reason_of_a_closed_server_follows_from_how_its_task_ended(
+    code: str | None, exit_code: int | None, reason: Reason
+) -> None:
     assert server.reason_for(TaskStopped(code, exit_code)) is reason
 
 
-def test_the_words_of_states_and_reasons_stand_in_records_and_pages() -> None:
+def test_the_values_of_states_and_reasons_stay_as_they_are_in_stored_records() -> None:
     assert list(ServerState) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
     assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
     assert server.key(LABEL) == f"_servers/{LABEL}.json"
 
 
-def test_a_record_of_an_earlier_version_lacks_what_was_not_written_down_then() -> None:
+def test_fields_that_an_earlier_version_did_not_write_have_defaults() -> None:
     old = (
         b'{"projectId": "maze", "userId": "alice", "attempt": 1, "state": "starting", "token": "t",'
         b' "requested": "2026-11-21T12:00:00Z", "deadline": "2026-11-21T12:30:00Z", "cluster": "c"}'

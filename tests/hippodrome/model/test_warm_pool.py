@@ -29,7 +29,7 @@ def warm_server(minutes: int, *, ready: bool = False, version: str = "v1") -> Wa
     return WarmServer(version, NOW + timedelta(minutes=minutes), ready)
 
 
-def test_where_pools_and_handovers_lie() -> None:
+def test_the_keys_of_pools_and_handovers() -> None:
     assert warm_pool.pool_key("maze") == "_spares/maze.json"
     assert handovers_folder("maze") == "maze/spares/"
     assert handover_key("maze", "s1-1") == "maze/spares/s1-1.json"
@@ -45,13 +45,13 @@ def test_where_pools_and_handovers_lie() -> None:
         (20, None, timedelta(0)),
     ],
 )
-def test_a_warm_server_waits_as_long_as_it_can_still_play_max_runtime(
+def test_a_warm_server_waits_as_long_as_max_runtime_still_fits_after_the_wait(
     installation: int, hours: int | None, waits: timedelta
 ) -> None:
     assert warm_pool.longest_wait(project(max_server_hours=hours), settings(installation)) == waits
 
 
-def test_each_warm_server_goes_at_its_own_time_within_the_last_quarter_of_the_wait() -> None:
+def test_the_deadlines_of_warm_servers_are_spread_over_the_last_quarter_of_the_wait() -> None:
     place, usual = settings(30 + 100), project()
     ends = [warm_pool.deadline(usual, place, f"label {number}", NOW) for number in range(200)]
     assert min(ends) < NOW + timedelta(minutes=76)
@@ -84,7 +84,7 @@ def test_how_many_warm_servers_a_project_should_have(
     assert warm_pool.target_size(None, settings(installation), waiting, room) == 0
 
 
-def test_the_warm_server_that_has_waited_longest_of_those_that_are_ready_and_fit_is_the_first() -> None:
+def test_the_first_warm_server_is_ready_of_this_version_and_has_waited_longest() -> None:
     pool = Pool(
         {
             "a": warm_server(3, ready=True),
@@ -101,7 +101,7 @@ def test_the_warm_server_that_has_waited_longest_of_those_that_are_ready_and_fit
     assert pool.without_first("v2") is pool
 
 
-def test_a_pool_changes_in_what_it_is_told_and_remembers_how_many_there_were() -> None:
+def test_a_pool_changes_only_the_named_servers_and_keeps_its_counter() -> None:
     pool = Pool({"a": warm_server(0), "b": warm_server(1)}, 7)
     assert pool.without(["a", "x"]) == Pool({"b": warm_server(1)}, 7)
     assert pool.with_ready(["b", "x"]) == Pool({"a": warm_server(0), "b": warm_server(1, ready=True)}, 7)
@@ -110,7 +110,7 @@ def test_a_pool_changes_in_what_it_is_told_and_remembers_how_many_there_were() -
     )
 
 
-def test_new_warm_servers_get_ids_that_were_never_given() -> None:
+def test_new_warm_servers_get_ids_that_were_never_used() -> None:
     pool = Pool({"a": warm_server(0)}, 7)
     grown = pool.with_new(project(), 2, NOW)
     new = [ids.warm_id("maze", NOW, number) for number in (7, 8)]
@@ -118,7 +118,7 @@ def test_new_warm_servers_get_ids_that_were_never_given() -> None:
     assert pool.with_new(project(), 0, NOW) == pool.with_new(project(), -1, NOW) == pool
 
 
-def test_a_pool_is_settled_to_its_number() -> None:
+def test_a_pool_is_resized_to_its_number() -> None:
     old, young, unready = warm_server(0, ready=True), warm_server(1, ready=True), warm_server(5)
     pool = Pool({"old": old, "young": young, "unready": unready, "other": warm_server(0, ready=True, version="v0")}, 4)
     assert pool.resized(None, 3, NOW) == Pool({}, 4)

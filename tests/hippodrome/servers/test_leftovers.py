@@ -14,11 +14,11 @@ from hippodrome.servers import leftovers
 from hippodrome.servers.leftovers import LeftoverReason, Scope, why_left_over, why_slot_left_over
 from hippodrome.servers.overdue import LOST_AFTER
 from hippodrome.servers.resources import Resources
-from tests.hippodrome.model.test_server import LABEL, LATER, NOW, WARM_SERVER, claimed
+from tests.hippodrome.model.test_server import LABEL, LATER, NOW, WARM_SERVER, new_record
 
 FIRST, SECOND, THIRD = (ids.server_name(LABEL, attempt) for attempt in (1, 2, 3))
 WARM_NAME = ids.server_name(ids.server_label("maze", WARM_SERVER), 1)
-OPEN = claimed(attempt=2)
+OPEN = new_record(attempt=2)
 CLOSED = server.close(OPEN, Reason.STOPPED, LATER)
 ON_WARM = msgspec.structs.replace(OPEN, warm_server_name=WARM_NAME)
 OFF_WARM = server.close(ON_WARM, Reason.STOPPED, LATER)

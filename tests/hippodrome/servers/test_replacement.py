@@ -13,13 +13,13 @@ from hippodrome.servers.replacement import Replacement
 from hippodrome.servers.services import ServerServices
 from protocol.keys import answer_key
 from testing.studies import installed, study
-from tests.hippodrome.model.test_server import LATER, WARM_SERVER, claimed
+from tests.hippodrome.model.test_server import LATER, WARM_SERVER, new_record
 
 
 @pytest.mark.parametrize("reason", list(Reason))
 def test_which_attempt_follows_automatically_and_which_may_be_requested(reason: Reason) -> None:
     def following(attempt: int) -> tuple[int | None, int | None]:
-        closed = server.close(claimed(attempt=attempt), reason, LATER)
+        closed = server.close(new_record(attempt=attempt), reason, LATER)
         return next_attempt(closed), requestable_attempt(closed)
 
     replaced, full = reason in (Reason.LOST, Reason.NO_CAPACITY), reason is Reason.FULL
@@ -31,9 +31,9 @@ def test_which_attempt_follows_automatically_and_which_may_be_requested(reason: 
 
 
 def test_nothing_follows_an_open_server_nor_a_warm_server() -> None:
-    assert (next_attempt(claimed()), requestable_attempt(claimed())) == (None, None)
-    assert next_attempt(server.close(claimed(WARM_SERVER), Reason.LOST, LATER)) is None
-    closed = msgspec.structs.replace(server.close(claimed(), Reason.LOST, LATER), reason=None)
+    assert (next_attempt(new_record()), requestable_attempt(new_record())) == (None, None)
+    assert next_attempt(server.close(new_record(WARM_SERVER), Reason.LOST, LATER)) is None
+    closed = msgspec.structs.replace(server.close(new_record(), Reason.LOST, LATER), reason=None)
     assert next_attempt(closed) is None
 
 
@@ -41,7 +41,7 @@ TWO_GAMES = study(
     steps=[Step("1", "game"), Step("2", "game"), Step("finalStep", "debrief")], events=Events("1", "finalStep")
 )
 NO_GAME = study(steps=[Step("1", "questionnaire"), Step("finalStep", "debrief")], events=Events("1", "finalStep"))
-LOST = server.close(claimed(), Reason.LOST, LATER)
+LOST = server.close(new_record(), Reason.LOST, LATER)
 
 
 @pytest.mark.parametrize(
@@ -69,19 +69,19 @@ def test_a_lost_server_is_replaced_unless_all_its_games_are_answered(
 def test_the_next_attempts_record_keeps_the_closed_one() -> None:
     services = ServerServices(installed())
     services.repository.create(LOST)
-    written = Replacement(services).write_record(claimed(attempt=2)).server
+    written = Replacement(services).write_record(new_record(attempt=2)).server
     assert (written.attempt, [one.reason for one in written.earlier]) == (2, [Reason.LOST])
     assert services.repository.server_of("maze", "alice") == written
 
 
 @pytest.mark.parametrize(
     ("before", "attempt"),
-    [(None, 2), (claimed(), 2), (LOST, 3), (server.close(claimed(attempt=2), Reason.LOST, LATER), 2)],
+    [(None, 2), (new_record(), 2), (LOST, 3), (server.close(new_record(attempt=2), Reason.LOST, LATER), 2)],
 )
 def test_only_the_closed_record_of_the_attempt_before_is_replaced(before: Server | None, attempt: int) -> None:
     services = ServerServices(installed())
     if before:
         services.repository.create(before)
     with pytest.raises(Conflict):
-        Replacement(services).write_record(claimed(attempt=attempt))
+        Replacement(services).write_record(new_record(attempt=attempt))
     assert services.repository.server_of("maze", "alice") == before
