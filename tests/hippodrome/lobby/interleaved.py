@@ -1,7 +1,7 @@
 """Functions of the lobby that run at the same time, one port call after the other, in an order that a test chooses.
 
-The documents are S3's where it matters here: an ETag is a hash of the content (S3 API Reference, "Object"), LastModified
-has whole seconds, and a listing shows every write before it.
+The documents behave as S3's do where it matters here: an ETag is a hash of the content (S3 API Reference, "Object"),
+LastModified has whole seconds, and a listing shows every write before it.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from testing.port_faults import Crash, PortFault, call_with_fault
 from tests.hippodrome.lobby.waiting_room import pairs, serve
 
 ENDS = (Crash, ConnectionError)
-"""With which a function may end, if the test injected it."""
+"""The exceptions with which a function may end because the test has injected a fault."""
 
 
 class S3Documents(FakeDocuments):
-    """Documents that let the others run before each call."""
+    """Documents that let other functions run before each call."""
 
     world: InterleavedPlatform
 
@@ -82,8 +82,12 @@ class InterleavedPlatform(FakePlatform):
         self.bus = S3Bus(self)
         self.hub = greenlet.getcurrent()
         self.made: list[str] = []  # the calls, in order
-        self.askers: dict[greenlet.greenlet, str] = {}  # whose page asks, by the function that runs for it
-        self.read: defaultdict[str, list[decisions.Proposal]] = defaultdict(list)  # by the requests of each participant
+        self.askers: dict[
+            greenlet.greenlet, str
+        ] = {}  # for each function that runs: the participant whose page sent the request
+        self.read: defaultdict[str, list[decisions.Proposal]] = defaultdict(
+            list
+        )  # the proposals that each participant's requests have read
 
     def call(self, name: str, effect: Callable[[], Any]) -> Any:
         fault = self.hub.switch() if greenlet.getcurrent() is not self.hub else None
@@ -91,15 +95,15 @@ class InterleavedPlatform(FakePlatform):
         return call_with_fault(name, effect, fault)
 
     def note(self, decisions: bytes) -> None:
-        """The function that runs has read the lobby's document."""
+        """Note the proposals that the running function has read in the lobby's document."""
         if user := self.askers.get(greenlet.getcurrent()):
-            with contextlib.suppress(ValueError):  # a test has damaged it
+            with contextlib.suppress(ValueError):  # a test may have damaged the document
                 self.read[user] += from_json(decisions, Decisions).proposed
 
 
 @dataclass(eq=False)
 class Running:
-    """A function that runs, up to its next call."""
+    """A function that runs and waits before its next call."""
 
     name: str
     thread: greenlet.greenlet
@@ -120,7 +124,7 @@ class Crossing:
     running: list[Running] = field(default_factory=list)
 
     def begin(self, name: str, act: Callable[[Lobby], Any]) -> Running:
-        """Start a function of its own, up to its first call."""
+        """Start another function and let it run up to its first call."""
         lobby = Lobby(self.platform, Repository(self.platform.documents))
         made = Running(name, greenlet.getcurrent())
 
@@ -144,13 +148,13 @@ class Crossing:
             self.running.remove(one)
 
     def finish(self, one: Running, fault: PortFault | None = None, at: int = 0) -> Running:
-        """Let a function make all its calls; the one with this number, from 1, has the fault."""
+        """Let a function make all its calls; the fault occurs at the call of this number, counted from 1."""
         while not one.is_over:
             self.advance(one, fault if one.calls + 1 == at else None)
         return one
 
     def visit(self, user: str) -> Running:
-        """The participant's page asks."""
+        """Begin a request of the participant's page."""
         one = self.begin(f"visit {user}", lambda lobby: lobby.visit(self.project, user, None, dict))
         self.platform.askers[one.thread] = user
         return one
@@ -168,13 +172,13 @@ class Crossing:
         return self.begin("repair", lambda lobby: lobby.repair(self.project))
 
     def serve(self, number: int | None = None) -> Running:
-        """The server of this session becomes ready; of all whose start message was sent, without a number."""
-        begun = sorted(self.begun())
+        """Make the server of this session ready; without a number, the servers of all sessions whose start message was sent."""
+        begun = sorted(self.ids_in_start_messages())
         for session_id in begun if number is None else begun[number % len(begun) :][:1] if begun else []:
             serve(self.platform, self.project, session_id)
         return self.begin("serve", lambda lobby: None)
 
-    # What is there
+    # Documents and messages
 
     def sessions(self) -> dict[str, Any]:
         """The sessions' documents, by id."""
@@ -192,7 +196,7 @@ class Crossing:
         found = self.platform.documents.kept.get(f"_lobbies/{self.project.id}.json")
         return json.loads(found[0]) if found else {}
 
-    def begun(self) -> set[str]:
+    def ids_in_start_messages(self) -> set[str]:
         """The ids of all sessions whose start message was sent."""
         return {m["userId"] for topic, m in self.platform.bus.sent if topic is Topic.START}
 
@@ -200,7 +204,7 @@ class Crossing:
         return ids.server_label(self.project.id, user)
 
     def wrong(self, users: list[str], *, at_rest: bool = False) -> list[str]:
-        """What must never be. `at_rest`: every run is over, so that what is decided must also be written."""
+        """Descriptions of all that must never be. `at_rest`: all runs are over, so that all decisions must also be written."""
         said, sessions = [], self.sessions()
         places: dict[str, list[str]] = {}
         for sid, found in sessions.items():
@@ -213,7 +217,7 @@ class Crossing:
             for name in names:
                 places.setdefault(name, []).append(sid)
                 read = self.platform.read[name]
-                if not any(set(each.labels) == labels for each in read):  # its server may be another by now
+                if not any(set(each.labels) == labels for each in read):  # the session may have another server by now
                     said.append("a participant is matched whose page has not asked since the proposal")
         for user in users:
             membership, mine = self.membership(user), places.get(user, [])
@@ -223,6 +227,11 @@ class Crossing:
                 said.append("a membership is of a session that does not know it")
             if at_rest and mine and (membership is None or membership["session"] != mine[0]):
                 said.append("a session has a member who has no membership of it")
-            if at_rest and membership and membership["session"] and membership["session"] not in self.begun():
+            if (
+                at_rest
+                and membership
+                and membership["session"]
+                and membership["session"] not in self.ids_in_start_messages()
+            ):
                 said.append("a session has no server")
         return said

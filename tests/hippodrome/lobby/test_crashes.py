@@ -1,4 +1,4 @@
-"""Every call of every function of the lobby fails once, in every way; then others go on: nothing is split or lost."""
+"""Each call of each function of the lobby fails once with each fault; then other functions go on. No group is split or lost."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def visit(user: str) -> Act:
 
 
 def pair(crossing: Crossing) -> list[Act]:
-    """Two come, are proposed, confirm, and get their memberships."""
+    """Two participants come, are proposed, confirm, and get their memberships."""
     return [visit(user) for user in ("ann", "bob", "ann", "bob", "ann", "bob")]
 
 
@@ -36,7 +36,7 @@ def pair_whose_server_is_ready_later(crossing: Crossing) -> list[Act]:
     return [*pair_with_a_server_ahead(crossing), lambda c: c.serve(), *pair(crossing)[:3]]
 
 
-def two_pairs_of_which_the_first_gets_the_server_of_the_second(crossing: Crossing) -> list[Act]:
+def two_pairs_whose_first_gets_the_server_of_the_second(crossing: Crossing) -> list[Act]:
     def serve_the_second(c: Crossing) -> Running:
         ids = [each["waits_for"]["id"] for each in c.decisions().get("formed", ()) if "waits_for" in each]
         for session_id in ids[1:]:
@@ -60,7 +60,7 @@ def one_is_unmatched(crossing: Crossing) -> list[Act]:
     return [visit("ann"), late, late, visit("ann")]
 
 
-def swept(crossing: Crossing) -> list[Act]:
+def pair_with_a_sweep(crossing: Crossing) -> list[Act]:
     return [*pair_with_a_server_ahead(crossing)[:6], lambda c: c.repair(), lambda c: c.forget("ann"), visit("bob")]
 
 
@@ -68,15 +68,15 @@ JOURNEYS = [
     pair,
     pair_with_a_server_ahead,
     pair_whose_server_is_ready_later,
-    two_pairs_of_which_the_first_gets_the_server_of_the_second,
+    two_pairs_whose_first_gets_the_server_of_the_second,
     one_leaves,
     one_is_unmatched,
-    swept,
+    pair_with_a_sweep,
 ]
 
 
 def play(crossing: Crossing, acts: list[Act], fault: PortFault | None, at: int) -> int:
-    """Play these functions one after the other; the call with this number fails. How many calls there were."""
+    """Run these functions one after the other; the fault occurs at the call of this number. Returns the number of calls."""
     calls = 0
     for act in acts:
         crossing.platform.wait(seconds=1)
@@ -87,7 +87,9 @@ def play(crossing: Crossing, acts: list[Act], fault: PortFault | None, at: int) 
 
 
 @pytest.mark.parametrize("journey", JOURNEYS)
-def test_whatever_fails_the_others_finish_it(journey: Callable[[Crossing], list[Act]]) -> None:
+def test_after_a_fault_at_any_call_later_requests_match_all_participants(
+    journey: Callable[[Crossing], list[Act]],
+) -> None:
     count = play(crossing := Crossing(pairs(patience=50)), journey(crossing), None, 0)
     assert count > 10
     for at in range(1, count + 1):
@@ -100,7 +102,7 @@ def test_whatever_fails_the_others_finish_it(journey: Callable[[Crossing], list[
                 for user in USERS[: 4 if len(journey(crossing)) > 12 else 2]:
                     told[user] = crossing.finish(crossing.visit(user)).result
                 crossing.platform.wait(seconds=2)
-            crossing.platform.wait(seconds=180)  # if a start message was lost
+            crossing.platform.wait(seconds=180)  # so that the sweep sends a lost start message again
             for _ in range(2):
                 crossing.finish(crossing.repair())
                 crossing.serve()
@@ -110,8 +112,8 @@ def test_whatever_fails_the_others_finish_it(journey: Callable[[Crossing], list[
             assert crossing.decisions().keys() <= {"version", "open"}, where
 
 
-def test_what_was_interrupted_is_finished_by_the_sweep_if_no_member_asks() -> None:
-    """The run that formed the session ends at each of its calls; its members have closed their pages."""
+def test_the_sweep_finishes_an_interrupted_session_if_no_member_asks() -> None:
+    """The function that forms the session crashes after each of its calls in turn; the members have closed their pages."""
     count = play(crossing := Crossing(), pair(crossing)[:4], None, 0)
     for at in range(1, count + 1):
         crossing = Crossing()
@@ -123,7 +125,7 @@ def test_what_was_interrupted_is_finished_by_the_sweep_if_no_member_asks() -> No
 
 
 def damage(crossing: Crossing) -> None:
-    """The document of decisions is no document any more."""
+    """Make the document of decisions unreadable."""
     crossing.platform.documents.kept[decisions.key(crossing.project.id)] = (b"{", '"damaged"', crossing.platform.now())
 
 
@@ -135,8 +137,8 @@ def ask_for(crossing: Crossing, users: list[str], seconds: int) -> None:
 
 
 @pytest.mark.parametrize("goes_on", [False, True], ids=["crashed", "slow"])
-def test_a_document_that_is_damaged_while_a_session_is_written_splits_none(goes_on: bool) -> None:
-    """The run that writes it has made so many calls when it ends, or when it goes on half a minute later."""
+def test_a_document_that_is_damaged_while_a_session_is_written_splits_no_group(goes_on: bool) -> None:
+    """The function that writes the session has made each possible number of calls, and then ends or goes on half a minute later."""
     calls = play(crossing := Crossing(), pair(crossing)[:4], None, 0)
     before = play(crossing := Crossing(), pair(crossing)[:3], None, 0)
     for done in range(calls - before):
@@ -163,8 +165,8 @@ def test_a_document_that_is_damaged_while_a_session_is_written_splits_none(goes_
 
 
 @pytest.mark.explores
-def test_of_two_requests_in_any_order_each_pair_is_formed_once() -> None:
-    """Both members confirm, and form, at the same time: every alternation of their calls, up to a length."""
+def test_two_requests_in_any_order_form_each_pair_once() -> None:
+    """Both members confirm and form the session at the same time: a sample of the orders of their first 12 calls."""
     for order in sample(range(2**12), 8):
         crossing = Crossing()
         play(crossing, pair(crossing)[:2], None, 0)

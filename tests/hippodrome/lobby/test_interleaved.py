@@ -1,9 +1,8 @@
-"""Functions of the lobby that overlap in every order, crash at any call, and lose replies: a stateful machine.
+"""A stateful machine: functions of the lobby overlap in any order, crash at any call, and lose replies.
 
-Participants poll, in one tab or several, close their pages, come back, are under way; the sweep runs; time passes. At
-every moment: no participant in two sessions, no session with more than its players, no session that changes, none who is
-matched without having asked since the proposal. At the end those who still ask all have a membership or are told that they are
-unmatched.
+Participants poll, in one tab or several, close their pages, come back, are under way; the sweep runs; time passes.
+After every step: no participant is in two sessions; no session has too many members or changes; no participant is matched
+who has not asked since the proposal. At the end, every participant who still asks is a member of a session or unmatched.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ numbers = st.integers(0, 7)
 class Machine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
-        self.formed: dict[str, Any] = {}  # session documents as they were first seen
+        self.formed: dict[str, Any] = {}  # each session's document as it was first read
         self.memberships: dict[str, Any] = {}
 
     @initialize(players=st.sampled_from([2, 3]), then=st.sampled_from(["unmatched", "policies"]))
     def install(self, players: int, then: str) -> None:
         self.crossing = Crossing(pairs(players=players, after_patience=then, patience=40))
 
-    # What happens
+    # Events
 
     @rule(user=users)
     def ask(self, user: str) -> None:
-        """A page asks, while other functions are in the middle of something."""
+        """A page sends a request while other functions are still running."""
         self.crossing.visit(user)
 
     @rule(user=users)
@@ -68,7 +67,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(which=numbers)
     def serve(self, which: int) -> None:
-        """A server that was started is ready."""
+        """A server that was started becomes ready."""
         self.crossing.serve(which)
 
     @precondition(lambda self: self.crossing.running)
@@ -90,7 +89,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(chance=st.integers(0, 10**6))
     def bustle(self, chance: int) -> None:
-        """Two or three who ask again and again, each request a call or a few at a time, some in a second tab."""
+        """Two or three participants ask again and again, some in a second tab; each request makes a few calls at a time."""
         dice = random.Random(chance)
         crossing, people = self.crossing, dice.sample(USERS, dice.choice([2, 3]))
         for _ in range(120):
@@ -109,7 +108,7 @@ class Machine(RuleBasedStateMachine):
                 crossing.platform.wait(seconds=dice.choice([0, 0.2, 0.7, 1.5]))
             self.nothing_is_wrong()
 
-    # What must be
+    # Invariants
 
     @invariant()
     def nothing_is_wrong(self) -> None:
@@ -136,7 +135,7 @@ class Machine(RuleBasedStateMachine):
                 told[user] = crossing.finish(crossing.visit(user)).result
             crossing.platform.wait(seconds=2)
         assert not [user for user in USERS if isinstance(told[user], LobbyState)], "a participant waits for ever"
-        crossing.platform.wait(seconds=180)  # if a start message was lost
+        crossing.platform.wait(seconds=180)  # so that the sweep sends a lost start message again
         for _ in range(2):
             crossing.finish(crossing.repair())
             crossing.serve()

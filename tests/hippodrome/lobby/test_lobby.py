@@ -24,7 +24,7 @@ from tests.hippodrome.lobby.waiting_room import WaitingRoom, pairs, waits
 # Matched
 
 
-def test_two_who_are_there_play_together(room: WaitingRoom) -> None:
+def test_two_participants_in_the_lobby_play_together(room: WaitingRoom) -> None:
     assert room.visit("ann") == LobbyState(1, 0.0, proposed=False)
     room.wait(1)
     assert room.visit("bob") == LobbyState(2, 0.0, proposed=True)
@@ -34,7 +34,7 @@ def test_two_who_are_there_play_together(room: WaitingRoom) -> None:
     assert room.started() == [room.session("ann").id]
 
 
-def test_what_is_done_leaves_the_document_with_the_next_write_and_then_its_mark_goes(room: WaitingRoom) -> None:
+def test_a_finished_session_leaves_the_document_with_the_next_write_and_its_mark_is_deleted(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     assert room.document().labels() == {room.label("ann"), room.label("bob")}
     room.poll("cem", "dan")
@@ -42,7 +42,7 @@ def test_what_is_done_leaves_the_document_with_the_next_write_and_then_its_mark_
     assert not [name for name in room.entries() if name.endswith(".done")]
 
 
-def test_the_sweep_drops_what_is_done(room: WaitingRoom) -> None:
+def test_the_sweep_removes_finished_sessions_from_the_document(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     room.poll("cem", seconds=60)
     room.lobby.repair(room.project)
@@ -50,17 +50,17 @@ def test_the_sweep_drops_what_is_done(room: WaitingRoom) -> None:
     assert room.entries() == []
 
 
-def test_seats_are_drawn_by_lot_so_that_who_came_first_is_not_always_the_same_player() -> None:
+def test_seats_are_drawn_by_lot_and_do_not_follow_from_who_came_first() -> None:
     room = WaitingRoom()
     for number in range(60):
         room.visit(f"early{number}")
         room.wait(1)
         room.poll(f"late{number}", f"early{number}", seconds=4)
     memberships = [room.membership(f"early{number}") for number in range(60)]
-    assert 12 < sum(one.seat for one in memberships if one) < 48  # one of some 10 million such rooms is beyond
+    assert 12 < sum(one.seat for one in memberships if one) < 48  # chance exceeds this in about one of 10 million runs
 
 
-def test_with_seats_by_group_each_is_the_player_of_their_group() -> None:
+def test_with_seats_by_group_each_member_has_the_seat_of_their_group() -> None:
     users = [f"u{n}" for n in range(20)]
     groups = {user: n % 3 % 2 for n, user in enumerate(users)}
     room = WaitingRoom(pairs(matching="mixed", seats="group"), groups=groups)
@@ -70,7 +70,7 @@ def test_with_seats_by_group_each_is_the_player_of_their_group() -> None:
     assert seats == {user: groups[user] for user in seats}
 
 
-def test_a_membership_says_how_long_the_participant_had_waited(room: WaitingRoom) -> None:
+def test_a_membership_holds_the_time_for_which_the_participant_waited(room: WaitingRoom) -> None:
     room.visit("zoe")
     room.wait(1)
     room.poll("ann", "zoe", seconds=4)
@@ -80,7 +80,7 @@ def test_a_membership_says_how_long_the_participant_had_waited(room: WaitingRoom
     assert zoe.waited == pytest.approx((ann.waited or 0.0) + 1)
 
 
-def test_who_is_unmatched_has_waited_for_their_patience(room: WaitingRoom) -> None:
+def test_an_unmatched_participants_membership_holds_their_patience_as_the_time_waited(room: WaitingRoom) -> None:
     room.poll("ann", seconds=room.project.patience + 4)
     membership = room.membership("ann")
     assert membership is not None
@@ -100,8 +100,8 @@ def test_a_session_never_has_more_members_than_players(players: int) -> None:
 
 
 @pytest.mark.parametrize("count", [200, pytest.param(1000, marks=pytest.mark.hunt)])
-def test_hundreds_who_join_at_once_are_all_in_pairs(count: int) -> None:
-    """Each of them lists all others, so the time grows with the square."""
+def test_hundreds_of_participants_who_come_at_once_are_all_matched(count: int) -> None:
+    """Each participant's request lists all others, so the time grows with the square of their number."""
     room = WaitingRoom()
     users = [f"u{n}" for n in range(count)]
     told = room.poll(*users, seconds=6)
@@ -132,7 +132,7 @@ def test_hundreds_who_join_at_once_are_all_in_pairs(count: int) -> None:
         ),
     ],
 )  # fmt: skip
-def test_matching_says_who_plays_with_whom(
+def test_matching_decides_who_plays_with_whom(
     matching: Any, groups: dict[str, int], answers: dict[str, Mapping[str, Any]], together: list[set[str]]
 ) -> None:
     room = WaitingRoom(pairs(matching=matching), groups=groups, answers=answers)
@@ -143,21 +143,21 @@ def test_matching_says_who_plays_with_whom(
     assert [{m.user_id for m in room.session(user).members} for user in ("a", "b")] == together
 
 
-def test_those_who_do_not_fit_are_not_counted_as_there() -> None:
+def test_participants_of_another_group_are_not_counted_as_there() -> None:
     room = WaitingRoom(pairs(matching="group"), groups={"ann": 0, "bob": 1})
     told = room.poll("ann", "bob", seconds=10)
     assert [waits(state).here for state in told.values()] == [1, 1]
 
 
-def test_all_members_of_a_session_that_is_formed_are_counted_as_there(room: WaitingRoom) -> None:
+def test_the_number_of_participants_who_are_there_includes_all_members_of_a_formed_session(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     document, entries = room.document(), room.lobby._store.entries(room.project)
     assert [each.id for each in document.formed] == [room.session("ann").id]
     assert rules.number_here(document, entries, room.project, room.label("ann"), room.platform.now()) == 2
 
 
-def test_a_function_of_the_researchers_may_choose_the_groups() -> None:
-    """The rules take what it wishes, and choose none of their own."""
+def test_the_researchers_function_may_choose_the_groups() -> None:
+    """The rules propose the groups that the function has chosen, and no others."""
     project = pairs(matching="match")
     room = WaitingRoom(project)
     room.poll("ann", "bob", "cem", seconds=4)
@@ -170,13 +170,13 @@ def test_a_function_of_the_researchers_may_choose_the_groups() -> None:
     assert [set(each.labels) for each in decided.proposed] == [{labels["ann"], labels["cem"]}]
 
 
-# Ghosts
+# Participants who do not ask any more
 
 
-def test_nobody_is_matched_who_has_not_asked_since_the_proposal(room: WaitingRoom) -> None:
+def test_a_participant_who_has_not_asked_since_the_proposal_is_not_matched(room: WaitingRoom) -> None:
     room.visit("ann")
     room.wait(2)
-    room.visit("bob")  # and closes the browser, which tells nobody
+    room.visit("bob")  # and closes the browser, which sends no message
     told = room.poll("ann", seconds=8)
     assert waits(told["ann"]).proposed
     assert room.membership("ann") is None
@@ -191,7 +191,7 @@ def test_the_request_that_proposes_confirms_nothing(room: WaitingRoom) -> None:
     assert [name for name in room.entries() if ".yes." in name] == []
 
 
-def test_a_confirmation_is_of_one_proposal_though_the_server_ahead_goes_to_the_next(room: WaitingRoom) -> None:
+def test_a_confirmation_counts_for_one_proposal_even_if_the_next_has_the_same_server(room: WaitingRoom) -> None:
     """Ann confirms to be with Bob, who leaves; she is proposed again, with Cem and the same server, and asks no more."""
     room.arrive_at_start("ann", "bob")
     room.poll("ann", "bob")
@@ -211,7 +211,7 @@ def test_a_confirmation_is_of_one_proposal_though_the_server_ahead_goes_to_the_n
     assert room.session("ann").id == room.started()[0]
 
 
-def test_who_asked_last_before_ten_seconds_is_not_there(room: WaitingRoom) -> None:
+def test_a_participant_who_asked_last_ten_seconds_ago_is_not_there(room: WaitingRoom) -> None:
     room.visit("ann")
     room.wait(10)
     assert waits(room.visit("bob")).here == 1
@@ -219,7 +219,7 @@ def test_who_asked_last_before_ten_seconds_is_not_there(room: WaitingRoom) -> No
 
 
 @pytest.mark.parametrize("ahead", [-6, -2, 2, 6, 60])
-def test_people_meet_though_the_storages_clock_is_off(
+def test_participants_are_matched_even_if_the_clock_of_s3_is_wrong(
     room: WaitingRoom, ahead: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """LastModified is of S3's clock, and is compared with the function's (docs/unproven.md)."""
@@ -239,7 +239,7 @@ def test_a_member_is_not_matched_again_when_a_request_of_a_second_tab_is_late() 
     crossing = Crossing()
     late = crossing.visit("ann")
     while not crossing.platform.made or not crossing.platform.made[-1].startswith("list"):
-        crossing.advance(late)  # it has read that nobody is there, and will write that ann is
+        crossing.advance(late)  # it has read that nobody is there, and will write ann's entry
     for user in ("ann", "bob", "ann", "bob", "ann"):
         crossing.platform.wait(seconds=1)
         crossing.finish(crossing.visit(user))
@@ -256,10 +256,10 @@ def test_a_member_is_not_matched_again_when_a_request_of_a_second_tab_is_late() 
     }
 
 
-def test_a_member_who_is_back_by_a_late_request_is_not_formed_even_if_they_seem_to_confirm(room: WaitingRoom) -> None:
+def test_a_member_whose_late_request_wrote_an_entry_is_in_no_second_session(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     first = room.session("ann")
-    room.lobby.repair(room.project)  # the document has forgotten her
+    room.lobby.repair(room.project)  # the document does not hold her any more
     one = folder.Waiting(room.label("ann"), folder.milliseconds(room.platform.now()), "-", room.platform.now())
     room.platform.documents.put(folder.waiting_key("maze", one), folder.body(folder.WaitingDocument("ann")))
     room.visit("cem")
@@ -274,14 +274,14 @@ def test_a_member_who_is_back_by_a_late_request_is_not_formed_even_if_they_seem_
 # Leaving, coming back
 
 
-def test_who_closes_the_page_is_gone_at_once(room: WaitingRoom) -> None:
+def test_a_participant_who_closes_the_page_has_left_at_once(room: WaitingRoom) -> None:
     room.visit("ann")
     room.lobby.leave(room.project, "ann")
     assert waits(room.visit("bob")).here == 1
     assert not waits(room.visit("bob")).proposed
 
 
-def test_a_proposal_falls_apart_at_once_when_one_leaves(room: WaitingRoom) -> None:
+def test_a_proposal_falls_apart_at_once_when_a_member_leaves(room: WaitingRoom) -> None:
     room.poll("ann", "bob", "cem")
     assert set(room.document().proposed[0].labels) == {room.label("ann"), room.label("bob")}
     room.lobby.leave(room.project, "bob")
@@ -290,14 +290,14 @@ def test_a_proposal_falls_apart_at_once_when_one_leaves(room: WaitingRoom) -> No
     assert room.together("ann", "cem")
 
 
-def test_a_reload_keeps_the_time_at_which_they_came(room: WaitingRoom) -> None:
+def test_a_reload_keeps_the_time_at_which_the_participant_came(room: WaitingRoom) -> None:
     room.poll("ann", seconds=20)
     room.lobby.leave(room.project, "ann")
     room.wait(1)
     assert waits(room.visit("ann")).seconds == 21
 
 
-def test_the_message_of_a_reload_may_come_after_the_new_page(room: WaitingRoom) -> None:
+def test_the_leave_message_of_a_reload_may_come_after_the_new_page(room: WaitingRoom) -> None:
     room.poll("ann", seconds=20)
     room.visit("ann")
     room.lobby.leave(room.project, "ann")
@@ -306,21 +306,21 @@ def test_the_message_of_a_reload_may_come_after_the_new_page(room: WaitingRoom) 
     assert waits(room.visit("bob")).here == 2
 
 
-def test_of_two_tabs_one_may_be_closed(room: WaitingRoom) -> None:
+def test_a_participant_with_two_tabs_may_close_one(room: WaitingRoom) -> None:
     room.poll("ann", "ann", seconds=10)
     room.lobby.leave(room.project, "ann")
     told = room.poll("ann", "bob", seconds=6)
     assert room.together("ann", "bob"), told
 
 
-def test_who_comes_back_later_begins_anew(room: WaitingRoom) -> None:
+def test_a_participant_who_comes_back_after_more_than_ten_seconds_begins_to_wait_anew(room: WaitingRoom) -> None:
     room.poll("ann", seconds=20)
     room.lobby.leave(room.project, "ann")
     room.wait(11)
     assert waits(room.visit("ann")).seconds == 0
 
 
-def test_who_was_away_without_a_word_begins_anew_after_half_a_minute(room: WaitingRoom) -> None:
+def test_a_participant_who_did_not_ask_for_half_a_minute_begins_to_wait_anew(room: WaitingRoom) -> None:
     room.poll("ann", seconds=10)
     room.wait(29)
     assert waits(room.visit("ann")).seconds == 39
@@ -328,7 +328,7 @@ def test_who_was_away_without_a_word_begins_anew_after_half_a_minute(room: Waiti
     assert waits(room.visit("ann")).seconds == 0
 
 
-def test_all_leave_at_once(room: WaitingRoom) -> None:
+def test_a_lobby_that_all_have_left_is_empty_after_two_sweeps(room: WaitingRoom) -> None:
     users = [f"u{n}" for n in range(7)]
     room.poll(*users)
     for user in users:
@@ -343,7 +343,7 @@ def test_all_leave_at_once(room: WaitingRoom) -> None:
     assert [room.membership(user) for user in users] == [None] * 7
 
 
-def test_leaving_means_nothing_to_one_who_is_not_there(room: WaitingRoom) -> None:
+def test_a_leave_message_changes_nothing_for_a_participant_outside_the_lobby(room: WaitingRoom) -> None:
     room.arrive_at_start("ann")
     before = dict(room.platform.documents.kept)
     for user in ("ann", "nobody"):
@@ -360,7 +360,7 @@ def test_two_tabs_are_one_participant(room: WaitingRoom) -> None:
     assert len(room.entries()) == 1
 
 
-def test_two_tabs_that_open_at_once_are_one_participant_too() -> None:
+def test_two_tabs_that_open_at_once_are_one_participant() -> None:
     crossing = Crossing()
     tabs = [crossing.visit("ann"), crossing.visit("ann")]
     while tabs[0].calls < 3 or tabs[1].calls < 3:
@@ -376,13 +376,13 @@ def test_two_tabs_that_open_at_once_are_one_participant_too() -> None:
 
 
 def test_two_game_steps_have_one_lobby_and_one_session(room: WaitingRoom) -> None:
-    """The lobby is the project's: who polls at two steps is there once, and plays both in one session."""
+    """A project has one lobby: a participant who polls at two steps is in it once, and plays both games in one session."""
     room.poll("ann", "ann", "bob", seconds=6)
     assert room.together("ann", "bob")
     assert room.visit("ann") == room.membership("ann")
 
 
-def test_whoever_asks_again_gets_the_same_membership_for_ever(room: WaitingRoom) -> None:
+def test_a_member_who_asks_again_gets_the_same_membership(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     before = dict(room.platform.documents.kept)
     for _ in range(3):
@@ -394,7 +394,7 @@ def test_whoever_asks_again_gets_the_same_membership_for_ever(room: WaitingRoom)
 # Patience
 
 
-def test_patience_ends_to_the_second(room: WaitingRoom) -> None:
+def test_patience_ends_at_the_exact_second(room: WaitingRoom) -> None:
     told = room.poll("ann", seconds=58)
     assert waits(told["ann"]).seconds == 58
     room.wait(2)
@@ -405,7 +405,7 @@ def test_patience_ends_to_the_second(room: WaitingRoom) -> None:
     assert room.entries() == [f"{room.label('ann')}.done"]
 
 
-def test_nobody_is_matched_after_the_end_of_patience_however_late_the_page_asks(room: WaitingRoom) -> None:
+def test_a_participant_is_not_matched_after_the_end_of_patience_however_late_the_page_asks(room: WaitingRoom) -> None:
     room.poll("ann", seconds=58)
     room.wait(3)  # the patience of ann is over; her page has not asked since
     told = room.poll("bob", seconds=4)
@@ -424,7 +424,7 @@ def test_a_proposal_made_in_time_holds_beyond_the_end_of_patience(room: WaitingR
     assert room.together("ann", "bob")
 
 
-def test_all_game_steps_of_the_unmatched_have_an_answer() -> None:
+def test_all_game_steps_of_an_unmatched_participant_have_an_answer() -> None:
     steps = [*pairs().steps[:4], pairs().steps[2].__class__("5", "game"), pairs().steps[4]]
     room = WaitingRoom(pairs(steps=steps, patience=10))
     room.poll("ann", seconds=10)
@@ -433,14 +433,14 @@ def test_all_game_steps_of_the_unmatched_have_an_answer() -> None:
     ] * 2
 
 
-def test_an_answer_that_was_lost_is_written_when_they_ask_again(room: WaitingRoom) -> None:
+def test_a_lost_answer_of_an_unmatched_participant_is_written_when_they_ask_again(room: WaitingRoom) -> None:
     room.poll("ann", seconds=60)
     room.platform.documents.delete("maze/users/ann/answers/3.json")
     room.visit("ann")
     assert room.stored("users/ann/answers/3.json")["answers"] == {"outcome": "unmatched"}
 
 
-def test_a_lobby_of_one_for_an_hour() -> None:
+def test_a_participant_alone_in_the_lobby_is_unmatched_after_an_hour_of_patience() -> None:
     room = WaitingRoom(pairs(patience=3600))
     told = room.poll("ann", seconds=3598)
     assert waits(told["ann"]) == LobbyState(1, 3598.0, proposed=False)
@@ -452,7 +452,7 @@ def test_a_lobby_of_one_for_an_hour() -> None:
 
 
 @pytest.mark.parametrize("there", [1, 2, 3])
-def test_with_policies_they_play_with_those_who_are_there(there: int) -> None:
+def test_with_policies_the_participants_who_are_there_play_together(there: int) -> None:
     room = WaitingRoom(pairs(players=4, after_patience="policies", patience=20))
     users = ["ann", "bob", "cem"][:there]
     room.visit("ann")
@@ -462,7 +462,7 @@ def test_with_policies_they_play_with_those_who_are_there(there: int) -> None:
     assert room.session("ann").players == 4
 
 
-# Hostile or broken clients
+# Hostile and faulty clients
 
 
 def test_a_page_that_asks_a_hundred_times_a_second_writes_once_a_second(room: WaitingRoom) -> None:
@@ -474,7 +474,7 @@ def test_a_page_that_asks_a_hundred_times_a_second_writes_once_a_second(room: Wa
     assert 4 <= room.platform.documents.calls.count("put") <= 5
 
 
-def test_while_a_proposal_waits_for_the_other_a_page_that_asks_often_writes_once(room: WaitingRoom) -> None:
+def test_a_page_that_asks_often_confirms_a_proposal_with_one_write(room: WaitingRoom) -> None:
     room.poll("ann", "bob")
     room.platform.documents.calls.clear()
     for _ in range(500):
@@ -484,14 +484,14 @@ def test_while_a_proposal_waits_for_the_other_a_page_that_asks_often_writes_once
 
 
 @pytest.mark.parametrize("name", ["x", "..", "sxx.1.-", "s" + "a" * 20 + ".way.way", "s" + "a" * 20 + ".yes.s.0", ""])
-def test_strange_entries_in_the_folder_are_left_alone(room: WaitingRoom, name: str) -> None:
+def test_strange_entries_in_the_folder_are_ignored(room: WaitingRoom, name: str) -> None:
     room.platform.documents.put(folder.folder("maze") + name, b"[")
     room.poll("ann", "bob", seconds=4)
     assert room.together("ann", "bob")
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"userId": 7}', b'{"userId": "../../x"}', b'{"userId": "bob"}'])
-def test_an_entry_whose_document_says_nothing_is_matched_with_nobody(room: WaitingRoom, body: bytes) -> None:
+def test_an_entry_without_a_readable_document_is_matched_with_no_participant(room: WaitingRoom, body: bytes) -> None:
     label = room.label("ghost")
     one = folder.Waiting(label, folder.milliseconds(room.platform.now()), "-", room.platform.now())
     room.platform.documents.put(folder.waiting_key("maze", one), body)
@@ -531,7 +531,7 @@ def test_a_session_that_was_half_written_when_the_document_was_lost_is_finished(
     assert room.session("bob") == found
 
 
-def test_nobody_is_unmatched_before_a_lost_document_is_whole_again(room: WaitingRoom) -> None:
+def test_a_participant_is_not_unmatched_before_a_lost_document_is_repaired(room: WaitingRoom) -> None:
     room.visit("ann")
     room.platform.documents.put(decisions.key("maze"), b"{")
     room.poll("ann", seconds=70)
@@ -544,7 +544,7 @@ def test_nobody_is_unmatched_before_a_lost_document_is_whole_again(room: Waiting
 
 
 def test_each_version_of_the_document_has_other_bytes() -> None:
-    """Else a function that read an earlier one could overwrite a later one, since an ETag is a hash of the content."""
+    """Otherwise a function that has read an earlier version could overwrite a later one, since an ETag is a hash of the content."""
     crossing, written = Crossing(), list[bytes]()
     documents = crossing.platform.documents
     keep = documents._write
@@ -567,7 +567,7 @@ def test_each_version_of_the_document_has_other_bytes() -> None:
 # Erasure
 
 
-def test_nothing_of_one_who_is_erased_stays_in_the_document() -> None:
+def test_nothing_about_an_erased_participant_stays_in_the_document() -> None:
     member = decisions.Matched
     now = WaitingRoom().platform.now()
     document = Decisions(
@@ -595,32 +595,36 @@ def calls(room: WaitingRoom) -> dict[str, int]:
     return {name: made.count(name) for name in sorted(set(made))}
 
 
-def test_what_a_request_in_the_lobby_costs(room: WaitingRoom) -> None:
+def test_a_request_in_the_lobby_makes_four_calls(room: WaitingRoom) -> None:
     room.visit("ann")
     calls(room)
     room.wait(2)
     room.visit("ann")
-    assert calls(room) == {"get": 2, "list": 1, "put": 1}  # the membership, the document; the folder; that she is there
+    assert calls(room) == {
+        "get": 2,
+        "list": 1,
+        "put": 1,
+    }  # get: the membership and the document; list: the folder; put: ann's entry
 
 
-def test_what_a_pair_costs_from_the_lobby_to_its_memberships(room: WaitingRoom) -> None:
+def test_the_calls_that_a_pair_makes_from_the_lobby_to_its_memberships(room: WaitingRoom) -> None:
     room.visit("ann")
     assert calls(room) == {"get": 2, "list": 1, "put": 1}
     room.wait(1)
-    room.visit("bob")  # and proposes: the document is read again, and written
+    room.visit("bob")  # bob's request proposes: it reads the document again, and writes it
     assert calls(room) == {"get": 3, "list": 1, "put": 2}
     room.wait(1)
-    room.visit("ann")  # confirms, and lists again
+    room.visit("ann")  # ann's request confirms, and lists again
     assert calls(room) == {"get": 2, "list": 2, "put": 1}
-    room.visit("bob")  # confirms, forms, and writes session and memberships
-    # two reads for each member; the document; a yes, the session, two memberships and the mark; four entries go
+    room.visit("bob")  # bob's request confirms, forms the session, and writes it with its memberships
+    # two reads for each member; written: the document, a confirmation, the session, two memberships and the mark; four entries are deleted
     assert calls(room) == {"delete": 4, "get": 2 + 4 + 1, "list": 2, "put": 1 + 5}
     room.wait(1)
     room.visit("ann")
     assert calls(room) == {"get": 1}
 
 
-def test_a_crowd_costs_one_request_no_more_than_a_few_documents() -> None:
+def test_a_request_in_a_crowd_reads_and_writes_few_documents() -> None:
     room = WaitingRoom()
     for number in range(300):
         room.visit(f"u{number}")
@@ -632,7 +636,7 @@ def test_a_crowd_costs_one_request_no_more_than_a_few_documents() -> None:
     assert made["put"] <= 2
 
 
-def test_a_lost_reply_of_the_document_does_not_propose_twice() -> None:
+def test_a_lost_reply_to_the_write_of_the_document_makes_no_second_proposal() -> None:
     crossing = Crossing()
     crossing.finish(crossing.visit("ann"))
     crossing.platform.wait(seconds=1)
@@ -643,10 +647,10 @@ def test_a_lost_reply_of_the_document_does_not_propose_twice() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "is_formed"), [(1, False), (5, True)], ids=["a moment ago", "long ago"])
-def test_a_group_whose_own_requests_could_not_write_is_formed_by_others_after_a_while_and_carried_out_by_its_members(
+def test_other_requests_form_a_group_after_a_while_and_its_members_carry_it_out(
     room: WaitingRoom, seconds: float, is_formed: bool
 ) -> None:
-    """In a crowd the document changes so fast that most writes meet another: then each one decides on several."""
+    """In a crowd most writes of the document conflict; so each write that succeeds decides on several groups."""
     room.poll("ann", "bob", "ann")  # bob's request proposes them
     (proposal,) = room.document().proposed
     for user in ("ann", "bob"):
@@ -660,9 +664,9 @@ def test_a_group_whose_own_requests_could_not_write_is_formed_by_others_after_a_
         assert room.together("ann", "bob")
 
 
-def test_each_start_message_says_for_how_many_the_session_is(room: WaitingRoom) -> None:
-    """A start that comes after another number was registered is for the number of its session."""
-    room.arrive_at_start("ann", ready=False)  # ahead
+def test_each_start_message_names_the_sessions_number_of_players(room: WaitingRoom) -> None:
+    """A start message that arrives after another number of players was registered still names its session's number."""
+    room.arrive_at_start("ann", ready=False)  # one server ahead
     room.wait(200)
     room.lobby.repair(room.project)  # the server has no record: its message may be lost
     room.poll("bob", "cem", "dan", "eve", seconds=4)  # formed: one pair with the server ahead, one without

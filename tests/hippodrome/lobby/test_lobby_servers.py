@@ -10,13 +10,13 @@ from hippodrome.model.records import to_json
 from tests.hippodrome.lobby.waiting_room import WaitingRoom, pairs
 
 
-def test_a_server_is_started_for_every_two_who_are_under_way(room: WaitingRoom) -> None:
+def test_a_server_is_started_for_every_two_participants_who_are_under_way(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", "cem")
     assert len(room.started()) == 2
     assert {each.id for each in room.document().open} == set(room.started())
 
 
-def test_the_pair_gets_the_server_that_was_started_first(room: WaitingRoom) -> None:
+def test_a_pair_gets_the_server_that_was_started_first(room: WaitingRoom) -> None:
     room.arrive_at_start("ann")
     room.wait(30)
     room.arrive_at_start("bob", "cem")
@@ -26,7 +26,7 @@ def test_the_pair_gets_the_server_that_was_started_first(room: WaitingRoom) -> N
     assert room.started().count(first) == 1
 
 
-def test_the_pair_gets_a_server_that_is_ready_though_another_was_started_first(room: WaitingRoom) -> None:
+def test_a_pair_gets_a_ready_server_even_if_another_was_started_first(room: WaitingRoom) -> None:
     room.arrive_at_start("ann")
     room.wait(30)
     room.arrive_at_start("bob", "cem")
@@ -37,7 +37,7 @@ def test_the_pair_gets_a_server_that_is_ready_though_another_was_started_first(r
     assert [each.id for each in room.document().open] == [first]
 
 
-def test_a_pair_whose_server_is_not_ready_is_formed_and_waits_for_the_first_that_is(room: WaitingRoom) -> None:
+def test_a_pair_without_a_ready_server_is_formed_and_gets_the_first_server_that_is_ready(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     room.wait(1)
     room.arrive_at_start("cem", ready=False)
@@ -53,8 +53,8 @@ def test_a_pair_whose_server_is_not_ready_is_formed_and_waits_for_the_first_that
     assert room.session("ann").id == second
 
 
-def test_of_two_pairs_the_first_gets_the_server_that_is_ready_first(room: WaitingRoom) -> None:
-    """The server of the second pair is ready. Its members ask, and the first pair has it."""
+def test_the_pair_that_was_formed_first_gets_the_server_that_is_ready_first(room: WaitingRoom) -> None:
+    """The server of the second pair becomes ready. A member of that pair asks, and the first pair gets the server."""
     room.arrive_at_start("ann", "bob", ready=False)
     room.wait(1)
     room.arrive_at_start("cem", "dan", ready=False)
@@ -73,7 +73,7 @@ def test_of_two_pairs_the_first_gets_the_server_that_is_ready_first(room: Waitin
     assert room.started() == [first, second], "no server more is started"
 
 
-def test_a_pair_whose_server_has_ended_keeps_it_and_is_told(room: WaitingRoom) -> None:
+def test_a_pair_whose_only_server_has_ended_keeps_it(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
     room.serve(first, state=server.ServerState.CLOSED, reason=server.Reason.REFUSED)
@@ -99,7 +99,7 @@ def test_a_pair_whose_server_has_ended_waits_for_another_that_starts(room: Waiti
     assert {room.session("ann").id, room.session("cem").id} == set(others)
 
 
-def test_a_pair_whose_server_has_ended_gets_one_that_is_ready_however_many_others_have_ended(room: WaitingRoom) -> None:
+def test_a_pair_whose_server_has_ended_gets_a_ready_one_however_many_others_have_ended(room: WaitingRoom) -> None:
     for number in range(8):
         room.arrive_at_start(f"ann{number}", f"bob{number}", ready=False)
         room.wait(1)
@@ -150,7 +150,7 @@ def test_a_pair_whose_server_is_lost_and_replaced_waits_for_it(room: WaitingRoom
     assert isinstance(told["ann"], NoServerYet)
 
 
-def test_after_five_minutes_a_pair_keeps_the_server_it_was_given(room: WaitingRoom) -> None:
+def test_after_five_minutes_a_pair_keeps_its_server(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
     room.serve(first, state=server.ServerState.STARTING)
@@ -160,7 +160,7 @@ def test_after_five_minutes_a_pair_keeps_the_server_it_was_given(room: WaitingRo
     assert room.session("ann").id == first
 
 
-def test_the_sweep_gives_ready_servers_to_pairs_that_ask_no_more(room: WaitingRoom) -> None:
+def test_the_sweep_gives_ready_servers_to_pairs_that_do_not_ask_any_more(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     [first] = room.started()
     room.serve(first, state=server.ServerState.STARTING)
@@ -170,7 +170,7 @@ def test_the_sweep_gives_ready_servers_to_pairs_that_ask_no_more(room: WaitingRo
     assert room.together("ann", "bob")
 
 
-def test_a_start_message_that_comes_late_leaves_nobody_under_way_who_waits_for_a_server(room: WaitingRoom) -> None:
+def test_a_late_start_message_writes_no_entry_for_a_participant_who_waits_for_a_server(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     room.serve(*room.started(), state=server.ServerState.STARTING)
     room.poll("ann", "bob", seconds=4)
@@ -178,7 +178,9 @@ def test_a_start_message_that_comes_late_leaves_nobody_under_way_who_waits_for_a
     assert room.entries() == []
 
 
-def test_a_server_that_has_no_record_yet_is_asked_for_again_when_the_session_is_formed(room: WaitingRoom) -> None:
+def test_the_start_message_of_a_server_without_a_record_is_sent_again_once_when_the_session_is_formed(
+    room: WaitingRoom,
+) -> None:
     room.arrive_at_start("ann", "bob", ready=False)
     room.platform.bus.sent.clear()  # the message was lost
     room.poll("ann", "bob", seconds=4)
@@ -187,7 +189,7 @@ def test_a_server_that_has_no_record_yet_is_asked_for_again_when_the_session_is_
     assert len(room.started()) == 1, "once"
 
 
-def test_a_repeated_start_message_starts_nothing_more(room: WaitingRoom) -> None:
+def test_a_repeated_start_message_starts_no_second_server(room: WaitingRoom) -> None:
     for _ in range(3):
         room.arrive_at_start("ann")
         room.wait(5)
@@ -195,7 +197,7 @@ def test_a_repeated_start_message_starts_nothing_more(room: WaitingRoom) -> None
     assert len(room.document().open) == 1
 
 
-def test_a_start_message_an_hour_late_changes_nothing(room: WaitingRoom) -> None:
+def test_a_start_message_that_comes_an_hour_late_changes_nothing(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=4)
     room.wait(3600)
     before = (dict(room.platform.documents.kept), list(room.platform.bus.sent))
@@ -203,8 +205,8 @@ def test_a_start_message_an_hour_late_changes_nothing(room: WaitingRoom) -> None
     assert (room.platform.documents.kept, room.platform.bus.sent) == before
 
 
-def test_no_more_servers_are_started_ahead_than_may_run_however_many_are_under_way() -> None:
-    """Else each sweep would ask anew for all that found no slot."""
+def test_servers_ahead_never_exceed_max_servers() -> None:
+    """Otherwise each sweep would start all servers again that found no slot."""
     room = WaitingRoom(pairs(max_servers=3))
     for number in range(40):
         room.arrive_at_start(f"p{number}", ready=False)
@@ -216,27 +218,27 @@ def test_no_more_servers_are_started_ahead_than_may_run_however_many_are_under_w
     assert len(set(room.started())) == 6
 
 
-def test_who_has_played_is_not_under_way(room: WaitingRoom) -> None:
+def test_a_participant_who_has_played_is_not_under_way(room: WaitingRoom) -> None:
     room.platform.documents.put("maze/users/ann/answers/3.json", b"{}")
     room.arrive_at_start("ann")
     assert room.entries() == []
     assert room.started() == []
 
 
-def test_a_start_message_of_one_who_waits_changes_nothing(room: WaitingRoom) -> None:
+def test_the_start_message_of_a_participant_in_the_lobby_changes_nothing(room: WaitingRoom) -> None:
     room.visit("ann")
     before = room.entries()
     room.arrive_at_start("ann")
     assert room.entries() == before
 
 
-def test_the_unmatched_are_not_under_way(room: WaitingRoom) -> None:
+def test_an_unmatched_participant_is_not_under_way(room: WaitingRoom) -> None:
     room.poll("ann", seconds=60)
     room.arrive_at_start("ann")
     assert room.started() == []
 
 
-def test_servers_that_nobody_needs_are_stopped_by_the_sweep(room: WaitingRoom) -> None:
+def test_the_sweep_stops_servers_that_are_not_needed(room: WaitingRoom) -> None:
     for user in ("ann", "bob", "cem", "dan", "eve"):
         room.arrive_at_start(user)
         room.wait(1)
@@ -249,7 +251,7 @@ def test_servers_that_nobody_needs_are_stopped_by_the_sweep(room: WaitingRoom) -
     assert sorted(room.stopped()) == sorted(set(room.started()) - set(listed))
 
 
-def test_a_server_that_waited_too_long_is_replaced_by_the_sweep(room: WaitingRoom) -> None:
+def test_the_sweep_replaces_a_server_that_waited_too_long(room: WaitingRoom) -> None:
     room.arrive_at_start("ann")
     [first] = room.started()
     room.wait(sessions.open_for(room.project, room.platform.settings).total_seconds() - 1)
@@ -271,7 +273,7 @@ def test_a_pair_does_not_get_a_server_that_waited_too_long(room: WaitingRoom) ->
 
 
 @pytest.mark.parametrize("max_runtime", [5, 60, 1440])
-def test_who_never_arrives_costs_one_server_that_waits_for_half_an_hour_at_most(max_runtime: int) -> None:
+def test_a_participant_who_never_arrives_costs_one_server(max_runtime: int) -> None:
     room = WaitingRoom(pairs(max_runtime=max_runtime))
     room.arrive_at_start("ann")
     for _ in range(12 * 25):  # a sweep every five minutes, for longer than any game
@@ -284,14 +286,16 @@ def test_who_never_arrives_costs_one_server_that_waits_for_half_an_hour_at_most(
     assert room.document().open == ()
 
 
-def test_the_server_of_one_who_never_arrives_is_stopped_when_it_can_no_longer_be_used(room: WaitingRoom) -> None:
+def test_the_server_of_a_participant_who_never_arrives_is_stopped_when_it_can_no_longer_be_used(
+    room: WaitingRoom,
+) -> None:
     room.arrive_at_start("ann")
     room.wait(sessions.open_for(room.project, room.platform.settings).total_seconds())
     assert list(room.lobby.repair(room.project)) == []
     assert room.stopped() == room.started()[:1]
 
 
-def test_an_open_server_without_a_record_is_asked_for_again_by_the_sweep(room: WaitingRoom) -> None:
+def test_the_sweep_sends_the_start_message_of_an_open_server_without_a_record_again(room: WaitingRoom) -> None:
     room.arrive_at_start("ann", ready=False)
     room.platform.bus.sent.clear()
     room.wait(170)
@@ -302,7 +306,7 @@ def test_an_open_server_without_a_record_is_asked_for_again_by_the_sweep(room: W
     assert list(room.lobby.repair(room.project)) == room.started()
 
 
-def test_an_open_server_that_has_ended_is_replaced_by_the_sweep(room: WaitingRoom) -> None:
+def test_the_sweep_replaces_an_open_server_that_has_ended(room: WaitingRoom) -> None:
     room.arrive_at_start("ann")
     [first] = room.started()
     put_record(room, first, closed=True)
@@ -312,7 +316,7 @@ def test_an_open_server_that_has_ended_is_replaced_by_the_sweep(room: WaitingRoo
 
 
 def put_record(room: WaitingRoom, session_id: str, *, closed: bool = False) -> None:
-    """The session's server as `start_server` writes it."""
+    """Write the record of the session's server as `start_server` does."""
     platform = room.platform
     made = server.new_attempt(room.project, session_id, 1, settings=platform.settings, now=platform.now())
     if closed:

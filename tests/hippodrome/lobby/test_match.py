@@ -1,4 +1,4 @@
-"""`matching: match`: a server's answer, written by the researcher's function, says who plays with whom."""
+"""`matching: match`: a server's answer, which the researcher's function has computed, decides who plays with whom."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def question(room: WaitingRoom) -> Any:
 
 
 def answer(room: WaitingRoom, body: bytes) -> None:
-    """What a server without members writes."""
+    """Write the answer that a server without members writes."""
     room.platform.documents.create(groups_key(room.project.id, question(room)["id"]), body)
 
 
@@ -35,7 +35,7 @@ def choose(room: WaitingRoom, *groups: Sequence[str]) -> None:
     answer(room, json.dumps({"groups": [[room.label(user) for user in group] for group in groups]}).encode())
 
 
-def test_the_question_says_who_waits_and_what_they_answered_and_holds_no_id(room: WaitingRoom) -> None:
+def test_a_question_lists_the_waiting_participants_with_their_answers_and_without_their_ids(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=6)
     asked = question(room)
     assert asked["players"] == 2
@@ -45,7 +45,7 @@ def test_the_question_says_who_waits_and_what_they_answered_and_holds_no_id(room
     assert b'"ann"' not in room.platform.documents.kept[waiting_key(room.project.id)][0]
 
 
-def test_those_whom_match_has_chosen_play_together(room: WaitingRoom) -> None:
+def test_participants_whom_match_has_chosen_play_together(room: WaitingRoom) -> None:
     room.poll("ann", "bob", "cem", "dan", seconds=12)
     assert room.membership("ann") is None
     choose(room, ("ann", "dan"), ("bob", "cem"))
@@ -54,7 +54,7 @@ def test_those_whom_match_has_chosen_play_together(room: WaitingRoom) -> None:
     assert room.together("bob", "cem")
 
 
-def test_how_long_they_wait_is_asked_again_once_there_is_an_answer(room: WaitingRoom) -> None:
+def test_after_an_answer_the_next_question_comes_with_new_waiting_times(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     choose(room)
     room.poll("ann", "bob", seconds=6)
@@ -62,7 +62,7 @@ def test_how_long_they_wait_is_asked_again_once_there_is_an_answer(room: Waiting
     assert waited == {5}
 
 
-def test_a_question_stays_until_it_is_answered_however_many_come(room: WaitingRoom) -> None:
+def test_a_question_stays_until_it_is_answered_however_many_participants_come(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     first = question(room)["id"]
     room.poll("ann", "bob", "cem", "dan", seconds=2)
@@ -72,7 +72,7 @@ def test_a_question_stays_until_it_is_answered_however_many_come(room: WaitingRo
     assert {each["id"] for each in question(room)["waiting"]} == {room.label("cem"), room.label("dan")}
 
 
-def test_without_an_answer_it_is_asked_again_of_those_who_are_there(room: WaitingRoom) -> None:
+def test_without_an_answer_a_new_question_lists_all_who_are_there(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     first = question(room)["id"]
     room.poll("ann", "bob", "cem", seconds=12)
@@ -94,7 +94,7 @@ def test_without_an_answer_it_is_asked_again_of_those_who_are_there(room: Waitin
         b'{"groups": [["LABEL"]]}',
     ],
 )
-def test_an_answer_that_is_none_matches_nobody_and_is_told(
+def test_an_invalid_answer_matches_no_participant_and_is_logged_once(
     room: WaitingRoom, body: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     room.poll("ann", "bob", seconds=2)
@@ -104,7 +104,7 @@ def test_an_answer_that_is_none_matches_nobody_and_is_told(
     assert len([each for each in caplog.messages if "match" in each]) == 1
 
 
-def test_of_a_participant_in_two_groups_the_first_counts(room: WaitingRoom) -> None:
+def test_a_participant_in_two_groups_plays_in_the_first(room: WaitingRoom) -> None:
     room.poll("ann", "bob", "cem", seconds=12)
     choose(room, ("ann", "bob"), ("bob", "cem"))
     room.poll("ann", "bob", "cem", seconds=6)
@@ -112,7 +112,7 @@ def test_of_a_participant_in_two_groups_the_first_counts(room: WaitingRoom) -> N
     assert room.membership("cem") is None
 
 
-def test_who_has_left_meanwhile_is_not_proposed(room: WaitingRoom) -> None:
+def test_a_participant_who_has_left_is_not_proposed(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     choose(room, ("ann", "bob"))
     room.lobby.leave(room.project, "bob")
@@ -120,13 +120,13 @@ def test_who_has_left_meanwhile_is_not_proposed(room: WaitingRoom) -> None:
     assert room.document().proposed == ()
 
 
-def test_nobody_is_matched_without_an_answer_and_patience_ends_the_waiting(room: WaitingRoom) -> None:
+def test_without_an_answer_participants_are_unmatched_at_the_end_of_patience(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=64)
     memberships = [room.membership(user) for user in ("ann", "bob")]
     assert all(one is not None and one.unmatched for one in memberships)
 
 
-def test_the_sweep_deletes_questions_that_nobody_asks_any_more(room: WaitingRoom) -> None:
+def test_the_sweep_deletes_old_questions(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     choose(room)
     room.wait(301)
@@ -134,7 +134,7 @@ def test_the_sweep_deletes_questions_that_nobody_asks_any_more(room: WaitingRoom
     assert not [key for key in room.platform.documents.kept if "/lobby/" in key or key.startswith("_match/")]
 
 
-def test_who_has_been_matched_stands_in_no_later_question(room: WaitingRoom) -> None:
+def test_a_matched_participant_is_in_no_later_question(room: WaitingRoom) -> None:
     room.poll("ann", "bob", seconds=2)
     choose(room, ("ann", "bob"))
     room.poll("ann", "bob", "cem", "dan", seconds=6)
@@ -144,10 +144,10 @@ def test_who_has_been_matched_stands_in_no_later_question(room: WaitingRoom) -> 
     assert "came" not in asked
 
 
-def test_a_question_without_room_leaves_out_who_comes_until_there_is_room(
+def test_a_full_question_leaves_out_further_participants_until_the_next(
     room: WaitingRoom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two may stand beside the question. Of three who come while it is not answered, the third is asked about later."""
+    """Two participants fit beside the question. Of three who come before its answer, the third is in a later question."""
     monkeypatch.setattr(questions, "MOST_CAME", 2)
     room.poll("ann", "bob", seconds=2)
     others = ("cem", "dan", "eve")
@@ -162,7 +162,7 @@ def test_a_question_without_room_leaves_out_who_comes_until_there_is_room(
     assert {one["id"] for one in question(room)["waiting"]} == {room.label(user) for user in others}
 
 
-def test_other_projects_ask_nothing() -> None:
+def test_a_project_without_match_writes_no_question() -> None:
     room = WaitingRoom(pairs())
     room.poll("ann", seconds=4)
     assert question(room) is None

@@ -28,7 +28,7 @@ def ago(seconds: float) -> datetime:
 
 
 def one(label: str, came: float = 5, seen: float = 0, trait: str = "-") -> Waiting:
-    """Who came and was seen so many seconds ago."""
+    """The entry of a participant who came and was seen so many seconds ago."""
     return Waiting(label, milliseconds(NOW) - round(came * 1000), trait, ago(seen))
 
 
@@ -38,7 +38,7 @@ def lobby(*people: Waiting, yes: Mapping[str, Iterable[str]] | None = None, way:
 
 
 def in_turn(labels: str, traits_of: str = "") -> list[Waiting]:
-    """These came one after the other, each with a trait, in the order of the letters."""
+    """Entries of participants who came one after the other in the order of the letters, each with a trait."""
     each_trait = traits_of or "-" * len(labels)
     return [one(label, 30 - n, trait=trait) for n, (label, trait) in enumerate(zip(labels, each_trait, strict=True))]
 
@@ -73,16 +73,16 @@ def formed(labels: str, name: str = "f") -> Formed:
 # Who is proposed
 
 
-def test_who_came_first_is_proposed_first_and_stands_first() -> None:
+def test_the_participant_who_came_first_is_proposed_first_and_named_first() -> None:
     people = [one("a", 10), one("b", 40), one("c", 20), one("d", 30), one("e", 5)]
     assert groups(decide(lobby(*people))) == ["bd", "ca"]
 
 
-def test_of_two_who_came_in_the_same_millisecond_the_label_decides() -> None:
+def test_the_label_decides_between_two_who_came_in_the_same_millisecond() -> None:
     assert groups(decide(lobby(one("c"), one("b"), one("a")))) == ["ab"]
 
 
-def test_a_proposal_is_made_now_with_an_id_of_its_own() -> None:
+def test_a_proposal_has_the_present_time_and_a_new_id() -> None:
     assert decide(lobby(*in_turn("abcd"))).proposed == (
         Proposal("new.1", ("a", "b"), NOW, players=2),
         Proposal("new.2", ("c", "d"), NOW, players=2),
@@ -96,7 +96,7 @@ def test_groups_are_full(players: int, found: list[str]) -> None:
     assert groups(decide(lobby(*in_turn("abcde")), project=pairs(players=players))) == found
 
 
-def test_who_was_seen_less_than_ten_seconds_ago_is_there() -> None:
+def test_a_participant_who_was_seen_less_than_ten_seconds_ago_is_there() -> None:
     assert groups(decide(lobby(one("a", 30, 9.999), one("b")))) == ["ab"]
     assert groups(decide(lobby(one("a", 30, 10), one("b")))) == []
 
@@ -109,15 +109,15 @@ def test_who_was_seen_less_than_ten_seconds_ago_is_there() -> None:
         Decisions(unmatched=(Unmatched("a", "A", NOW),)),
     ],
 )
-def test_who_stands_in_the_document_is_not_proposed_again(document: Decisions) -> None:
+def test_a_participant_in_the_document_is_not_proposed_again(document: Decisions) -> None:
     entries = lobby(*in_turn("abcx"), yes={"p": "ax"})
     found = groups(decide(entries, document))
     assert [each for each in found if each != "ax"] == ["bc"]
 
 
 @pytest.mark.parametrize("known", [Decisions(proposed=(proposal("ax"),)), Decisions(formed=(formed("ax"),))])
-def test_who_stood_in_the_document_before_the_listing_is_not_proposed(known: Decisions) -> None:
-    """They have a membership since, perhaps, and the listing is too old to tell."""
+def test_a_participant_who_was_in_the_document_before_the_listing_is_not_proposed(known: Decisions) -> None:
+    """They may have a membership by now, which the older listing cannot show."""
     entries = lobby(*in_turn("abc"))
     assert groups(decide(entries, Decisions(), known=known)) == ["bc"]
 
@@ -132,12 +132,12 @@ def test_a_run_makes_fifty_proposals_at_most() -> None:
     assert len(decide(lobby(*late), project=mixed).proposed) == 50
 
 
-def test_what_changes_nothing_is_the_same_document() -> None:
+def test_a_decision_without_a_change_returns_the_same_document() -> None:
     document = Decisions(open=(OpenSession("o", ago(5)),), proposed=(proposal("ab"),), formed=(formed("cd"),))
     assert decide(lobby(one("a"), one("b"), one("e")), document) is document
 
 
-# With whom
+# Who plays with whom
 
 
 @pytest.mark.parametrize(
@@ -161,80 +161,82 @@ def test_what_changes_nothing_is_the_same_document() -> None:
         ("match", 2, ("abcd", "----"), []),
     ],
 )
-def test_matching_says_who_may_play_with_whom(
+def test_matching_decides_who_may_play_with_whom(
     matching: Any, players: int, people: tuple[str, str], found: list[str]
 ) -> None:
     project = pairs(matching=matching, players=players)  # its first page has two groups
     assert groups(decide(lobby(*in_turn(*people)), project=project)) == found
 
 
-def test_groups_of_any_trait_are_proposed_in_the_order_in_which_their_first_came() -> None:
+def test_groups_of_different_traits_are_proposed_in_the_order_in_which_their_first_members_came() -> None:
     project = pairs(matching="group")
     assert groups(decide(lobby(*in_turn("abcdef", "122331")), project=project)) == ["af", "bc", "de"]
 
 
-def test_mixed_without_groups_takes_one_of_each() -> None:
+def test_mixed_without_groups_takes_one_of_each_trait() -> None:
     project = pairs(matching="mixed", players=3, steps=[Step("3", "game")])
     assert groups(decide(lobby(*in_turn("abcd", "1123")), project=project)) == ["acd"]
 
 
-def wish(*labels: str, people: str = "abcd", **changes: Any) -> list[str]:
+def proposed_of_chosen(*labels: str, people: str = "abcd", **changes: Any) -> list[str]:
     project = pairs(matching="match", **changes)
     return groups(decide(lobby(*in_turn(people)), project=project, chosen=[list(each) for each in labels]))
 
 
-def test_groups_that_are_wished_are_proposed_in_their_order_each_by_arrival() -> None:
-    assert wish("db", "ca") == ["bd", "ac"]
+def test_chosen_groups_are_proposed_in_their_order_with_members_by_arrival() -> None:
+    assert proposed_of_chosen("db", "ca") == ["bd", "ac"]
 
 
 @pytest.mark.parametrize("wished", ["a", "abc", "aa", "ax", ""])
-def test_a_wished_group_that_is_not_full_or_not_of_those_who_wait_is_not_proposed(wished: str) -> None:
-    assert wish(wished, "cd") == ["cd"]
+def test_a_chosen_group_is_proposed_only_if_it_is_full_and_all_members_wait(wished: str) -> None:
+    assert proposed_of_chosen(wished, "cd") == ["cd"]
 
 
-def test_who_is_wished_twice_is_in_the_first_group() -> None:
-    assert wish("ab", "bc", "cd") == ["ab", "cd"]
+def test_a_participant_in_two_chosen_groups_is_in_the_first() -> None:
+    assert proposed_of_chosen("ab", "bc", "cd") == ["ab", "cd"]
 
 
-def test_wishes_count_only_if_the_function_matches() -> None:
+def test_chosen_groups_count_only_with_matching_match() -> None:
     assert groups(decide(lobby(*in_turn("abcd")), chosen=[["a", "d"]])) == ["ab", "cd"]
 
 
 # Patience
 
 
-def test_patience_is_over_to_the_millisecond() -> None:
+def test_patience_ends_at_the_exact_millisecond() -> None:
     project = pairs(patience=PATIENCE)
     assert not matchmaking.patience_is_over(one("a", 59.999).joined, project, NOW)
     assert matchmaking.patience_is_over(one("a", 60).joined, project, NOW)
     assert matchmaking.patience_is_over(one("a", 0.5).joined, pairs(patience=0.5), NOW)
 
 
-def test_who_would_be_unmatched_is_proposed_no_more() -> None:
+def test_a_participant_whose_patience_is_over_is_not_proposed() -> None:
     assert groups(decide(lobby(one("a", 59.999), one("b")))) == ["ab"]
     assert groups(decide(lobby(one("a", 60), one("b")))) == []
     assert groups(decide(lobby(one("a", 60), one("b"), one("c", 4)))) == ["bc"]
 
 
 @pytest.mark.parametrize(("there", "found"), [("a", ["a"]), ("ab", ["ab"]), ("abc", ["abc"]), ("abcd", ["abc"])])
-def test_with_policies_whose_patience_is_over_plays_with_those_who_are_there(there: str, found: list[str]) -> None:
+def test_with_policies_a_participant_whose_patience_is_over_plays_with_the_others_who_are_there(
+    there: str, found: list[str]
+) -> None:
     project = pairs(players=3, after_patience="policies")
     people = [one(label, 60 - n) for n, label in enumerate(there)]
     assert groups(decide(lobby(*people), project=project)) == found
 
 
-def test_with_policies_nobody_is_in_a_short_group_before_somebodys_patience_is_over() -> None:
+def test_with_policies_there_is_no_short_group_before_a_participants_patience_is_over() -> None:
     project = pairs(players=3, after_patience="policies")
     assert groups(decide(lobby(one("a", 59.999), one("b")), project=project)) == []
 
 
-def test_with_policies_full_groups_come_first_and_those_left_over_are_not_taken_twice() -> None:
+def test_with_policies_full_groups_come_first_and_each_participant_is_in_one_group() -> None:
     project = pairs(players=2, after_patience="policies")
     people = [one(label, 65 - n) for n, label in enumerate("abc")]
     assert groups(decide(lobby(*people), project=project)) == ["ab", "c"]
 
 
-def test_with_policies_a_short_group_is_of_those_who_fit() -> None:
+def test_with_policies_a_short_group_follows_the_matching() -> None:
     project = pairs(players=3, matching="group", after_patience="policies")
     people = [one("a", 61, trait="1"), one("b", trait="2"), one("c", 4, trait="1"), one("d", 62, trait="3")]
     assert groups(decide(lobby(*people), project=project)) == ["d", "ac"]
@@ -246,12 +248,12 @@ def test_with_policies_a_short_group_is_of_those_who_fit() -> None:
     assert groups(decide(lobby(*people), project=project)) == ["ab"]
 
 
-def test_two_whose_patience_is_over_are_in_one_short_group() -> None:
+def test_two_participants_whose_patience_is_over_are_in_one_short_group() -> None:
     project = pairs(players=3, after_patience="policies")
     assert groups(decide(lobby(one("b", 61), one("a", 62)), project=project)) == ["ab"]
 
 
-def test_the_unmatched_stand_in_the_document_once() -> None:
+def test_an_unmatched_participant_is_in_the_document_once() -> None:
     ann = Unmatched("a", "A", NOW)
     given = rules.give_up(Decisions(), ann)
     assert given == Decisions(unmatched=(ann,))
@@ -259,7 +261,7 @@ def test_the_unmatched_stand_in_the_document_once() -> None:
 
 
 @pytest.mark.parametrize("document", [Decisions(proposed=(proposal("ax"),)), Decisions(formed=(formed("ax"),))])
-def test_who_is_proposed_or_formed_is_not_unmatched(document: Decisions) -> None:
+def test_a_participant_who_is_proposed_or_in_a_formed_session_does_not_become_unmatched(document: Decisions) -> None:
     assert rules.give_up(document, Unmatched("a", "A", NOW)) is document
 
 
@@ -280,31 +282,34 @@ def test_a_proposal_falls_apart_when_a_member_has_left_even_if_they_have_confirm
     assert not stays(1, one("a"), yes="ab")
 
 
-def test_a_proposal_falls_apart_when_one_who_has_not_confirmed_has_not_asked_for_ten_seconds() -> None:
+def test_a_proposal_falls_apart_when_an_unconfirmed_member_has_not_asked_for_ten_seconds() -> None:
     assert stays(5, one("a", 30, 9.999), one("b"), yes="b")
     assert not stays(5, one("a", 30, 10), one("b"), yes="b")
 
 
-def test_who_has_confirmed_need_not_ask_again() -> None:
+def test_a_member_who_has_confirmed_need_not_ask_again() -> None:
     assert stays(9, one("a", 30, 25), one("b"), yes="a")
 
 
-def test_of_a_fallen_proposal_those_who_are_there_keep_their_turn() -> None:
+def test_members_of_a_fallen_proposal_keep_their_turn() -> None:
     document = Decisions(proposed=(proposal("ab", 10),))
     entries = lobby(one("a", 40, 11), one("b", 39), one("c", 8), one("d", 7), yes={"p": "b"})
-    assert groups(decide(entries, document, known=Decisions())) == ["ab", "cd"]  # made after the listing: it stays
+    assert groups(decide(entries, document, known=Decisions())) == [
+        "ab",
+        "cd",
+    ]  # the proposal was made after the listing: it stays
     fallen = decide(entries, document)
-    assert groups(fallen) == ["cd"]  # who stood there is proposed by the next run, which lists anew
+    assert groups(fallen) == ["cd"]  # a and b are proposed by the next run, which lists anew
     assert groups(decide(entries, Decisions())) == ["bc"]
 
 
-def test_a_proposal_that_the_listing_cannot_know_stays() -> None:
+def test_a_proposal_that_is_newer_than_the_listing_stays() -> None:
     document = Decisions(proposed=(proposal("ab", 60, "late"), proposal("cd", 60, "early")))
     known = Decisions(proposed=(proposal("cd", 60, "early"),))
     assert groups(decide(lobby(), document, known=known)) == ["ab"]
 
 
-def test_the_server_of_a_fallen_proposal_is_used_for_the_next_which_is_another() -> None:
+def test_the_next_proposal_gets_the_server_of_a_fallen_one_and_an_id_of_its_own() -> None:
     ahead = OpenSession("o", ago(100), "x")
     document = Decisions(open=(OpenSession("later", ago(5)),), proposed=(proposal("ab", 10, "p", ahead),))
     fallen = decide(lobby(one("c", 8), one("d", 7)), document)
@@ -313,7 +318,7 @@ def test_the_server_of_a_fallen_proposal_is_used_for_the_next_which_is_another()
     assert fallen.proposed[0].session_id == "o"
 
 
-def test_proposals_can_be_dropped() -> None:
+def test_proposals_are_removed_by_id() -> None:
     ahead = OpenSession("o", ago(3))
     document = Decisions(
         open=(OpenSession("first", ago(9)), OpenSession("last", ago(1))),
@@ -328,7 +333,7 @@ def test_proposals_can_be_dropped() -> None:
 # Confirmed, and formed
 
 
-def test_a_group_is_confirmed_when_all_have_and_none_has_left() -> None:
+def test_a_group_is_confirmed_when_all_members_have_confirmed_and_none_has_left() -> None:
     ab = proposal("ab")
     document = Decisions(proposed=(ab,))
     a, b = one("a"), one("b")
@@ -340,7 +345,7 @@ def test_a_group_is_confirmed_when_all_have_and_none_has_left() -> None:
     assert rules.confirmed(document, lobby(a, b, yes={"another": "ab"})) == []
 
 
-def test_what_is_formed_was_proposed_and_has_the_proposals_members() -> None:
+def test_a_session_is_formed_only_with_the_members_of_its_proposal() -> None:
     members = (Matched("a", "A", 1), Matched("b", "B"))
     document = Decisions(proposed=(proposal("ab"), proposal("cd", name="q")))
     done = rules.form(document, "p", members, NOW)
@@ -353,7 +358,7 @@ def test_what_is_formed_was_proposed_and_has_the_proposals_members() -> None:
         assert rules.form(document, "p", others, NOW) is document
 
 
-def test_seats_are_drawn_by_lot_by_every_run_alike() -> None:
+def test_every_run_draws_the_same_seats_by_lot() -> None:
     members = tuple(Matched(label, label.upper()) for label in "abc")
     first = Counter[str]()
     for n in range(600):
@@ -376,7 +381,7 @@ def test_seats_by_group_are_drawn_by_lot_within_a_group_only() -> None:
     assert orders == {"cdab", "dcab"}
 
 
-def test_seats_are_those_in_which_the_members_were_wished() -> None:
+def test_with_seats_by_match_members_have_the_seats_in_the_chosen_order() -> None:
     project = pairs(players=3, matching="match", seats="match")
     document = decide(lobby(*in_turn("abcd")), project=project, chosen=[["d", "a", "c"]])
     [found] = document.proposed
@@ -396,7 +401,7 @@ def test_a_formed_session_has_the_id_of_the_server_that_was_started_ahead() -> N
     assert rules.form(document, "o", (Matched("a", "A"), Matched("b", "B")), NOW) is document
 
 
-def test_what_is_done_leaves_the_document() -> None:
+def test_finished_sessions_and_unmatched_participants_leave_the_document() -> None:
     document = Decisions(
         formed=(formed("ab"), formed("cd", "g")), unmatched=(Unmatched("e", "E", NOW), Unmatched("h", "H", NOW))
     )
@@ -408,17 +413,17 @@ def test_what_is_done_leaves_the_document() -> None:
     assert rules.without_done(document, ["f", "g", "e", "h"]) == Decisions()
 
 
-def test_each_change_counts_a_version() -> None:
+def test_each_change_increases_the_version() -> None:
     before = Decisions(version=7, formed=(formed("ab"),))
     after = decisions.next_version(before, Decisions(version=7))
     assert after == Decisions(version=8)
     assert decisions.next_version(before, before) is before
 
 
-# What the document says
+# The content of the document
 
 
-def test_the_document_says_where_a_participant_stands() -> None:
+def test_the_document_tells_each_participants_state() -> None:
     ab, cd, e = proposal("ab"), formed("cd"), Unmatched("e", "E", NOW)
     document = Decisions(version=3, open=(OpenSession("o", NOW, "z"),), proposed=(ab,), formed=(cd,), unmatched=(e,))
     assert document.labels() == set("abcde")
@@ -437,14 +442,14 @@ def test_sessions_that_may_have_a_server() -> None:
     assert document.session_ids() == {"n", "o", "f"}
 
 
-def test_what_the_document_leaves_out_is_empty_or_no() -> None:
+def test_fields_that_the_document_leaves_out_have_defaults() -> None:
     told = b'{"formed": [{"id": "f", "members": [{"label": "a", "userId": "A"}], "at": "2026-03-04T12:00:00Z"}]}'
     assert from_json(told, Decisions) == Decisions(
         0, (), (), (Formed("f", (Matched("a", "A", None),), NOW, False),), ()
     )
 
 
-def test_a_document_of_an_earlier_version_says_neither_for_how_many_players_nor_which_code() -> None:
+def test_a_document_of_an_earlier_version_has_no_number_of_players_and_no_code() -> None:
     when = '"2026-03-04T12:00:00Z"'
     told = f"""{{"open": [{{"id": "o", "asked": {when}}}], "formed": [{{"id": "f", "members": [], "at": {when}}}],
         "proposed": [{{"id": "p", "labels": [], "at": {when}}}], "unmatched": [{{"label": "a", "userId": "A", "at": {when}}}]}}"""
@@ -453,7 +458,7 @@ def test_a_document_of_an_earlier_version_says_neither_for_how_many_players_nor_
     assert (found.unmatched[0].completion_code, found.unmatched[0].waited) == ("", None)
 
 
-def test_the_documents_key() -> None:
+def test_the_key_of_the_document() -> None:
     assert decisions.key("maze") == "_lobbies/maze.json"
 
 
@@ -464,7 +469,7 @@ def here(label: str, *people: Waiting, document: Decisions | None = None, **chan
     return rules.number_here(document or Decisions(), lobby(*people), pairs(**{"players": 3, **changes}), label, NOW)
 
 
-def test_those_are_counted_who_could_play_together() -> None:
+def test_the_number_who_are_there_counts_those_who_could_play_together() -> None:
     assert here("a") == 1
     assert here("a", one("a")) == 1
     assert here("a", one("a"), one("b")) == 2
@@ -478,15 +483,15 @@ def test_those_are_counted_who_could_play_together() -> None:
     assert here("a", *in_turn("abc", "111"), matching="mixed") == 2
 
 
-def test_members_of_a_group_are_counted_wherever_they_are() -> None:
+def test_the_number_who_are_there_includes_all_members_of_a_proposal_or_session() -> None:
     assert here("a", document=Decisions(proposed=(proposal("ab"),))) == 2
     assert here("a", document=Decisions(formed=(formed("ab"),))) == 2
 
 
-# A document that was made anew, because it could not be read
+# A document that replaces one that could not be read
 
 
-def test_in_a_renewed_document_none_is_proposed_or_unmatched_and_the_rest_goes_on() -> None:
+def test_a_renewed_document_proposes_no_group_and_lets_no_participant_become_unmatched() -> None:
     renewed = Decisions(renewed=ago(5), formed=(formed("ef"),))
     assert decide(lobby(*in_turn("abcd")), renewed) == renewed
     assert rules.give_up(renewed, Unmatched("a", "A", NOW)) is renewed
@@ -502,7 +507,7 @@ def wanted(document: Decisions | None = None, also: Sequence[str] = (), **change
     return servers_ahead.sessions_wanted(document or Decisions(), entries, pairs(**changes), also)
 
 
-def test_a_server_is_wanted_for_every_so_many_who_are_under_way_or_wait() -> None:
+def test_one_server_is_wanted_for_each_group_of_participants_who_are_under_way_or_wait() -> None:
     assert wanted() == 2
     assert wanted(also="d") == 2
     assert wanted(also="e") == 3
@@ -530,7 +535,7 @@ def opened(number: int, *asked: float) -> list[tuple[str, datetime, str]]:
     return [(each.id, each.asked, each.by) for each in found.open]
 
 
-def test_as_many_sessions_are_opened_as_are_missing() -> None:
+def test_as_many_sessions_are_opened_as_are_still_wanted() -> None:
     assert opened(0) == []
     assert opened(2) == [("new.1", NOW, "a"), ("new.2", NOW, "a")]
     assert opened(2, 9) == [("o0", ago(9), ""), ("new.1", NOW, "a")]
@@ -562,7 +567,7 @@ def surplus(number: int, over: Iterable[str] = ()) -> set[str]:
     return set(servers_ahead.surplus(document, number, set(over), NOW, players=2, open_for=OPEN_FOR))
 
 
-def test_open_sessions_beyond_those_wanted_are_surplus_the_last_first() -> None:
+def test_open_sessions_beyond_the_wanted_number_are_surplus_beginning_with_the_last() -> None:
     assert surplus(3) == {"x"}
     assert surplus(9) == {"x"}
     assert surplus(2) == {"x", "c"}
@@ -570,7 +575,7 @@ def test_open_sessions_beyond_those_wanted_are_surplus_the_last_first() -> None:
     assert surplus(2, over="a") == {"x", "a"}
 
 
-def test_open_sessions_can_be_dropped() -> None:
+def test_open_sessions_are_removed_by_id() -> None:
     document = Decisions(open=(OpenSession("a", NOW), OpenSession("b", NOW)), formed=(formed("ab"),))
     assert servers_ahead.without_open(document, ["a", "x"]) == Decisions(
         open=(OpenSession("b", NOW),), formed=document.formed
@@ -580,7 +585,7 @@ def test_open_sessions_can_be_dropped() -> None:
 # Erased
 
 
-def test_of_one_who_is_erased_nothing_stays() -> None:
+def test_nothing_about_an_erased_participant_stays_in_the_decisions() -> None:
     document = Decisions(
         version=4,
         open=(OpenSession("o", ago(9), "a"), OpenSession("n", ago(1), "b")),
@@ -605,7 +610,7 @@ def test_a_session_whose_members_are_all_erased_leaves_the_document() -> None:
     assert rules.without(rules.without(document, "a"), "b") == Decisions()
 
 
-def test_who_is_not_there_takes_nothing_along() -> None:
+def test_erasing_an_unknown_participant_changes_nothing() -> None:
     document = Decisions(open=(OpenSession("o", NOW, "b"),), proposed=(proposal("bc"),), formed=(formed("de"),))
     assert to_json(rules.without(document, "a")) == to_json(document)
 
@@ -619,10 +624,10 @@ def pair_of(labels: str, server: str, at: datetime = NOW) -> Formed:
     return Formed(server, tuple(Matched(label, label.upper()) for label in labels), at, True, ahead)
 
 
-def given(
+def servers_given(
     document: Decisions, *ready: str, over: Sequence[str] = (), coming: Sequence[str] = (), now: datetime = NOW
 ) -> dict[str, tuple[str, bool]]:
-    """Of each session, by its members, the server that it has then, and whether it waits no longer."""
+    """For each session, by its members: the server that it then has, and whether it keeps this server."""
     after = servers_ahead.with_ready_servers(document, ready, over, now, coming=coming, open_for=timedelta(minutes=30))
     waiting = [each for each in after.formed if each.waits_for]
     assert all(each.waits_for and each.waits_for.id == each.id for each in waiting)
@@ -637,58 +642,58 @@ FIRST, SECOND, THIRD = pair_of("ab", "s1", ago(9)), pair_of("cd", "s2", ago(8)),
 THREE = Decisions(formed=(SECOND, FIRST, THIRD))
 
 
-def test_who_was_formed_first_gets_the_server_that_is_ready_first() -> None:
-    assert given(THREE, "s3") == {"ab": ("s3", True), "cd": ("s2", False), "ef": ("s1", False)}
+def test_the_session_that_was_formed_first_gets_the_server_that_is_ready_first() -> None:
+    assert servers_given(THREE, "s3") == {"ab": ("s3", True), "cd": ("s2", False), "ef": ("s1", False)}
 
 
 @pytest.mark.parametrize("ready", ["s2", "s3", "s4"])
-def test_the_server_of_any_session_goes_to_the_one_that_was_formed_first(ready: str) -> None:
+def test_a_ready_server_of_any_session_goes_to_the_session_that_was_formed_first(ready: str) -> None:
     four = Decisions(formed=(FIRST, SECOND, THIRD, pair_of("gh", "s4", ago(6))))
-    assert given(four, ready)["ab"] == (ready, True)
+    assert servers_given(four, ready)["ab"] == (ready, True)
 
 
 def test_a_session_whose_own_server_is_ready_keeps_it() -> None:
-    assert given(THREE, "s1") == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
-    assert given(THREE, "s1", "s2", "s3") == {"ab": ("s1", True), "cd": ("s2", True), "ef": ("s3", True)}
+    assert servers_given(THREE, "s1") == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
+    assert servers_given(THREE, "s1", "s2", "s3") == {"ab": ("s1", True), "cd": ("s2", True), "ef": ("s3", True)}
 
 
 def test_a_ready_server_of_an_open_session_is_given_first() -> None:
     document = Decisions(open=(OpenSession("o", ago(30)),), formed=THREE.formed)
-    assert given(document, "o", "s3") == {"ab": ("o", True), "cd": ("s3", True), "ef": ("s2", False)}
+    assert servers_given(document, "o", "s3") == {"ab": ("o", True), "cd": ("s3", True), "ef": ("s2", False)}
 
 
 def test_an_open_server_that_has_waited_for_too_long_is_not_given() -> None:
     document = Decisions(open=(OpenSession("o", ago(1800)),), formed=(FIRST,))
-    assert given(document, "o") == {"ab": ("s1", False)}
+    assert servers_given(document, "o") == {"ab": ("s1", False)}
 
 
 def test_a_session_keeps_a_server_that_has_ended_unless_an_open_one_is_ready() -> None:
-    assert given(THREE, over=["s1"]) == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
-    assert given(THREE, "s3", over=["s1"]) == {"ab": ("s1", True), "cd": ("s3", True), "ef": ("s2", False)}
+    assert servers_given(THREE, over=["s1"]) == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
+    assert servers_given(THREE, "s3", over=["s1"]) == {"ab": ("s1", True), "cd": ("s3", True), "ef": ("s2", False)}
     document = Decisions(open=(OpenSession("o", ago(30)),), formed=(FIRST,))
-    assert given(document, "o", over=["s1"]) == {"ab": ("o", True)}
+    assert servers_given(document, "o", over=["s1"]) == {"ab": ("o", True)}
 
 
 def test_a_session_whose_server_has_ended_waits_for_an_open_one_that_starts() -> None:
     document = Decisions(open=(OpenSession("p", ago(40)), OpenSession("o", ago(30))), formed=(FIRST, SECOND))
-    assert given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("o", False), "cd": ("s2", False)}
-    assert given(document, over=["s1", "s2"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
-    assert given(document, "s2", over=["s1"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
+    assert servers_given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("o", False), "cd": ("s2", False)}
+    assert servers_given(document, over=["s1", "s2"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
+    assert servers_given(document, "s2", over=["s1"], coming=["o"]) == {"ab": ("o", False), "cd": ("s2", True)}
     late = Decisions(open=(OpenSession("o", ago(1800)),), formed=(FIRST,))
-    assert given(late, over=["s1"], coming=["o"]) == {"ab": ("s1", True)}
+    assert servers_given(late, over=["s1"], coming=["o"]) == {"ab": ("s1", True)}
 
 
 def of(players: int, session: Formed) -> Formed:
-    """The session, of a registration with so many players."""
+    """The session, for a registration with so many players."""
     assert session.waits_for
     return replace(session, players=players, waits_for=replace(session.waits_for, players=players))
 
 
 def test_a_server_is_given_to_a_session_of_as_many_players_as_it_was_started_for() -> None:
     document = Decisions(open=(OpenSession("o", ago(30), players=3),), formed=(of(2, FIRST), of(3, SECOND)))
-    assert given(document, "o") == {"ab": ("s1", False), "cd": ("o", True)}
-    assert given(document, "s2") == {"ab": ("s1", False), "cd": ("s2", True)}
-    assert given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("s1", True), "cd": ("s2", False)}
+    assert servers_given(document, "o") == {"ab": ("s1", False), "cd": ("o", True)}
+    assert servers_given(document, "s2") == {"ab": ("s1", False), "cd": ("s2", True)}
+    assert servers_given(document, over=["s1"], coming=["o", "s2"]) == {"ab": ("s1", True), "cd": ("s2", False)}
 
 
 def test_servers_that_were_started_for_another_number_of_players_are_replaced() -> None:
@@ -701,24 +706,24 @@ def test_servers_that_were_started_for_another_number_of_players_are_replaced() 
 
 
 def test_a_session_that_has_waited_for_five_minutes_keeps_its_server() -> None:
-    assert given(THREE, now=ago(9 - 299)) == {"ab": ("s1", False), "cd": ("s2", False), "ef": ("s3", False)}
-    assert given(THREE, now=ago(9 - 300)) == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
+    assert servers_given(THREE, now=ago(9 - 299)) == {"ab": ("s1", False), "cd": ("s2", False), "ef": ("s3", False)}
+    assert servers_given(THREE, now=ago(9 - 300)) == {"ab": ("s1", True), "cd": ("s2", False), "ef": ("s3", False)}
 
 
-def test_without_a_server_that_is_ready_the_document_stays_as_it_is() -> None:
+def test_without_a_ready_server_the_document_is_unchanged() -> None:
     for document in (THREE, Decisions(open=(OpenSession("o", NOW),)), Decisions()):
         for ready in ([], ["o", "x"]):
             after = servers_ahead.with_ready_servers(document, ready, (), NOW, open_for=timedelta(minutes=30))
             assert after is document
 
 
-def test_a_session_that_has_its_server_for_good_gets_no_other() -> None:
+def test_a_session_that_waits_no_longer_gets_no_other_server() -> None:
     settled = replace(FIRST, waits_for=None)
-    assert given(Decisions(formed=(settled, SECOND)), "s1", "s2") == {"ab": ("s1", True), "cd": ("s2", True)}
-    assert given(Decisions(formed=(settled, SECOND)), "s1") == {"ab": ("s1", True), "cd": ("s2", False)}
+    assert servers_given(Decisions(formed=(settled, SECOND)), "s1", "s2") == {"ab": ("s1", True), "cd": ("s2", True)}
+    assert servers_given(Decisions(formed=(settled, SECOND)), "s1") == {"ab": ("s1", True), "cd": ("s2", False)}
 
 
-def test_only_a_session_that_has_its_server_is_decided_for_good() -> None:
+def test_a_session_that_waits_for_a_server_is_not_decided_yet() -> None:
     settled = replace(FIRST, waits_for=None)
     document = Decisions(formed=(settled, SECOND), unmatched=(Unmatched("z", "Z", NOW),))
     assert [document.is_decided(label) for label in "acz"] == [True, False, True]
@@ -727,7 +732,7 @@ def test_only_a_session_that_has_its_server_is_decided_for_good() -> None:
     assert document.without_server() == [SECOND]
 
 
-def test_one_who_is_erased_is_forgotten_by_the_server_that_started_for_them() -> None:
+def test_the_server_that_started_for_an_erased_participant_no_longer_names_them() -> None:
     waits = replace(FIRST, waits_for=OpenSession("s1", NOW, "a"))
     [left] = rules.without(Decisions(formed=(waits,)), "a").formed
     assert left.waits_for == OpenSession("s1", NOW)

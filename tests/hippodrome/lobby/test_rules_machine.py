@@ -1,7 +1,7 @@
-"""The rules of the lobby under requests that overlap and crash: a stateful machine over a model of the documents.
+"""A stateful machine: the rules of the lobby under requests that overlap and crash, over a model of the documents.
 
-Requests here do what `lobby.py` does, in memory, one step at a time: read, list, be seen or confirm, compare-and-swap,
-carry out. As on S3, a version of the document is known by its bytes alone.
+Requests here do what `lobby.py` does, in memory, one step at a time: read, list, write their entry or confirm,
+compare-and-swap, carry out. As on S3, a version of the document is identified by its bytes alone.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ people = st.sampled_from(PEOPLE)
 
 @dataclass
 class World:
-    """The documents, the people, and what must hold of them whenever one is written."""
+    """The documents, the participants, and checks that run whenever a document is written."""
 
     project: Project
     traits: dict[str, str]
@@ -71,7 +71,7 @@ class World:
     # The document
 
     def change(self, settle: Callable[[Decisions], Decisions], listed: Entries = NONE_LISTED) -> Iterator[None]:
-        """Change the document, by who stood in the lobby when the run listed them."""
+        """Change the document as a run does that has listed these entries; write it if nobody else has."""
         came = {**self.came, **{label: one.joined for label, one in listed.waiting.items()}}
         for _ in range(8):
             before, writes = self.document, self.writes
@@ -134,7 +134,7 @@ class World:
             return max(found.values()) <= (self.project.players + 1) // 2
         return max(found.values()) == 1 if isinstance(self.project.matching, dict) else True
 
-    # What functions do, up to each call
+    # Functions, as generators that pause before each call
 
     def visit(self, who: str) -> Request:
         if who in self.memberships:
@@ -219,7 +219,7 @@ class World:
         made |= {each.label: UNMATCHED for each in decided.unmatched}
         for label, membership in made.items():
             yield
-            kept = self.memberships.setdefault(label, membership)  # created once: of two tabs, one may give up late
+            kept = self.memberships.setdefault(label, membership)  # written once: one of two tabs may give up late
             assert kept == membership or membership == UNMATCHED, "a participant gets another membership"
         for key in [key for label in made for key in entries.keys.get(label, ())]:
             yield
@@ -270,7 +270,7 @@ class Machine(RuleBasedStateMachine):
         shown = [each if each == "-" else each * 10 for each in traits]
         self.world = World(project, dict(zip(PEOPLE, shown, strict=True)))
 
-    # What happens
+    # Events
 
     @rule(who=people)
     def ask(self, who: str) -> None:
@@ -292,7 +292,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(which=st.integers(0, 7))
     def serve(self, which: int) -> None:
-        """A server that was started ahead is ready."""
+        """A server that was started ahead becomes ready."""
         document = self.world.document
         ids = [each.id for each in document.open] + [each.id for each in document.without_server()]
         if ids:
@@ -317,7 +317,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(chance=st.integers(0, 10**6))
     def bustle(self, chance: int) -> None:
-        """Some ask again and again, each request a call or a few at a time, and some close their pages."""
+        """Some participants ask again and again, each request a few calls at a time, and some close their pages."""
         dice = random.Random(chance)
         some = dice.sample(PEOPLE, dice.choice([2, 3, 4, 5]))
         for _ in range(150):
@@ -339,7 +339,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(who=st.permutations(PEOPLE), calls=st.integers(2, 5))
     def be_slow(self, who: list[str], calls: int) -> None:
-        """A request comes to its write after a proposal has come and gone, so that all else stands as it was read."""
+        """A request writes after a proposal has been made and has fallen apart, so that the document has the same content as when it was read."""
         slow, left, other, *_ = who
         self.ask_in_turn([left])
         mine = self.world.visit(slow)
@@ -352,7 +352,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(some=st.sets(people, min_size=1))
     def stay(self, some: set[str]) -> None:
-        """These ask each second, alone: within 16 seconds (a proposal of before, and one of theirs) all who fit play."""
+        """Only these ask, each second. Within 16 seconds (an old proposal falls apart, and one of theirs is made) all who fit play."""
         self.crash_all()
         for _ in range(16):
             for one in sorted(some):
@@ -370,7 +370,7 @@ class Machine(RuleBasedStateMachine):
         if next(self.running[which], self) is self:
             self.running.pop(which)
 
-    # What must be
+    # Invariants
 
     @invariant()
     def memberships_are_those_of_sessions(self) -> None:

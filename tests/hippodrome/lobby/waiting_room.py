@@ -47,7 +47,7 @@ def serve(
 
 @dataclass
 class WaitingRoom:
-    """A lobby, and those who have asked there."""
+    """A lobby, and the answers and groups of the participants who ask there."""
 
     project: Project = field(default_factory=pairs)
     platform: FakePlatform = field(default_factory=FakePlatform)
@@ -59,16 +59,16 @@ class WaitingRoom:
         self.lobby = self.function()
 
     def function(self) -> Lobby:
-        """Another running function, which remembers nothing."""
+        """The lobby of another running function, whose caches are empty."""
         return Lobby(self.platform, Repository(self.platform.documents))
 
     def visit(self, user: str, lobby: Lobby | None = None) -> LobbyState | NoServerYet | Membership:
-        """The participant's page asks."""
+        """A request of the participant's page; its reply."""
         asked = (lobby or self.lobby).visit
         return asked(self.project, user, self.groups.get(user), lambda: self.answers.get(user, {}))
 
     def poll(self, *users: str, seconds: float = 0) -> dict[str, LobbyState | NoServerYet | Membership]:
-        """These pages ask now, and every two seconds for as long; what each is told at last."""
+        """These pages ask now and every two seconds for so many seconds; the last reply to each."""
         told = {user: self.visit(user) for user in users}
         for _ in range(round(seconds / POLL)):
             self.platform.wait(seconds=POLL)
@@ -102,7 +102,7 @@ class WaitingRoom:
         return from_json(found[0], Decisions) if found else Decisions()
 
     def entries(self) -> list[str]:
-        """The names of the entries in the lobby's folder, with participants' ids for their labels where they are known."""
+        """The names of the entries in the lobby's folder, sorted."""
         prefix = folder.folder(self.project.id)
         return [key.removeprefix(prefix) for key in sorted(self.platform.documents.kept) if key.startswith(prefix)]
 
@@ -121,14 +121,14 @@ class WaitingRoom:
         return json.loads(found[0]) if found else None
 
     def arrive_at_start(self, *users: str, ready: bool = True) -> None:
-        """What `start_server` does for their start messages. `ready`: the servers that start are ready at once."""
+        """Do what `start_server` does for their start messages. `ready`: the servers that start are ready at once."""
         for user in users:
             self.lobby.under_way(self.project, StartServer(self.project.id, user).user_id)
         if ready:
             self.serve(*self.started())
 
     def serve(self, *session_ids: str, state: ServerState = ServerState.READY, **changes: Any) -> None:
-        """The servers of these sessions come into this state."""
+        """Set the state of the servers of these sessions."""
         for session_id in session_ids:
             serve(self.platform, self.project, session_id, state, **changes)
 
@@ -137,6 +137,6 @@ class WaitingRoom:
 
 
 def waits(told: LobbyState | NoServerYet | Membership) -> LobbyState:
-    """What a participant is told who still waits."""
+    """The reply to a participant who still waits; fails for any other reply."""
     assert isinstance(told, LobbyState), told
     return told
