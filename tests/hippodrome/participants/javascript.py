@@ -21,10 +21,10 @@ _ENDS = {")", "]", "}", "++", "--"}
 
 
 def tokens(code: str) -> list[str]:
-    """The tokens, without what separates them. A template is its texts and the tokens of the code in it.
+    """The tokens, without the spaces between them. A template gives its texts and the tokens of the code in it.
 
-    What means nothing is left out: a semicolon at the end of a block, and a comma behind the last item of a list.
-    Raises ValueError for what is no token, and for what would begin a comment of HTML or end the script.
+    Left out, because they have no effect: a semicolon at the end of a block, a comma behind the last item of a list.
+    Raises ValueError for text that is no token, that would begin a comment of HTML, or that would end the script.
     """
     found, end = _tokens(code, 0)
     if end != len(code):
@@ -35,7 +35,7 @@ def tokens(code: str) -> list[str]:
 
 
 def _tokens(code: str, at: int) -> tuple[list[str], int]:
-    """Those from `at` to a bracket that closes none of them, and where it stands; or to the end."""
+    """The tokens from `at` up to a closing bracket that was opened before, and its position; or up to the end."""
     found: list[str] = []
     depth = 0
     while (at := _end(_SPACE, code, at)) < len(code) and (depth or code[at] != "}"):
@@ -58,7 +58,7 @@ def _tokens(code: str, at: int) -> tuple[list[str], int]:
 
 
 def _template(code: str, at: int) -> tuple[list[str], int]:
-    """A template that begins at `at`, and where it is over."""
+    """The template that begins at `at`, and the position of its end."""
     found: list[str] = []
     while True:
         part = _TEMPLATE.match(code, at + 1)

@@ -31,7 +31,7 @@ def test_a_json_object_is_kept_as_it_is(answers: dict[str, object]) -> None:
 
 
 @given(st.binary(max_size=2000), st.sampled_from([forms.FORM, forms.JSON, "text/plain", ""]))
-def test_arbitrary_bytes_are_answers_or_a_sentence(body: bytes, kind: str) -> None:
+def test_arbitrary_bytes_are_read_as_answers_or_refused_with_a_sentence(body: bytes, kind: str) -> None:
     try:
         form = forms.read(posted(body, kind))
     except BadForm as bad:
@@ -56,13 +56,13 @@ def test_arbitrary_bytes_are_answers_or_a_sentence(body: bytes, kind: str) -> No
         (b"a=1", "", 415),
     ],
 )
-def test_what_cannot_be_accepted_says_so(body: bytes, kind: str, status: int) -> None:
+def test_a_form_that_cannot_be_accepted_is_refused_with_its_status(body: bytes, kind: str, status: int) -> None:
     with pytest.raises(BadForm) as bad:
         forms.read(posted(body, kind))
     assert bad.value.status == status
 
 
-def test_what_our_frame_added_is_not_an_answer() -> None:
+def test_fields_that_the_frame_adds_are_no_answers() -> None:
     form = forms.read(posted(f"age=3&hippodrome-step=2&hippodrome-ticket={quote_plus('t&=')}".encode()))
     assert (form.answers, form.step, form.ticket) == ({"age": "3"}, "2", "t&=")
 
@@ -107,13 +107,13 @@ def test_a_body_that_could_not_be_decoded_is_refused() -> None:
     assert bad.value.status == 400
 
 
-def test_constants_that_are_no_json_are_refused_by_name() -> None:
+def test_constants_that_are_no_json_are_refused_and_named() -> None:
     for name in ("NaN", "Infinity", "-Infinity"):
         with pytest.raises(BadForm):
             forms.read(posted(f'{{"a": {name}}}'.encode(), forms.JSON))
 
 
-def test_a_field_of_ours_that_came_twice_counts_if_both_say_the_same() -> None:
+def test_a_field_of_the_frame_that_comes_twice_counts_if_both_values_are_the_same() -> None:
     form = forms.read(posted(b"hippodrome-action=again&hippodrome-action=again&hippodrome-step=2&hippodrome-step=3"))
     assert (form.action, form.step, form.answers) == ("again", None, {})
     form = forms.read(

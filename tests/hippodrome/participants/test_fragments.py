@@ -1,4 +1,4 @@
-"""Step pages made fit for the frame, and filled in."""
+"""Step pages are prepared for the frame, and filled in."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BASE = "/steps/demo/"
 
 
 class Tags(HTMLParser):
-    """What an independent parser finds."""
+    """The tags that an independent parser finds."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -82,16 +82,16 @@ def test_text_without_tags_stays_as_it_is(text: str) -> None:
 
 @pytest.mark.parametrize("size", [200_000])
 @pytest.mark.parametrize("piece", ["{{", "<!--", '<a ="', "<script>", "</", "<", "{% a", "<img srcset='a, "])
-def test_time_grows_with_the_page_not_with_its_square(piece: str, size: int) -> None:
+def test_the_time_for_a_page_does_not_grow_with_the_square_of_its_length(piece: str, size: int) -> None:
     began = time.thread_time()
     prepare(piece * (size // len(piece)), BASE)
     assert time.thread_time() - began < 3
 
 
-# What is dropped
+# Tags that are left out
 
 
-def test_what_belongs_to_a_document_goes_and_its_contents_stay() -> None:
+def test_tags_of_a_whole_document_are_left_out_and_their_contents_stay() -> None:
     source = (
         '<!DOCTYPE html><HTML lang="de"><head><meta charset=x><base href="/a"><title>Zu &amp; auf</title>'
         "<style>b{c:d}</style></head><body class=x><form action='http://evil.example' method=get\n>Text</FORM ></body></html>"
@@ -116,11 +116,11 @@ def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
     ("source", "ends"),
     [("<textarea>x", "</textarea>"), ("<script>x", "</script>"), ("<!-- x", "-->"), ("x <b", "&lt;b")],
 )
-def test_what_is_left_open_is_closed(source: str, ends: str) -> None:
+def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, ends: str) -> None:
     assert prepare(source).render({}).endswith(ends)
 
 
-# What is noted
+# Fields and buttons
 
 
 @pytest.mark.parametrize(
@@ -195,11 +195,11 @@ def test_scripts_from_elsewhere_get_it_only_if_the_project_allows_the_host() -> 
     assert ["nonce" in each.named("script")[0] for each in found] == [True, False, False, False]
 
 
-def test_a_nonce_of_the_authors_does_not_count() -> None:
+def test_an_authors_nonce_has_no_effect() -> None:
     assert prepare('<script nonce="old">1</script>').render({}, "N").startswith('<script nonce="N" nonce="old">')
 
 
-def test_clients_with_a_frame_of_their_own_get_no_nonce() -> None:
+def test_a_page_for_clients_with_their_own_frame_has_no_nonce() -> None:
     assert prepare("<script>1</script>").render({}) == "<script>1</script>"
 
 
@@ -233,7 +233,7 @@ def test_a_page_without_expressions_is_no_template() -> None:
     assert prepare(source).render({}) == source
 
 
-def test_what_is_not_there_is_empty() -> None:
+def test_an_unknown_value_is_shown_as_nothing() -> None:
     assert prepare("[{{ a }}{{ b.c.d }}{{ answers['9'].x.y }}]").render({"answers": {}}) == "[]"
 
 
@@ -247,7 +247,7 @@ def test_expressions_in_attributes() -> None:
     assert prepare(source).render({"x": 2}) == '<input name=a checked value="&gt;"><p>'
 
 
-def test_private_characters_are_nothing_special() -> None:
+def test_characters_of_private_use_stay_unchanged() -> None:
     assert prepare("\ue0000\ue001{{ 1 }}\ue000").render({}) == "\ue0000\ue0011\ue000"
 
 
@@ -267,21 +267,21 @@ def test_private_characters_are_nothing_special() -> None:
         ("{{ answers.update({}) }}", 1),
     ],
 )
-def test_a_page_that_fails_says_where(source: str, line: int) -> None:
+def test_a_page_that_fails_names_the_line(source: str, line: int) -> None:
     with pytest.raises(FragmentError) as caught:
         prepare(source).render({"answers": {"1": {}}})
     assert caught.value.line == line
     assert caught.value.message
 
 
-def test_a_page_does_not_grow_without_end() -> None:
+def test_a_page_cannot_grow_without_limit() -> None:
     source = "{% for a in range(9999) %}{% for b in range(9999) %}0123456789{% endfor %}{% endfor %}"
     with pytest.raises(FragmentError, match="2 MB"):
         prepare(source).render({})
 
 
 @given(soup)
-def test_rendering_fails_in_one_way_only(text: str) -> None:
+def test_rendering_raises_fragment_error_only(text: str) -> None:
     try:
         prepare(text, BASE).render({"answers": {}}, "N")
     except FragmentError as error:
@@ -307,29 +307,29 @@ def test_rendering_fails_in_one_way_only(text: str) -> None:
         ("{{ " + "(" * 5000 + " }}", set()),
     ],
 )
-def test_needs(source: str, expected: set[str]) -> None:
+def test_records_mentioned_finds_the_records_that_a_page_needs(source: str, expected: set[str]) -> None:
     assert records_mentioned(source) == expected
 
 
 @given(st.text() | soup)
-def test_needs_never_raises(text: str) -> None:
+def test_records_mentioned_never_raises(text: str) -> None:
     assert all(need.partition(".")[0] in ("participant", "answers") for need in records_mentioned(text))
 
 
-def test_what_is_not_there_is_null_for_scripts() -> None:
+def test_an_unknown_value_is_null_in_scripts() -> None:
     text = prepare('const age = {{ answers["2"].age|tojson }}, x = {{ {"a": participant.b}|tojson }};').render({})
     assert text == 'const age = null, x = {"a": null};'
 
 
 @pytest.mark.parametrize("name", ["script", "style", "textarea", "iframe", "xmp", "noembed", "noframes", "SCRIPT"])
-def test_what_stands_in_a_raw_element_is_no_tag_up_to_its_own_end(name: str) -> None:
+def test_the_content_of_a_raw_element_is_text_up_to_its_own_end_tag(name: str) -> None:
     source = f"<{name}><form><b></{name}x></{name}\n><form><i>"
     assert prepare(source).render({}) == f"<{name}><form><b></{name}x></{name}\n><i>"
     assert prepare(f"<{name}><form>").render({}) == f"<{name}><form></{name.lower()}>"
 
 
 @pytest.mark.parametrize("name", ["html", "head", "body", "form", "meta", "base", "FORM"])
-def test_tags_of_documents_are_dropped_but_for_their_line_ends(name: str) -> None:
+def test_tags_of_a_whole_document_leave_their_line_ends(name: str) -> None:
     assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "a\nb\nc"
 
 
@@ -358,7 +358,7 @@ def test_each_address_of_a_set_points_to_the_projects_files(name: str) -> None:
     assert found == f"<{name} srcset='{BASE}a.png 1x,  {BASE}b.png 2x, https://x.org/c.png 3x'>"
 
 
-def test_only_a_documents_own_title_is_taken_out() -> None:
+def test_only_the_documents_own_title_is_taken_out() -> None:
     drawing = "<svg><title>circle</title></svg>"
     page = prepare(f"{drawing}<svg/><title> The \n {{{{ x }}}} page &amp; more </title>{drawing}")
     assert page.title == "The page & more"
@@ -376,7 +376,7 @@ def test_the_language_of_the_page_is_one_that_a_page_can_have(lang: str, kept: s
 
 
 @pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b"])
-def test_an_expression_that_never_ends_is_text_for_the_tags(source: str) -> None:
+def test_an_expression_that_never_ends_is_text_and_so_are_tags_in_it(source: str) -> None:
     assert prepare(f"{source}<form>").text == source
 
 
@@ -421,7 +421,7 @@ def test_a_page_may_have_two_million_characters() -> None:
 
 
 def work(source: str) -> float:
-    """The processor seconds that preparing a page takes, the less of two times."""
+    """The processor seconds that preparing a page takes: the smaller of two measurements."""
     times = []
     for _ in range(2):
         begun = time.process_time()
@@ -448,7 +448,7 @@ def work(source: str) -> float:
         "\ue0001",
     ],
 )
-def test_a_page_costs_in_proportion_to_its_length_whatever_it_holds(begin: str, again: str) -> None:
+def test_the_work_for_a_page_grows_with_its_length_whatever_it_holds(begin: str, again: str) -> None:
     """Sixteen times the text: about sixteen times the work, and never near the square of it, 256 times."""
     short, long = (begin + again * (size // len(again)) for size in (4_000, 64_000))
     assert work(long) < 80 * max(work(short), 0.001)

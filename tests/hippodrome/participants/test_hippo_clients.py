@@ -16,7 +16,7 @@ from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 from testing.visitors import hidden
 
-AXIOS = "application/json, text/plain, */*"  # what axios accepts (1.x and HIPPO's 0.x)
+AXIOS = "application/json, text/plain, */*"  # the Accept header of axios (1.x, and 0.x as HIPPO has it)
 ALICE = "projectId=maze&userId=alice"
 
 
@@ -42,7 +42,7 @@ def ask(platform: FakePlatform, query: str = ALICE, form: Any = None, **headers:
 ])  # fmt: skip
 @pytest.mark.parametrize("form", [None, {"age": "3"}])
 def test_an_unknown_project_is_not_found(platform: FakePlatform, query: str, form: Any) -> None:
-    """HIPPO's front end shows its page of errors for 400 and waits for ever after 404."""
+    """HIPPO's front end shows its error page for status 400, and waits forever after 404."""
     before = dict(platform.documents.kept)
     status, answer = ask(platform, query, form)
     assert (status, answer["page"]) == (400, "Project ID Not Found")
@@ -71,7 +71,7 @@ def test_a_full_study_is_a_page() -> None:
     assert "This study is full" in answer["page"]
 
 
-def test_the_button_under_a_message_answers_no_step() -> None:
+def test_the_button_under_a_message_answers_no_step_of_the_study() -> None:
     """HIPPO's front end puts a button under every page; the fields that it sends with this one name no step."""
     platform = installed(study(max_participants=1))
     bob = "projectId=maze&userId=bob"
@@ -114,10 +114,10 @@ def test_every_refusal_has_a_page(platform: FakePlatform, query: str, form: Any,
 @pytest.mark.parametrize(("method", "content_type", "body", "status"), [
     ("POST", JSON, json.dumps({"a": "x" * 300_000}), 413), ("POST", "text/plain", "a=1", 415), ("DELETE", JSON, "", 405),
 ])  # fmt: skip
-def test_a_front_end_shows_a_message_instead_of_waiting_for_ever(
+def test_a_front_end_gets_a_status_for_which_it_shows_the_message(
     platform: FakePlatform, method: str, content_type: str, body: str, status: int
 ) -> None:
-    """It acts on 200 and 400 alone. Its button then gets the page that is due; programs get the status itself."""
+    """It acts on statuses 200 and 400 only. Its button then gets the page that is due; other programs get the real status."""
     step = ask(platform)[1]["step"]
     for origin, expected in ({"origin": "https://hippogym.irll.net"}, 200), ({}, status):
         event = http_event(method, ALICE, body, headers={"accept": AXIOS, "content-type": content_type, **origin})
@@ -127,7 +127,7 @@ def test_a_front_end_shows_a_message_instead_of_waiting_for_ever(
         assert ask(platform, ALICE, hidden(json.loads(answer["body"])["page"]))[1]["step"] == step
 
 
-def test_without_an_id_a_program_gets_what_hippo_answers_and_a_browser_gets_an_id(platform: FakePlatform) -> None:
+def test_without_an_id_a_program_gets_hippos_answer_and_a_browser_gets_an_id(platform: FakePlatform) -> None:
     status, answer = ask(platform, "projectId=maze")
     assert (status, answer["page"]) == (400, "Project ID Not Found")
     assert "userId" in answer["message"]
@@ -135,7 +135,7 @@ def test_without_an_id_a_program_gets_what_hippo_answers_and_a_browser_gets_an_i
     assert browser["statusCode"] == 302
 
 
-def test_a_preview_and_a_failure_of_ours_have_a_page(platform: FakePlatform) -> None:
+def test_a_preview_and_an_internal_failure_have_a_page(platform: FakePlatform) -> None:
     status, answer = ask(platform, ALICE + "&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE")
     assert (status, "preview" in answer["page"]) == (200, True)
     working = platform.documents.get
@@ -150,7 +150,7 @@ def test_a_preview_and_a_failure_of_ours_have_a_page(platform: FakePlatform) -> 
     assert "maze/users/alice/answers/1.json" not in platform.documents.kept
 
 
-def test_what_a_message_says_is_text(platform: FakePlatform) -> None:
+def test_names_in_a_message_are_escaped(platform: FakePlatform) -> None:
     place.use(platform := installed(study(name="<script>alert(1)</script>")))
     _, answer = ask(platform, ALICE + "&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE")
     assert "<script>" not in answer["page"]

@@ -1,4 +1,4 @@
-"""What a participant's requests do: next_step, through its handler, on a platform in memory."""
+"""What a participant's requests do: next_step is called through its handler, on a platform in memory."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def to_game(alice: Browser) -> None:
 
 
 def serve(platform: FakePlatform) -> None:
-    """Do what the start message asks for, up to ready."""
+    """Start the server of the start message, up to ready."""
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
     (task,) = platform.tasks.running
@@ -62,14 +62,14 @@ def serve(platform: FakePlatform) -> None:
 
 
 def play(platform: FakePlatform) -> None:
-    """The trial reports that it is done."""
+    """Store the answer that the trial stores when the game is over."""
     platform.documents.put("maze/users/alice/answers/3.json", b'{"step": "3", "answers": {"score": 120}}')
 
 
 # The way through
 
 
-def test_a_participant_walks_from_the_link_to_the_code(platform: FakePlatform, alice: Browser) -> None:
+def test_a_participant_goes_from_the_link_to_the_completion_code(platform: FakePlatform, alice: Browser) -> None:
     assert re.search(r"Do you agree\?|May we\?", alice.get())
     assert alice.answer(alice.get(), consent="yes")["statusCode"] == 303
     assert "Age" in alice.get()
@@ -87,7 +87,7 @@ def test_a_participant_walks_from_the_link_to_the_code(platform: FakePlatform, a
     assert stored(platform, "answers/4.json")["answers"] == {"words": "It was\nfun ☃"}
 
 
-def test_a_get_never_moves_anyone(platform: FakePlatform, alice: Browser) -> None:
+def test_a_get_never_moves_a_participant_on(platform: FakePlatform, alice: Browser) -> None:
     first = alice.get()
     before = dict(platform.documents.kept)
     for _ in range(5):
@@ -100,7 +100,7 @@ def test_the_same_link_resumes_in_any_browser(platform: FakePlatform, alice: Bro
     assert "Age" in Browser(platform).get()
 
 
-def test_a_post_leads_back_to_the_whole_link(platform: FakePlatform) -> None:
+def test_a_post_redirects_to_the_whole_link(platform: FakePlatform) -> None:
     browser = Browser(platform, "projectId=maze&PROLIFIC_PID=abc&STUDY_ID=s%26t")
     response = browser.answer(browser.get(), consent="yes")
     assert response["headers"]["Location"] == "/next?projectId=maze&PROLIFIC_PID=abc&STUDY_ID=s%26t"
@@ -117,7 +117,7 @@ def test_a_link_without_an_id_gets_one_and_keeps_it(platform: FakePlatform) -> N
 
 
 @pytest.mark.parametrize("name", ["PROLIFIC_PID", "workerId", "survey_code"])
-def test_a_recruiters_id_is_the_participants(platform: FakePlatform, name: str) -> None:
+def test_the_recruiters_id_is_the_participants_id(platform: FakePlatform, name: str) -> None:
     Browser(platform, f"projectId=maze&{name}=R2D2").get()
     assert stored(platform, "participant.json", "R2D2")
 
@@ -158,7 +158,7 @@ def test_a_post_for_a_step_not_yet_reached_changes_nothing(
     assert platform.documents.kept == before
 
 
-def test_a_ticket_of_somebody_else_does_not_count(platform: FakePlatform, alice: Browser) -> None:
+def test_the_ticket_of_another_participant_does_not_count(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     bob = Browser(platform, "projectId=maze&userId=bob")
     bob.get()
@@ -166,7 +166,7 @@ def test_a_ticket_of_somebody_else_does_not_count(platform: FakePlatform, alice:
     assert stored(platform, "answers/2.json", "bob") is None
 
 
-def test_nobody_answers_the_game_step_but_the_trial(platform: FakePlatform, alice: Browser) -> None:
+def test_only_the_trial_answers_the_game_step(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     page = alice.get()
     alice.answer(page, score="99999")
@@ -189,7 +189,7 @@ def test_a_final_step_with_questions_is_answered_once() -> None:
     page = alice.get()
     alice.answer(page, mail="a@example.org")
     assert stored(platform, "answers/finalStep.json")["answers"] == {"mail": "a@example.org"}
-    assert "hippodrome-step" not in alice.get()  # there is no form to send any more
+    assert "hippodrome-step" not in alice.get()  # the page has no form any more
 
 
 # Servers
@@ -222,7 +222,7 @@ def test_a_study_may_start_its_server_at_the_link() -> None:
     assert sent(platform) == [(Topic.START, "alice")]
 
 
-def test_a_start_message_that_was_lost_is_sent_again(platform: FakePlatform, alice: Browser) -> None:
+def test_a_lost_start_message_is_sent_again(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     alice.get()
     assert len(sent(platform)) == 1
@@ -231,16 +231,14 @@ def test_a_start_message_that_was_lost_is_sent_again(platform: FakePlatform, ali
     assert sent(platform) == [(Topic.START, "alice")] * 2
 
 
-def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
-    platform: FakePlatform, alice: Browser
-) -> None:
+def test_a_page_asks_again_for_the_replacement_of_a_lost_server(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     serve(platform)
     platform.tasks.running.clear()
     stored_server = Repository(platform.documents).server(ids.server_label("maze", "alice"))
     assert stored_server
     Servers(platform).clean_up_lost(stored_server, server.Reason.LOST)
-    platform.bus.sent.clear()  # as where the function died right then, or the study was closed for a while
+    platform.bus.sent.clear()  # as if the function had crashed just then, or the study had been closed for a while
     alice.get()
     assert not platform.bus.sent
     platform.wait(seconds=31)
@@ -248,7 +246,7 @@ def test_a_lost_server_whose_replacement_nobody_heard_of_is_asked_for_again(
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
-def test_a_server_that_has_not_begun_to_run_for_long_is_asked_for_again(platform: FakePlatform, alice: Browser) -> None:
+def test_a_page_asks_again_for_a_server_that_does_not_run_after_a_while(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     Servers(platform).start(StartServer("maze", "alice"))
     platform.bus.sent.clear()
@@ -262,7 +260,7 @@ def test_a_server_that_has_not_begun_to_run_for_long_is_asked_for_again(platform
     assert len(platform.tasks.running) == 1
 
 
-def test_a_server_of_before_the_steps_were_numbered_anew_is_stopped_and_another_may_be_asked_for(
+def test_a_server_from_before_the_steps_were_renumbered_is_stopped_and_may_be_replaced(
     platform: FakePlatform, alice: Browser
 ) -> None:
     to_game(alice)
@@ -286,7 +284,7 @@ def test_a_server_of_before_the_steps_were_numbered_anew_is_stopped_and_another_
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
-def test_a_message_is_out_before_the_answer_that_calls_for_it(platform: FakePlatform, alice: Browser) -> None:
+def test_the_start_message_is_sent_before_the_answer_is_stored(platform: FakePlatform, alice: Browser) -> None:
     page = alice.get()
 
     def crash() -> None:
@@ -306,7 +304,7 @@ def poll(alice: Browser, step: str = "3") -> Any:
     return json.loads(response["body"])
 
 
-def test_the_waiting_page_tells_the_truth(platform: FakePlatform, alice: Browser) -> None:
+def test_the_waiting_page_gets_the_servers_present_state(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     assert poll(alice)["state"] == "queued"
     platform.wait(seconds=7)
@@ -344,7 +342,9 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
-def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: FakePlatform, alice: Browser) -> None:
+def test_a_participant_whose_server_was_lost_sees_that_another_replaces_it(
+    platform: FakePlatform, alice: Browser
+) -> None:
     to_game(alice)
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
@@ -360,7 +360,7 @@ def test_whoever_lost_a_server_is_told_that_another_takes_its_place(platform: Fa
 
 
 def program(alice: Browser, form: dict[str, str] | None = None) -> dict[str, Any]:
-    """What HIPPO's front end gets, with a form after a click on its button."""
+    """The answer that HIPPO's front end gets; with `form`, after a click on its button."""
     sent, method = (None, "GET") if form is None else (json.dumps(form), "POST")
     response = alice.send(method, sent, accept="application/json, text/plain, */*", content_type="application/json")
     found: dict[str, Any] = json.loads(response["body"])
@@ -370,7 +370,7 @@ def program(alice: Browser, form: dict[str, str] | None = None) -> dict[str, Any
 def test_a_program_whose_game_was_lost_gets_a_page_whose_button_makes_it_poll(
     platform: FakePlatform, alice: Browser
 ) -> None:
-    """HIPPO's front end asks once when its connection ends, and polls only after a form that is answered with `wait`."""
+    """HIPPO's front end asks once when its connection ends. It polls only after a form that is answered with `wait`."""
     to_game(alice)
     serve(platform)
     assert program(alice)["page"] == "show_game_page"
@@ -401,7 +401,7 @@ def test_a_program_whose_game_is_over_gets_a_page_that_asks_for_another_server(
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
-def test_a_program_that_gets_no_more_servers_is_told_so(platform: FakePlatform, alice: Browser) -> None:
+def test_a_program_that_gets_no_more_servers_gets_a_page_that_says_so(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     last = server.stopped_before_start("maze", "alice", MAX_ATTEMPTS, platform.now())
     platform.documents.put(server.key(last.label), to_json(last))
@@ -411,7 +411,7 @@ def test_a_program_that_gets_no_more_servers_is_told_so(platform: FakePlatform, 
         assert "restart" not in page
 
 
-def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Browser) -> None:
+def test_a_participant_gets_at_most_eight_servers(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     last = server.stopped_before_start("maze", "alice", MAX_ATTEMPTS, platform.now())
     platform.documents.put(server.key(last.label), to_json(last))
@@ -426,7 +426,7 @@ def test_nobody_gets_more_servers_than_eight(platform: FakePlatform, alice: Brow
 # Programs (HIPPO's front end)
 
 
-def test_a_program_gets_hippos_contract(platform: FakePlatform, alice: Browser) -> None:
+def test_a_program_gets_answers_as_from_hippo(platform: FakePlatform, alice: Browser) -> None:
     def ask(method: str = "GET", body: object = None) -> Any:
         sent = json.dumps(body) if body is not None else None
         response = alice.send(method, sent, accept="application/json, text/plain, */*", content_type="application/json")
@@ -470,9 +470,7 @@ def test_a_program_gets_hippos_contract(platform: FakePlatform, alice: Browser) 
         ("&".join(f"a{n}=1" for n in range(100)), 400),
     ],
 )
-def test_a_broken_link_gets_a_page_that_says_so_and_changes_nothing(
-    platform: FakePlatform, query: str, status: int
-) -> None:
+def test_a_broken_link_gets_an_error_page_and_changes_nothing(platform: FakePlatform, query: str, status: int) -> None:
     before = dict(platform.documents.kept)
     response = Browser(platform, query).send()
     assert response["statusCode"] == status
@@ -481,7 +479,7 @@ def test_a_broken_link_gets_a_page_that_says_so_and_changes_nothing(
     assert platform.documents.kept == before
 
 
-def test_the_page_without_a_study_says_what_a_link_looks_like(platform: FakePlatform) -> None:
+def test_the_page_without_a_study_shows_the_form_of_a_link(platform: FakePlatform) -> None:
     assert "projectId=" in Browser(platform, "").get()
 
 
@@ -503,7 +501,7 @@ def test_a_study_that_is_not_live_does_not_exist() -> None:
         ("&".join(f"f{n}=" for n in range(30_000)), FORM, 400),
     ],
 )
-def test_answers_that_cannot_be_kept_are_refused_and_nobody_moves(
+def test_answers_that_cannot_be_stored_are_refused_and_the_participant_stays_at_the_step(
     platform: FakePlatform, alice: Browser, body: str | bytes, kind: str, status: int
 ) -> None:
     alice.get()
@@ -518,10 +516,10 @@ def test_answers_that_cannot_be_kept_are_refused_and_nobody_moves(
     ("body", "kind", "why"),
     [
         ("a=" + "x" * 300_000, FORM, "Zu lang."),
-        ("a=1", "text/plain", "Answers are accepted from a form or as JSON"),  # no page of ours sends it
+        ("a=1", "text/plain", "Answers are accepted from a form or as JSON"),  # no page of Hippodrome sends such a form
     ],
 )
-def test_a_form_is_refused_in_the_words_of_the_study(body: str, kind: str, why: str) -> None:
+def test_a_form_is_refused_in_the_studys_own_words(body: str, kind: str, why: str) -> None:
     words = {
         "language": "de",
         "notSaved": "Nicht gespeichert",
@@ -542,7 +540,7 @@ def test_no_request_makes_the_function_fail(query: str, body: bytes, method: str
     assert response["statusCode"] < 500
 
 
-def test_a_failure_becomes_a_sentence_and_is_logged_without_what_was_sent(
+def test_a_failure_becomes_a_sentence_and_its_log_holds_no_answer(
     platform: FakePlatform, alice: Browser, log: io.StringIO
 ) -> None:
     page = alice.get()
@@ -561,8 +559,8 @@ def test_a_failure_becomes_a_sentence_and_is_logged_without_what_was_sent(
     assert "alice" not in response["body"] + logged
 
 
-def test_no_id_and_no_answer_is_logged_on_the_whole_way(platform: FakePlatform, log: io.StringIO) -> None:
-    test_a_participant_walks_from_the_link_to_the_code(platform, Browser(platform))
+def test_no_id_and_no_answer_is_logged_in_a_whole_study(platform: FakePlatform, log: io.StringIO) -> None:
+    test_a_participant_goes_from_the_link_to_the_completion_code(platform, Browser(platform))
     logged = log.getvalue()
     assert "answered" in logged
     for secret in ("alice", "snowman", "fun", "33"):
@@ -580,7 +578,7 @@ def test_script_in_an_answer_is_shown_as_text() -> None:
     assert "<script>y" not in page
 
 
-def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePlatform) -> None:
+def test_only_pictures_beside_the_pages_are_served(platform: FakePlatform) -> None:
     platform.documents.put("maze/steps/maze.png", b"\x89PNG")
     place.use(platform)
 
@@ -596,7 +594,7 @@ def test_pictures_beside_the_pages_are_served_and_nothing_else(platform: FakePla
         assert ask(path)["statusCode"] == 404
 
 
-def test_pages_travel_compressed_to_browsers_that_can_read_it(platform: FakePlatform, alice: Browser) -> None:
+def test_pages_are_compressed_for_browsers_that_accept_it(platform: FakePlatform, alice: Browser) -> None:
     plain = alice.send()
     for accepts, packed in [
         ("gzip, deflate, br", True),
@@ -632,7 +630,7 @@ def test_a_page_is_read_again_when_its_project_is_registered_anew(platform: Fake
     assert "A better page" in alice.get()
 
 
-def test_a_page_that_mentions_an_answer_reads_that_one_alone(platform: FakePlatform, alice: Browser) -> None:
+def test_a_page_that_mentions_an_answer_reads_only_this_answer(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     play(platform)
     alice.answer(alice.get(), words="x")
@@ -642,7 +640,7 @@ def test_a_page_that_mentions_an_answer_reads_that_one_alone(platform: FakePlatf
     assert "120" in alice.get()
 
 
-def test_what_a_warm_request_asks_of_aws(platform: FakePlatform, alice: Browser) -> None:
+def test_the_aws_calls_of_requests_with_a_full_cache(platform: FakePlatform, alice: Browser) -> None:
     for key in range(5):  # warm: project and pages are in the cache
         Browser(platform, f"projectId=maze&userId=u{key}").get()
     alice.query = "projectId=maze&userId=alice"
@@ -655,7 +653,7 @@ def test_what_a_warm_request_asks_of_aws(platform: FakePlatform, alice: Browser)
     assert calls(platform, lambda: poll(alice)) == ["get"]
 
 
-def test_an_answer_costs_the_same_bytes_whatever_came_before(platform: FakePlatform, alice: Browser) -> None:
+def test_the_size_of_an_answer_does_not_depend_on_earlier_requests(platform: FakePlatform, alice: Browser) -> None:
     for _ in range(20):
         alice.get()
     alice.answer(alice.get(), consent="yes")

@@ -55,7 +55,7 @@ def keep(platform: FakePlatform, *names: str) -> None:
 
 
 @pytest.mark.parametrize("ending", KINDS)
-def test_each_kind_of_file_is_served_as_what_it_is_and_can_do_nothing(platform: FakePlatform, ending: str) -> None:
+def test_each_kind_of_file_is_served_with_its_content_type_in_a_sandbox(platform: FakePlatform, ending: str) -> None:
     keep(platform, f"a.b.{ending}", f"A.{ending.upper()}")
     for name in (f"a.b.{ending}", f"A.{ending.upper()}"):
         headers = ask(f"/steps/maze/{name}")["headers"]
@@ -65,7 +65,7 @@ def test_each_kind_of_file_is_served_as_what_it_is_and_can_do_nothing(platform: 
 
 
 @pytest.mark.parametrize("name", [".png", ".hidden.png", "a\u200b.png", "x" * 197 + ".png", "a.html"])
-def test_a_file_that_is_hidden_unprintable_too_long_or_of_another_kind_is_not_there(
+def test_a_file_that_is_hidden_unprintable_too_long_or_of_another_kind_is_not_found(
     platform: FakePlatform, name: str
 ) -> None:
     keep(platform, name)
@@ -84,7 +84,7 @@ def test_only_files_of_a_live_study_are_served(platform: FakePlatform, path: str
     assert ask(path)["statusCode"] == 404
 
 
-def test_other_methods_are_refused_and_options_says_who_may_ask(platform: FakePlatform) -> None:
+def test_other_methods_are_refused_and_options_allows_all_origins(platform: FakePlatform) -> None:
     assert ask("/next", "DELETE")["statusCode"] == 405
     answer = ask("/next", "OPTIONS")
     assert (answer["statusCode"], answer["headers"]["Access-Control-Allow-Origin"]) == (204, "*")
@@ -93,11 +93,11 @@ def test_other_methods_are_refused_and_options_says_who_may_ask(platform: FakePl
 @pytest.mark.parametrize(
     ("query", "status"), [("", 200), ("a=1", 404), ("projectId=none", 404), ("projectId=a%20b", 404)]
 )
-def test_a_link_without_a_study_is_answered(platform: FakePlatform, query: str, status: int) -> None:
+def test_a_link_without_a_study_gets_an_error(platform: FakePlatform, query: str, status: int) -> None:
     assert Browser(platform, query).send()["statusCode"] == status
 
 
-def test_what_the_recruiters_link_carries_is_kept_within_limits(platform: FakePlatform) -> None:
+def test_fields_of_the_recruiters_link_are_stored_within_limits(platform: FakePlatform) -> None:
     long = f"{'n' * 64}={'v' * 300}&{'m' * 65}=x"
     Browser(platform, f"projectId=maze&userId=alice&poll=1&SESSION=7&{long}").send()
     link = "projectId=maze&userId=alice&SESSION=7"
@@ -107,7 +107,7 @@ def test_what_the_recruiters_link_carries_is_kept_within_limits(platform: FakePl
     assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code")
 
 
-def test_a_poll_tells_the_step_that_it_was_asked_for(platform: FakePlatform) -> None:
+def test_the_answer_to_a_poll_names_the_step_that_was_asked_for(platform: FakePlatform) -> None:
     alice = Browser(platform)
     to_game(alice)
     for step, told in (("3", "3"), ("4", "4"), ("none", "3")):
@@ -115,7 +115,7 @@ def test_a_poll_tells_the_step_that_it_was_asked_for(platform: FakePlatform) -> 
         assert json.loads(body)["step"] == told
 
 
-def test_a_start_that_nobody_heard_is_repeated_after_half_a_minute_and_not_before(platform: FakePlatform) -> None:
+def test_a_start_message_without_effect_is_repeated_after_half_a_minute(platform: FakePlatform) -> None:
     alice = Browser(platform)
     to_game(alice)
     for seconds, repeated in ((30, 0), (1, 1)):
@@ -125,7 +125,7 @@ def test_a_start_that_nobody_heard_is_repeated_after_half_a_minute_and_not_befor
         assert len(platform.bus.sent) == repeated
 
 
-def test_a_game_at_the_first_step_asks_for_its_server_with_each_load_until_it_is_heard() -> None:
+def test_a_game_at_the_first_step_sends_a_start_message_with_each_load() -> None:
     steps = study().steps
     platform = installed(study(steps=[steps[2], steps[4]], events=Events("3", "finalStep")))
     alice = Browser(platform)

@@ -46,7 +46,7 @@ def platform(project: Project) -> Iterator[FakePlatform]:
 
 
 class Player(Browser):
-    """A participant's browser at the game step: its page, and what its polls are told."""
+    """A participant's browser at the game step: its page, and the answers to its polls."""
 
     def __init__(self, platform: FakePlatform, user: str, query: str = "") -> None:
         super().__init__(platform, f"projectId=maze&userId={user}{query}")
@@ -59,19 +59,19 @@ class Player(Browser):
 
     @property
     def data(self) -> dict[str, Any]:
-        """What the page hands to its script."""
+        """The data that the page hands to its script."""
         found = re.search(r'<script type="application/json"[^>]*>(.*?)</script>', self.get(), re.DOTALL)
         assert found
         return dict(json.loads(found[1]))
 
     def poll(self, address: str | None = None) -> dict[str, Any]:
-        """What the page's poll address answers."""
+        """The answer of the page's poll address."""
         query = urlsplit(address or self.data["poll"]).query
         answer = next_step.handler(http_event("GET", query, None, headers={"accept": "application/json"}), None)
         return {"status": answer["statusCode"], **json.loads(answer["body"])}
 
     def close(self, page: str, **changes: str) -> int:
-        """What the page sends when it is closed; the status of the answer."""
+        """Send what the page sends when it is closed; the status of the answer."""
         fields = {**hidden(page), "hippodrome-action": "leave", **changes}
         body = "&".join(f"{name}={value}" for name, value in fields.items())
         return int(self.send("POST", body, content_type=FORM)["statusCode"])
@@ -82,7 +82,7 @@ def waiting(platform: FakePlatform) -> list[str]:
 
 
 def matched(platform: FakePlatform, *players: Player) -> list[dict[str, Any]]:
-    """Their polls, when they are in a session."""
+    """Poll until these players are in a session; the answers to their last polls."""
     addresses = [player.data["poll"] for player in players]
     for _ in range(4):
         platform.wait(seconds=2)
@@ -107,7 +107,7 @@ def serve_owner(platform: FakePlatform, owner: str) -> str:
     return SecretCache(platform.documents).token(named)
 
 
-def test_the_lobby_tells_how_many_are_there_and_what_happens_at_the_end(platform: FakePlatform) -> None:
+def test_the_lobby_shows_how_many_are_there_and_what_happens_when_patience_ends(platform: FakePlatform) -> None:
     ann = Player(platform, "ann").to_game()
     state = ann.data["state"]
     assert state["state"] == "lobby"
@@ -136,7 +136,7 @@ def test_a_pair_gets_one_server_and_each_a_token_of_their_own(platform: FakePlat
     assert token not in json.dumps(told)
 
 
-def test_who_is_not_matched_goes_on_and_their_pages_can_tell(platform: FakePlatform, project: Project) -> None:
+def test_an_unmatched_participant_goes_on_and_pages_can_show_it(platform: FakePlatform, project: Project) -> None:
     said = b"{% if participant.unmatched %}alone{% else %}together {{ participant.members }}{% endif %} {{ completion_code }}"
     for page in ("survey", "debrief"):
         platform.documents.put(step_key("maze", page), said)
@@ -176,7 +176,7 @@ def test_members_of_a_session_are_not_unmatched(platform: FakePlatform) -> None:
     assert "False 2" in ann.get()
 
 
-def test_a_closed_page_is_out_at_once_and_the_answer_is_no_redirect(platform: FakePlatform) -> None:
+def test_a_participant_who_closes_the_page_leaves_the_lobby_at_once_without_a_redirect(platform: FakePlatform) -> None:
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     page = ann.get()
     platform.wait(seconds=2)
@@ -185,7 +185,7 @@ def test_a_closed_page_is_out_at_once_and_the_answer_is_no_redirect(platform: Fa
     assert bob.data["state"]["here"] == 1
 
 
-def test_leaving_takes_the_ticket_of_the_step(platform: FakePlatform) -> None:
+def test_leaving_the_lobby_needs_the_ticket_of_the_step(platform: FakePlatform) -> None:
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     page = ann.get()
     assert ann.close(page, **{"hippodrome-ticket": "0" * 32}) == 204
@@ -202,7 +202,7 @@ def test_leaving_changes_nothing_for_a_member(platform: FakePlatform) -> None:
 
 
 @pytest.mark.parametrize("query", ["poll=3", "poll=3&ticket=0", "poll=1&ticket=0", "poll=", "poll=3&ticket=%00"])
-def test_polling_for_another_participant_takes_their_ticket(platform: FakePlatform, query: str) -> None:
+def test_polling_for_another_participant_needs_their_ticket(platform: FakePlatform, query: str) -> None:
     Player(platform, "ann").to_game()
     before = dict(platform.documents.kept)
     mallory = Player(platform, "ann")
@@ -234,7 +234,7 @@ def test_a_signed_link_is_needed_where_links_are_signed() -> None:
     place.use(None)
 
 
-def test_a_form_for_another_server_is_for_the_sessions(platform: FakePlatform) -> None:
+def test_a_form_for_another_server_asks_for_the_sessions_next_server(platform: FakePlatform) -> None:
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     matched(platform, ann, bob)
     serve(platform)
@@ -253,7 +253,7 @@ def test_a_form_for_another_server_is_for_the_sessions(platform: FakePlatform) -
     assert [m["userId"] for topic, m in platform.bus.sent if topic is Topic.START] == [membership.session]
 
 
-def test_a_program_waits_in_the_lobby_with_hippos_word(platform: FakePlatform) -> None:
+def test_a_program_in_the_lobby_gets_the_page_wait_as_from_hippo(platform: FakePlatform) -> None:
     ann = Player(platform, "ann").to_game()
     answer = json.loads(ann.send(accept="application/json")["body"])
     assert (answer["page"], answer["state"]) == ("wait", "lobby")
@@ -269,10 +269,10 @@ def told_of(browser: Browser) -> tuple[int, str]:
     return answer["statusCode"], re.sub(r"nonce[-=\"'\w]+", "", answer["body"])
 
 
-def test_members_who_end_their_game_after_the_study_is_closed_are_told_what_one_alone_is(
+def test_members_whose_game_ends_after_the_study_is_closed_get_the_same_answer_as_a_single_player(
     platform: FakePlatform, project: Project
 ) -> None:
-    """And go on where they were, once it is open again: docs/config.md, "closing"."""
+    """When the study is open again, they go on where they were: docs/config.md, "closing"."""
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     matched(platform, ann, bob)
     addresses = [player.data["poll"] for player in (ann, bob)]
@@ -322,8 +322,8 @@ def register_three(platform: FakePlatform) -> None:
     platform.wait(seconds=11)
 
 
-def test_the_page_of_a_pair_stays_that_of_a_pair(platform: FakePlatform) -> None:
-    """Also before its server has a record, and after it has one."""
+def test_the_page_of_a_pair_stays_that_of_a_pair_when_another_number_is_registered(platform: FakePlatform) -> None:
+    """Both before and after its server has a record."""
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     matched(platform, ann, bob)
     register_three(platform)
@@ -336,7 +336,7 @@ def test_the_page_of_a_pair_stays_that_of_a_pair(platform: FakePlatform) -> None
         serve(platform)
 
 
-def test_the_start_message_that_a_pairs_page_sends_again_says_that_it_is_a_pair(platform: FakePlatform) -> None:
+def test_a_start_message_that_a_pairs_page_sends_again_is_for_two_players(platform: FakePlatform) -> None:
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     matched(platform, ann, bob)
     register_three(platform)
@@ -347,7 +347,7 @@ def test_the_start_message_that_a_pairs_page_sends_again_says_that_it_is_a_pair(
     assert message["players"] == 2
 
 
-def test_who_waits_in_the_lobby_is_told_of_the_new_number_by_page_and_poll(platform: FakePlatform) -> None:
+def test_a_participant_in_the_lobby_gets_the_new_number_of_players_by_page_and_poll(platform: FakePlatform) -> None:
     ann = Player(platform, "ann").to_game()
     assert ann.data["players"] == 2
     register_three(platform)
@@ -356,7 +356,7 @@ def test_who_waits_in_the_lobby_is_told_of_the_new_number_by_page_and_poll(platf
     assert "3 people play this game together." in ann.get()
 
 
-def test_a_page_that_a_pairs_registration_named_and_that_is_gone_is_left_out(platform: FakePlatform) -> None:
+def test_a_missing_page_that_the_pairs_earlier_registration_named_is_left_out(platform: FakePlatform) -> None:
     ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
     matched(platform, ann, bob)
     before = study(**{**STUDY, "trial": {**STUDY["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"}})
@@ -384,8 +384,10 @@ def for_one() -> Iterator[FakePlatform]:
     place.use(None)
 
 
-def test_who_plays_alone_stays_in_their_own_game_when_several_players_are_registered(for_one: FakePlatform) -> None:
-    """Their page, as it is and loaded again, is that of their server; whoever comes next is in the lobby."""
+def test_a_participant_who_plays_alone_stays_in_their_own_game_when_several_players_are_registered(
+    for_one: FakePlatform,
+) -> None:
+    """The open page, and the page when it is loaded again, is that of their server; the next participant is in the lobby."""
     ann = Player(for_one, "ann").to_game()
     token = serve_owner(for_one, "ann")
     address, before = ann.data["poll"], ann.data
@@ -400,9 +402,7 @@ def test_who_plays_alone_stays_in_their_own_game_when_several_players_are_regist
 
 
 @pytest.mark.parametrize("how", ["lost", "stopped"])
-def test_their_own_game_is_theirs_while_there_is_a_server_or_the_next_one_comes(
-    for_one: FakePlatform, how: str
-) -> None:
+def test_participants_keep_their_own_game_while_it_has_a_server_or_a_next_one(for_one: FakePlatform, how: str) -> None:
     ann = Player(for_one, "ann").to_game()
     serve_owner(for_one, "ann")
     address = ann.data["poll"]
@@ -421,7 +421,7 @@ def test_their_own_game_is_theirs_while_there_is_a_server_or_the_next_one_comes(
         assert ann.data["state"]["state"] == "lobby"
 
 
-def test_the_page_of_one_who_waits_for_a_server_that_does_not_start_is_loaded_again_and_is_the_lobby(
+def test_a_participant_whose_own_server_has_not_started_gets_the_lobby(
     for_one: FakePlatform,
 ) -> None:
     ann = Player(for_one, "ann").to_game()
@@ -431,7 +431,9 @@ def test_the_page_of_one_who_waits_for_a_server_that_does_not_start_is_loaded_ag
     assert ann.data["state"]["state"] == "lobby"
 
 
-def test_a_poll_without_a_ticket_is_refused_where_several_players_were_registered_first(platform: FakePlatform) -> None:
+def test_a_poll_without_a_ticket_is_refused_if_the_first_registration_was_for_several_players(
+    platform: FakePlatform,
+) -> None:
     Player(platform, "ann").to_game()
     answer = next_step.handler(
         http_event("GET", "projectId=maze&userId=ann&poll=3", None, headers={"accept": "application/json"}), None
@@ -439,7 +441,7 @@ def test_a_poll_without_a_ticket_is_refused_where_several_players_were_registere
     assert answer["statusCode"] == 403
 
 
-def test_a_page_that_only_the_registration_for_one_named_and_that_is_gone_is_left_out(for_one: FakePlatform) -> None:
+def test_a_missing_page_that_only_the_registration_for_one_player_named_is_left_out(for_one: FakePlatform) -> None:
     ann = Player(for_one, "ann").to_game()
     serve_owner(for_one, "ann")
     before = study(trial={**ONE["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"})
@@ -451,10 +453,10 @@ def test_a_page_that_only_the_registration_for_one_named_and_that_is_gone_is_lef
     assert 'id="text-instructions"' not in page
 
 
-def test_who_has_become_a_member_plays_with_others_whatever_server_of_their_own_has_been_started(
+def test_a_member_plays_with_the_others_even_if_a_server_of_their_own_was_started(
     for_one: FakePlatform,
 ) -> None:
-    """By a function that had not read the registration yet. A page that was made for one is loaded again."""
+    """A function that had not read the new registration has started that server. A page that was made for one player is loaded again."""
     ann = Player(for_one, "ann").to_game()
     address = ann.data["poll"]
     register_two(for_one)
@@ -468,7 +470,7 @@ def test_who_has_become_a_member_plays_with_others_whatever_server_of_their_own_
 
 
 def start_for_one(platform: FakePlatform, user: str) -> None:
-    """Start the participant's own server as a function does that knows the registration for one player."""
+    """Start the participant's own server, as a function does that still knows the registration for one player."""
     other = installed(study(**ONE))
     serve_owner(other, user)
     key = server.key(ids.server_label("maze", user))
@@ -476,10 +478,10 @@ def start_for_one(platform: FakePlatform, user: str) -> None:
     place.use(platform)
 
 
-def test_a_function_that_has_not_read_the_registration_for_several_yet_reads_it_for_the_poll_of_the_lobby(
+def test_a_function_with_an_old_registration_reads_the_new_one_for_a_poll_of_the_lobby(
     for_one: FakePlatform,
 ) -> None:
-    """Else the page would take the participant for matched."""
+    """Otherwise the page would treat the participant as matched."""
     ann = Player(for_one, "ann").to_game()
     assert ann.data["state"]["state"] == "queued"
     for_one.documents.keep(MASTER_LIST, to_json(MasterList([study(**STUDY).following(study(**ONE))])))

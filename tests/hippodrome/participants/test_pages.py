@@ -109,7 +109,7 @@ def kinds() -> dict[str, Page]:
 
 
 @pytest.mark.parametrize("kind", kinds())
-def test_nothing_runs_but_what_carries_the_pages_nonce(kind: str) -> None:
+def test_only_scripts_and_styles_with_the_pages_nonce_may_run(kind: str) -> None:
     page = kinds()[kind]
     found = policy(page.headers)
     (source,) = found["script-src"]
@@ -126,7 +126,7 @@ def test_nothing_runs_but_what_carries_the_pages_nonce(kind: str) -> None:
     assert "camera=()" in page.headers["Permissions-Policy"]
 
 
-def test_every_page_has_a_nonce_of_its_own() -> None:
+def test_every_page_has_its_own_nonce() -> None:
     assert len({str(policy(step("x").headers)["script-src"]) for _ in range(20)}) == 20
 
 
@@ -146,7 +146,7 @@ def test_allowed_hosts_show_pictures_and_cannot_add_directives() -> None:
 
 
 @pytest.mark.parametrize("kind", kinds())
-def test_nothing_is_loaded_from_other_hosts(kind: str) -> None:
+def test_pages_load_nothing_from_other_hosts(kind: str) -> None:
     for _, attrs in Elements(kinds()[kind].html).all:
         for name in ("src", "href", "srcset", "poster"):
             assert not re.match(r"(https?:)?//", attrs.get(name) or "")
@@ -155,7 +155,7 @@ def test_nothing_is_loaded_from_other_hosts(kind: str) -> None:
 # Step pages
 
 
-def test_the_frame_owns_the_one_form() -> None:
+def test_the_only_form_is_that_of_the_frame() -> None:
     found = Elements(step('<form action="/evil" id=f><input name=age></form></form><form>').html)
     assert found.named("form") == [
         {"class": "page", "method": "post", "action": "/next?a=1&b=2", "accept-charset": "utf-8"}
@@ -165,20 +165,20 @@ def test_the_frame_owns_the_one_form() -> None:
 
 
 @pytest.mark.parametrize(("source", "ours"), [("<input name=a>", 1), ("x", 1), ("<button>Mine</button>", 0)])
-def test_a_button_is_added_where_there_is_none(source: str, ours: int) -> None:
+def test_a_page_without_a_button_gets_one(source: str, ours: int) -> None:
     html = step(source).html
     assert html.count(">Continue</button>") == ours
     assert len(Elements(html).named("button")) == 1
 
 
-def test_a_final_step_of_a_type_with_a_form_has_its_button_even_without_fields() -> None:
+def test_a_final_step_of_a_type_with_a_form_has_a_button_even_without_fields() -> None:
     asked = step("<p>Take a break.</p>", at=4, has_form=True)
     assert (">Send<" in asked.html, 'data-done=""' in asked.html) == (True, False)
     answered = step("<p>Take a break.</p>", at=4, has_form=True, answered=True)
     assert (">Send<" in answered.html, 'data-done=""' in answered.html) == (False, True)
 
 
-def test_the_final_page_asks_only_if_it_has_questions() -> None:
+def test_the_final_page_has_a_form_only_if_it_has_questions() -> None:
     assert "<form" not in step("<h1>Bye</h1>", at=4).html
     asking = step("<input name=a>", at=4).html
     assert ">Send</button>" in asking
@@ -189,7 +189,7 @@ def test_the_final_page_asks_only_if_it_has_questions() -> None:
     assert "disabled" in saved.named("fieldset")[0]
 
 
-def test_a_problem_is_told_first() -> None:
+def test_a_problem_is_shown_as_an_alert() -> None:
     found = Elements(step("<h1>Q</h1>", problem="Too <long>.").html)
     assert [attrs for _, attrs in found.all if attrs.get("role") == "alert"]
     assert "Too <long>." in found.text
@@ -212,7 +212,7 @@ def test_there_is_always_one_main_heading(source: str) -> None:
     assert len(Elements(step(source).html).named("h1")) == 1
 
 
-def test_a_page_in_a_language_from_right_to_left_says_so() -> None:
+def test_a_page_in_a_right_to_left_language_has_the_attribute_dir() -> None:
     study = msgspec.structs.replace(PROJECT, texts={"language": "ar"})
 
     def in_study(source: str) -> Page:
@@ -255,7 +255,7 @@ def test_a_broken_page_raises_with_its_line() -> None:
     assert caught.value.line == 2
 
 
-def test_clients_with_their_own_frame_get_the_researchers_part_and_the_fields_that_name_the_step() -> None:
+def test_clients_with_their_own_frame_get_the_researchers_page_with_the_step_and_ticket_fields() -> None:
     text = pages.fragment(step_view("<form>\n<p>{{ completion_code }}<script>1</script><input name=a></form>"))
     named = '<input type="hidden" name="hippodrome-step" value="2">\n<input type="hidden" name="hippodrome-ticket" value="TICKET">\n'
     assert text == f"{named}\n<p>CODE<script>1</script><input name=a>"
@@ -285,13 +285,13 @@ def data_of(page: Page) -> Any:
     ("state", "present", "past"),
     [("queued", 0, 0), ("starting", 1, 1), ("naming", 2, 2), ("ready", 3, 3), ("new", 0, 0)],
 )
-def test_waiting_marks_the_present_stage(state: str, present: int, past: int) -> None:
+def test_the_waiting_page_marks_the_present_stage(state: str, present: int, past: int) -> None:
     stages = Elements(game(state=state).html).named("li")
     assert [at for at, attrs in enumerate(stages) if attrs.get("aria-current") == "step"] == [present]
     assert [attrs.get("class") for attrs in stages].count("past") == past
 
 
-def test_without_javascript_the_waiting_page_asks_again_and_says_what_is_missing() -> None:
+def test_without_javascript_the_waiting_page_reloads_itself_and_says_that_javascript_is_needed() -> None:
     html = game().html
     assert '<noscript><meta http-equiv="refresh" content="5"></noscript>' in html
     assert "The game needs JavaScript" in html
@@ -311,7 +311,7 @@ def test_in_the_lobby_the_page_waits_for_others_and_not_for_a_server() -> None:
     assert "hidden" in found["lobby"]
 
 
-def test_a_browser_without_javascript_is_not_matched_as_it_asks_only_once() -> None:
+def test_in_the_lobby_a_page_without_javascript_does_not_reload_itself() -> None:
     html = game(project=TOGETHER, **LOBBY).html
     assert "http-equiv" not in html
     assert "The game needs JavaScript" in html
@@ -319,7 +319,7 @@ def test_a_browser_without_javascript_is_not_matched_as_it_asks_only_once() -> N
 
 
 @pytest.mark.parametrize(("after", "ends"), [("end", True), (None, True), ("policy", False)])
-def test_the_page_knows_what_follows_if_a_participant_stays_away(after: str | None, ends: bool) -> None:
+def test_the_page_gets_whether_the_game_ends_if_a_participant_stays_away(after: str | None, ends: bool) -> None:
     trial = {"afterAbsent": after} if after else {}
     data = data_of(game(project=msgspec.structs.replace(TOGETHER, trial=trial)))
     assert (data["players"], data["absentEnds"]) == (2, ends)
@@ -327,7 +327,7 @@ def test_the_page_knows_what_follows_if_a_participant_stays_away(after: str | No
 
 
 @given(st.dictionaries(st.text(), st.text()) | st.just({"reason": "</script><script>alert(1)//"}))
-def test_the_state_reaches_the_script_whole_and_harmless(more: dict[str, str]) -> None:
+def test_the_state_reaches_the_script_unchanged_and_escaped(more: dict[str, str]) -> None:
     more = {"x" + key: value for key, value in more.items()}
     page = game(**more)
     data = data_of(page)
@@ -338,7 +338,7 @@ def test_the_state_reaches_the_script_whole_and_harmless(more: dict[str, str]) -
 
 @pytest.mark.parametrize("state", ["ended", "failed"])
 @pytest.mark.parametrize("again", [True, False])
-def test_when_it_is_over_a_form_may_start_it_again(state: str, again: bool) -> None:
+def test_a_page_whose_game_is_over_has_a_form_for_another_server(state: str, again: bool) -> None:
     found = Elements(game(state=state, again=again).html)
     sections = {attrs["id"]: attrs for attrs in found.named("section")}
     assert "hidden" in sections["wait"]
@@ -350,7 +350,7 @@ def test_when_it_is_over_a_form_may_start_it_again(state: str, again: bool) -> N
 
 
 @pytest.mark.parametrize("reason", [*Reason, None])
-def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
+def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> None:
     state = "failed" if reason in FAILURES else "ended"
     text = Elements(game(state=state, reason=reason, again=True).html).text
     assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
@@ -367,12 +367,12 @@ def test_the_page_of_a_closed_server_says_why(reason: Reason | None) -> None:
 
 
 @pytest.mark.parametrize(("state", "says"), [("failed", "Try again"), ("ended", "Start again")])
-def test_the_button_says_what_it_does(state: str, says: str) -> None:
+def test_the_button_of_a_closed_server_names_what_it_does(state: str, says: str) -> None:
     assert re.search(r'<button type="submit">(.*)</button>', game(state=state, again=True).html)[1] == says  # type: ignore[index]
 
 
 @pytest.mark.parametrize("replaces", [False, True])
-def test_the_waiting_page_says_when_another_computer_takes_the_place_of_one_that_failed(replaces: bool) -> None:
+def test_the_waiting_page_shows_when_a_server_replaces_one_that_failed(replaces: bool) -> None:
     sections = {
         attrs.get("id"): attrs for attrs in Elements(game(state="starting", replaces=replaces).html).named("div")
     }
@@ -409,7 +409,7 @@ def test_the_page_of_a_game_drawn_by_objects_is_small(capsys: pytest.CaptureFixt
     assert len(gzip.compress(game().html.encode())) + 1_000 < size < 40_000
 
 
-def test_the_page_of_a_game_for_several_participants_is_small_and_no_other_page_carries_its_parts(
+def test_the_page_of_a_game_for_several_participants_is_small_and_no_other_page_has_its_parts(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     size = len(gzip.compress(game(project=TOGETHER, **LOBBY).html.encode()))
@@ -419,7 +419,7 @@ def test_the_page_of_a_game_for_several_participants_is_small_and_no_other_page_
     assert not [part for part in ("lobby", "company", "#people", "sendBeacon") if part in game().html]
 
 
-def test_a_page_carries_the_style_of_its_own_kind_only() -> None:
+def test_a_page_has_the_style_of_its_kind_only() -> None:
     whole, found = frame.style(), {kind: frame.style(kind) for kind in ("step", "game", "message")}
     assert ".likert" in found["step"]
     assert ".stages" in found["game"]
@@ -445,7 +445,7 @@ def test_every_field_of_the_example_has_a_label(path: Path) -> None:
         assert text.rfind("<label>", 0, box.start()) > text.rfind("</label>", 0, box.start())
 
 
-def test_the_example_says_goodbye_to_everybody() -> None:
+def test_the_examples_last_page_has_a_text_for_every_group() -> None:
     source = (ROOT / "steps" / "debrief.html").read_text()
     for group in (None, 0, 1):
         text = Elements(step(source, at=4, values={"answers": {}, "group": group, "completion_code": "CODE"}).html).text
@@ -457,12 +457,12 @@ def test_the_examples_last_page_reads_no_record() -> None:
     assert records_mentioned((ROOT / "steps" / "debrief.html").read_text()) == frozenset()  # each would cost a call
 
 
-def test_nobody_speaks_jinja_to_participants() -> None:
+def test_no_page_shows_jinja_expressions_to_participants() -> None:
     for path in EXAMPLES:
         assert "{{" not in step(path.read_text()).html
 
 
-def test_the_policy_and_the_other_headers_word_by_word() -> None:
+def test_each_kind_of_page_has_exactly_these_headers() -> None:
     def told(page: Page) -> dict[str, str]:
         headers = dict(page.headers)
         headers["Content-Security-Policy"] = re.sub("nonce-[^']+", "nonce-N", headers["Content-Security-Policy"])
@@ -487,7 +487,7 @@ def test_the_policy_and_the_other_headers_word_by_word() -> None:
     }
 
 
-def test_the_frame_of_a_step_says_where_one_is() -> None:
+def test_the_frame_of_a_step_shows_the_progress() -> None:
     page = Elements(step("<title>Age</title><p>x</p>").html)
     (progress,) = page.named("progress")
     assert progress == {"max": "4", "value": "1"}
@@ -508,12 +508,12 @@ def test_the_frame_of_a_step_says_where_one_is() -> None:
 
 
 @pytest.mark.parametrize(("source", "study"), [("<p>x</p>", "h1"), ("<h1>x</h1>", "p")])
-def test_the_studys_name_is_the_heading_where_the_page_has_none(source: str, study: str) -> None:
+def test_the_studys_name_is_the_heading_of_a_page_without_one(source: str, study: str) -> None:
     page = Elements(step(source).html)
     assert [tag for tag, attributes in page.all if attributes.get("class") == "study"] == [study]
 
 
-def test_a_final_page_that_is_done_says_so_to_the_script() -> None:
+def test_a_final_page_tells_its_script_whether_it_is_done() -> None:
     asks, thanks = "<input name=a>", "<p>Thanks</p>"
     done = [
         "data-done" in Elements(step(source, at=at, answered=answered).html).named("body")[0]
@@ -528,7 +528,7 @@ def test_a_final_page_that_is_done_says_so_to_the_script() -> None:
     assert done == [False, True, True, True, False]
 
 
-def test_the_game_page_hands_its_script_what_it_needs() -> None:
+def test_the_game_page_hands_the_necessary_data_to_its_script() -> None:
     page = game(state="starting").html
     found = re.search(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
     assert found
@@ -552,9 +552,9 @@ def code(text: str) -> str:
 
 
 def texts(script: str) -> list[str]:
-    """The texts in a script, of templates the parts that are no code. No regular expression of ours has quotes."""
+    """The texts in a script; of templates, the parts that are no code. No regular expression in the scripts has quotes."""
     found: list[str] = []
-    within = ["{"]  # what is open: a text's quote, a template or a bracket
+    within = ["{"]  # what is open: the quote of a text, a template or a bracket
     at = 0
     while at < len(script):
         char, here = script[at], within[-1]
@@ -582,7 +582,7 @@ def texts(script: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("name", "page"), [("step.js", step("<p>x</p>")), ("game/main.js", game())])
-def test_a_page_carries_its_script_and_the_style_without_their_comments(name: str, page: Page) -> None:
+def test_a_page_has_its_script_and_style_without_comments(name: str, page: Page) -> None:
     script = in_script(code(re.sub(r" // .*", "", scripts.join(ROOT / "web" / name))), IN_ENGLISH)
     carried = re.findall(r'<script(?: type="module")? nonce="[^"]+">\n(.*?)</script>', page.html, re.DOTALL)[-1]
     spare = r"\s|;(?=\s*})|,(?=\n\s*[}\])])"  # and semicolons and commas in front of a closing bracket
@@ -594,12 +594,12 @@ def test_a_page_carries_its_script_and_the_style_without_their_comments(name: st
     assert frame.style() == re.sub(r"([{;,}])\n", r"\1", dense).replace(";}", "}")
 
 
-def test_spaces_that_mean_something_in_a_style_stay() -> None:
+def test_spaces_that_have_a_meaning_in_a_style_stay() -> None:
     quoted = re.findall('"[^"]*"', code((ROOT / "web" / "style.css").read_text()))
     assert not [text for text in quoted if re.search(" [{};>~]|[{};>~:,] ", text)]
     assert 'font:100%/1.55 system-ui,-apple-system,"Segoe UI",' in frame.style()
 
 
-def test_the_game_page_loads_nothing_but_itself() -> None:
+def test_the_game_page_loads_no_other_script() -> None:
     assert not [attrs for attrs in Elements(game().html).named("script") if attrs.get("src")]
     assert not re.search(r"^\s*(import|export)\b", game().html, re.MULTILINE)

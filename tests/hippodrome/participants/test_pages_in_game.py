@@ -41,7 +41,7 @@ def with_pages(project: Project, **pages: str) -> FakePlatform:
 
 
 def game_page(platform: FakePlatform) -> str:
-    """What alice gets as the page of the game, whatever its status."""
+    """The page that alice gets at the game step, whatever its status."""
     alice = Browser(platform)
     alice.answer(alice.get(), consent="yes")
     alice.answer(alice.get(), age="33")
@@ -68,7 +68,7 @@ def test_the_modules_of_such_pages_are_in_no_other_game_page(platform: FakePlatf
 
 
 @pytest.mark.parametrize(("source", "title"), [("", "This page is missing"), ("{% if %}", "This page is broken")])
-def test_a_page_that_cannot_be_shown_is_said(source: str, title: str) -> None:
+def test_a_page_that_cannot_be_shown_gets_an_error_page(source: str, title: str) -> None:
     platform = with_pages(STUDY, pause=source)
     try:
         assert title in game_page(platform)
@@ -76,7 +76,7 @@ def test_a_page_that_cannot_be_shown_is_said(source: str, title: str) -> None:
         place.use(None)
 
 
-def test_pages_that_were_uploaded_as_hippo_does_are_found_with_their_groups() -> None:
+def test_pages_that_hippos_script_uploaded_are_found_with_their_groups() -> None:
     platform = FakePlatform()
     for file in (
         "consent-0",

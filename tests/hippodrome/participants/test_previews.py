@@ -1,4 +1,4 @@
-"""Who is no participant yet, and who was not invited: neither gets a record or a server."""
+"""Previews of links, and visitors without an invitation, get neither a record nor a server."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def untouched(platform: FakePlatform) -> bool:
 
 
 @pytest.mark.parametrize("agent", PEOPLE)
-def test_people_begin(platform: FakePlatform, agent: str) -> None:
+def test_a_persons_browser_begins_the_study(platform: FakePlatform, agent: str) -> None:
     Browser(platform, LINK).get(user_agent=agent)
     assert not untouched(platform)
 
 
 @pytest.mark.parametrize("agent", PROGRAMS)
-def test_a_card_for_a_link_shows_the_study_and_begins_nothing(platform: FakePlatform, agent: str) -> None:
+def test_a_program_that_previews_a_link_sees_the_study_and_begins_nothing(platform: FakePlatform, agent: str) -> None:
     for query in (LINK, "projectId=maze"):
         page = Browser(platform, query).get(user_agent=agent)
         assert "A maze" in page
@@ -79,8 +79,8 @@ def test_a_card_for_a_link_shows_the_study_and_begins_nothing(platform: FakePlat
 
 
 @pytest.mark.parametrize("headers", AHEAD)
-def test_what_a_browser_fetches_ahead_is_refused_and_not_kept(platform: FakePlatform, headers: dict[str, str]) -> None:
-    """Any status but a 2xx makes it ask again when the person comes."""
+def test_a_prefetch_of_a_browser_is_refused_and_not_cached(platform: FakePlatform, headers: dict[str, str]) -> None:
+    """After any status but a 2xx, the browser asks again when the person opens the link."""
     for query in (LINK, "projectId=maze"):
         answer = Browser(platform, query).send(**headers)
         assert (answer["statusCode"], answer["headers"]["Cache-Control"]) == (403, "no-store")
@@ -90,7 +90,7 @@ def test_what_a_browser_fetches_ahead_is_refused_and_not_kept(platform: FakePlat
 
 
 @pytest.mark.parametrize("query", [LINK, "projectId=maze", "projectId=maze&workerId=W1"])
-def test_a_task_that_is_only_looked_at_begins_nothing(platform: FakePlatform, query: str) -> None:
+def test_the_preview_of_a_task_on_mturk_begins_nothing(platform: FakePlatform, query: str) -> None:
     page = Browser(platform, f"{query}&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE&hitId=H").get()
     assert "preview" in page
     assert untouched(platform)
@@ -99,7 +99,7 @@ def test_a_task_that_is_only_looked_at_begins_nothing(platform: FakePlatform, qu
 
 
 @pytest.mark.parametrize("query", [LINK, "projectId=maze"])
-def test_head_begins_nothing(platform: FakePlatform, query: str) -> None:
+def test_a_head_request_begins_nothing(platform: FakePlatform, query: str) -> None:
     assert Browser(platform, query).send("HEAD")["statusCode"] in (200, 302)
     assert untouched(platform)
 
@@ -150,7 +150,7 @@ def test_a_signed_link_leads_through_the_study(closed: FakePlatform) -> None:
     ],
 )
 @pytest.mark.parametrize("method", ["GET", "HEAD", "POST"])
-def test_others_get_nothing(closed: FakePlatform, query: str, method: str) -> None:
+def test_a_visitor_without_a_valid_signature_gets_nothing(closed: FakePlatform, query: str, method: str) -> None:
     body = f"hippodrome-step=1&hippodrome-ticket={ids.ticket('secret', 'alice', '1')}" if method == "POST" else None
     answer = Browser(closed, query).send(method, body, content_type="application/x-www-form-urlencoded")
     assert answer["statusCode"] in (400, 403)
@@ -158,7 +158,7 @@ def test_others_get_nothing(closed: FakePlatform, query: str, method: str) -> No
     assert untouched(closed)
 
 
-def test_a_link_without_an_id_is_refused_and_makes_none(closed: FakePlatform) -> None:
+def test_a_link_without_an_id_is_refused_and_no_id_is_made(closed: FakePlatform) -> None:
     answer = Browser(closed, "projectId=maze").send()
     assert (answer["statusCode"], "Location" in answer["headers"]) == (403, False)
     assert "by invitation" in answer["body"]
@@ -179,5 +179,5 @@ def test_no_other_signature_opens_a_link(user: str, other: str, guess: str, at: 
     ):
         assert ids.secrets_equal(wrong, right) is (wrong == right)
     assert (ids.link_signature("secret", "maze", other) == right) is (other == user)
-    # No two of what a secret signs can be taken for one another.
+    # Values that the secret signs for one purpose are no proof for another.
     assert right not in (ids.ticket("secret", "maze", user), ids.ticket("secret", user, other))

@@ -1,4 +1,4 @@
-"""The relays: only for a participant who exists, may do so now, and is the one they say they are."""
+"""The relays accept requests only from a participant who exists, has a server step, and proves who they are."""
 
 from __future__ import annotations
 
@@ -54,14 +54,16 @@ def test_a_participant_may_ask_for_their_server(platform: FakePlatform) -> None:
     {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")},
     {"hippodrome-step": "nope", "hippodrome-ticket": ids.ticket("secret", "alice", "nope")},
 ])  # fmt: skip
-def test_nobody_else_may_start_or_stop_it(platform: FakePlatform, proof: dict[str, object]) -> None:
+def test_a_request_without_a_valid_proof_may_not_start_or_stop_a_server(
+    platform: FakePlatform, proof: dict[str, object]
+) -> None:
     Servers(platform).start(StartServer("maze", "alice"))
     assert ask(START, **proof) == 403
     assert ask(STOP, **proof) == 403
     assert platform.bus.sent == []
 
 
-def test_it_can_be_asked_for_only_where_the_study_has_one(platform: FakePlatform) -> None:
+def test_a_server_can_be_asked_for_only_at_steps_that_have_one(platform: FakePlatform) -> None:
     for key in "23":
         platform.documents.put(f"maze/users/alice/answers/{key}.json", b"{}")
     assert ask(START, **PROOF) == 409
@@ -107,8 +109,8 @@ def test_a_get_starts_and_stops_a_server_as_with_hippo(platform: FakePlatform) -
     ]
 
 
-def test_a_stop_names_no_project_as_with_hippo(platform: FakePlatform) -> None:
-    """The ticket says of which project it is."""
+def test_a_stop_need_not_name_the_project_as_with_hippo(platform: FakePlatform) -> None:
+    """The ticket determines the project."""
     Servers(platform).start(StartServer("maze", "alice"))
     assert get(STOP, platform, "userId=alice", **PROOF)[0] == 200
     assert ask(STOP, "userId=alice", **PROOF) == 202
@@ -116,7 +118,7 @@ def test_a_stop_names_no_project_as_with_hippo(platform: FakePlatform) -> None:
 
 
 @pytest.mark.parametrize("query", ["userId=alice", "projectId=maze&userId=alice"])
-def test_a_request_without_a_proof_is_told_what_to_send(platform: FakePlatform, query: str) -> None:
+def test_a_request_without_a_proof_is_refused_with_the_fields_to_send(platform: FakePlatform, query: str) -> None:
     Servers(platform).start(StartServer("maze", "alice"))
     for function in (START, STOP):
         status, text = get(function, platform, query)
@@ -166,7 +168,7 @@ def test_other_methods_are_refused(platform: FakePlatform, method: str) -> None:
 
 
 @pytest.mark.parametrize("delay", [-1, 86_401, "soon", None, True, [], 1e400, {}])
-def test_a_delay_that_is_none_is_refused(platform: FakePlatform, delay: object) -> None:
+def test_an_invalid_delay_is_refused(platform: FakePlatform, delay: object) -> None:
     Servers(platform).start(StartServer("maze", "alice"))
     assert ask(STOP, **PROOF, delay=delay) == 400
 
@@ -178,5 +180,5 @@ def test_without_a_server_there_is_nothing_to_stop(platform: FakePlatform) -> No
 @pytest.mark.parametrize(("query", "status"), [
     ("projectId=nobody&userId=alice", 404), ("projectId=maze&userId=..", 400), ("", 404), ("projectId=maze", 400),
 ])  # fmt: skip
-def test_broken_requests_say_so(platform: FakePlatform, query: str, status: int) -> None:
+def test_broken_requests_are_refused_with_their_status(platform: FakePlatform, query: str, status: int) -> None:
     assert ask(START, query, **PROOF) == status

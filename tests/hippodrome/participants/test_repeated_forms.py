@@ -30,7 +30,7 @@ WINDOW = REPEAT_WINDOW.total_seconds()
 
 
 def pages_only() -> Project:
-    """Four pages and a final one: every step may be answered with the same form."""
+    """A study of four pages and a final one, where each step may be answered with the same form."""
     return study(steps=[Step(key, "survey") for key in PAGES[:-1]] + [Step("finalStep", "debrief")], events=Events())
 
 
@@ -61,7 +61,7 @@ def hippos_form(page: str) -> dict[str, str]:
 
 
 def answered(platform: FakePlatform, user: str = "alice") -> dict[str, Any]:
-    """The answers that are kept, by step."""
+    """The stored answers, by step."""
     folder = f"maze/users/{user}/answers/"
     found = {key: body for key, (body, *_) in platform.documents.kept.items() if key.startswith(folder)}
     return {key.removeprefix(folder).removesuffix(".json"): json.loads(found[key])["answers"] for key in sorted(found)}
@@ -79,7 +79,9 @@ def test_a_form_without_a_step_that_is_sent_twice_answers_one_step(platform: Fak
     assert first["step"] == again["step"] == "2"
 
 
-def test_it_is_known_again_after_others_and_in_another_order(platform: FakePlatform) -> None:
+def test_a_repeated_form_is_recognized_after_other_forms_and_with_its_fields_in_another_order(
+    platform: FakePlatform,
+) -> None:
     program = Program(platform)
     program.ask()
     program.post({"age": 7, "names": {"a": 1, "b": [2]}})
@@ -89,7 +91,7 @@ def test_it_is_known_again_after_others_and_in_another_order(platform: FakePlatf
 
 
 @pytest.mark.parametrize("other", [{"age": "7"}, {"age": 7.0}, {"age": True}, {"age": [7]}, {}, {"age": 7, "x": None}])
-def test_what_differs_in_anything_is_another_answer(platform: FakePlatform, other: object) -> None:
+def test_a_form_with_any_difference_is_another_answer(platform: FakePlatform, other: object) -> None:
     program = Program(platform)
     program.ask()
     program.post({"age": 7})
@@ -97,7 +99,7 @@ def test_what_differs_in_anything_is_another_answer(platform: FakePlatform, othe
     assert list(answered(platform)) == ["1", "2"]
 
 
-def test_an_answer_that_a_browsers_page_sent_is_not_taken_again_from_a_program(platform: FakePlatform) -> None:
+def test_a_form_that_a_browser_sent_is_not_accepted_again_from_a_program(platform: FakePlatform) -> None:
     program = Program(platform)
     program.ask()
     proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
@@ -107,7 +109,7 @@ def test_an_answer_that_a_browsers_page_sent_is_not_taken_again_from_a_program(p
     assert list(answered(platform)) == ["1"]
 
 
-def test_a_form_that_names_its_step_without_a_ticket_answers_that_step_alone(platform: FakePlatform) -> None:
+def test_a_form_with_a_step_and_no_ticket_answers_only_this_step(platform: FakePlatform) -> None:
     program = Program(platform)
     program.ask()
     for _ in range(3):
@@ -117,7 +119,7 @@ def test_a_form_that_names_its_step_without_a_ticket_answers_that_step_alone(pla
     assert list(answered(platform)) == ["1", "2"]
 
 
-def test_what_an_agent_wrote_instead_of_an_answer_stops_nobody(platform: FakePlatform) -> None:
+def test_an_unreadable_answer_of_an_agent_does_not_stop_the_participant(platform: FakePlatform) -> None:
     program = Program(platform)
     program.ask()
     for step, body in (("1", b"\xff{"), ("2", b"[]"), ("3", b'{"answers": 3}')):
@@ -140,7 +142,7 @@ def test_few_documents_are_read_however_many_steps_were_answered() -> None:
     place.use(None)
 
 
-# Honestly the same
+# Equal answers to different steps
 
 
 def test_a_program_that_names_no_step_may_answer_the_same_after_a_minute(platform: FakePlatform) -> None:
@@ -154,7 +156,9 @@ def test_a_program_that_names_no_step_may_answer_the_same_after_a_minute(platfor
     assert answered(platform) == {"1": {}, "2": {}}
 
 
-def test_hippos_front_end_answers_equal_pages_as_fast_as_it_likes_and_never_two_at_once(platform: FakePlatform) -> None:
+def test_hippos_front_end_may_answer_equal_pages_at_any_speed_and_one_form_answers_one_step(
+    platform: FakePlatform,
+) -> None:
     platform.documents.put(step_key("maze", "survey"), b"<input name='agree' value='yes'><button name='b'>Go</button>")
     program = Program(platform)
     shown = program.ask()
@@ -167,8 +171,8 @@ def test_hippos_front_end_answers_equal_pages_as_fast_as_it_likes_and_never_two_
     assert answered(platform) == {key: {"agree": "yes"} for key in PAGES[:-1]}
 
 
-def test_a_step_that_is_named_twice_alike_is_named(platform: FakePlatform) -> None:
-    """A program that adds step and ticket to a form that holds them already."""
+def test_a_step_that_is_named_twice_with_the_same_value_counts(platform: FakePlatform) -> None:
+    """A program adds step and ticket to a form that has them already."""
     program = Program(platform)
     shown = program.ask()
     fields = [*hippos_form(shown["page"]).items(), ("hippodrome-step", shown["step"])]
@@ -178,7 +182,7 @@ def test_a_step_that_is_named_twice_alike_is_named(platform: FakePlatform) -> No
     assert "hippodrome-step" not in answered(platform)["1"]
 
 
-def test_asking_for_another_server_is_no_answer_that_could_repeat_one() -> None:
+def test_a_form_that_asks_for_another_server_is_not_taken_for_a_repeated_answer() -> None:
     platform = installed(
         study(steps=[Step("1", "survey"), Step("2", "game"), Step("3", "debrief")], events=Events("2"))
     )
@@ -228,7 +232,7 @@ class Turns:
 
 
 class Flight:
-    """One request under way."""
+    """A request that is not answered yet."""
 
     def __init__(self, local: threading.local, act: Callable[[], Any]) -> None:
         self.reply: Any = None
@@ -251,7 +255,7 @@ class Flight:
         assert self._go.acquire(timeout=60)
 
     def one_call(self) -> None:
-        """Go on until the next call, or the end."""
+        """Let the request go on until its next call, or its end."""
         if not self.over:
             self._go.release()
             assert self._rests.acquire(timeout=60)
@@ -289,7 +293,7 @@ class Participant:
         return kept is not None and (self.platform.now() - kept[2]) < REPEAT_WINDOW
 
     def look(self, reply: Any) -> None:
-        """The reply shows a page; an earlier one than is open already comes too late to be seen."""
+        """Take the reply's page as the open one, unless a later page is open already."""
         self.shown = max(self.shown, reply["step"], key=PAGES.index)
 
     def land(self) -> None:
@@ -298,7 +302,7 @@ class Participant:
         self.flights.clear()
 
     def close(self) -> None:
-        """Let go of requests that still wait for their turn."""
+        """End the requests that still wait for their turn."""
         for flight in self.flights:
             while not flight.over:
                 flight.one_call()
@@ -315,7 +319,7 @@ NAMES = st.sampled_from(["nothing", "nothing", "nothing", "step", "ticket"])
 
 
 @given(forms=st.lists(FORMS, min_size=4, max_size=4), data=st.data())
-def test_every_answer_is_kept_for_its_own_step_however_requests_overtake_each_other(
+def test_every_answer_is_stored_for_its_own_step_however_requests_overtake_each_other(
     forms: list[dict[str, str]], data: st.DataObject
 ) -> None:
     with closing(Participant([*forms, {}])) as alice:
@@ -324,7 +328,7 @@ def test_every_answer_is_kept_for_its_own_step_however_requests_overtake_each_ot
 
 
 def overtake(alice: Participant, data: st.DataObject) -> None:
-    """Send, repeat, delay and overtake as the example says; every answer is then that of its step."""
+    """Send, repeat, delay and overtake requests as hypothesis chooses; then each stored answer must belong to its step."""
     for _ in range(data.draw(st.integers(0, 40), label="moves")):
         at = PAGES.index(alice.shown)
         late = [n for n in range(at) if alice.may_come_late(n)]
@@ -348,7 +352,7 @@ def overtake(alice: Participant, data: st.DataObject) -> None:
 
 
 def press_on(alice: Participant) -> None:
-    """Pressing the button every 20 seconds leads to the end, whatever has happened and though answers are the same."""
+    """Press the button every 20 seconds: this must lead to the end of the study, even if the answers are equal."""
     for _ in range(4 * 5):
         at = PAGES.index(alice.shown)
         if at == 4:

@@ -54,19 +54,19 @@ def test_no_top_level_name_occurs_in_two_modules() -> None:
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.stem)
-def test_a_module_imports_what_it_uses_of_the_others_and_nothing_else(module: Path) -> None:
+def test_a_module_imports_exactly_the_names_that_it_uses_of_others(module: Path) -> None:
     others = {name for other in MODULES if other != module for name in declared(other)}
     wanted = {name for names in imported(module).values() for name in names}
     assert words(module) & others - local(module) == wanted
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.stem)
-def test_what_a_module_imports_is_exported(module: Path) -> None:
+def test_the_names_that_a_module_imports_are_exported(module: Path) -> None:
     for name, names in imported(module).items():
         assert set(names) <= set(declared(GAME / name, exported=True))
 
 
-def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() -> None:
+def test_every_module_is_in_the_script_behind_the_modules_that_it_imports() -> None:
     joined = scripts.join(GAME / "main.js", (*game_modules.MODULES, *game_modules.OWN_WORDS, *game_modules.TOGETHER))
     places = {module.name: joined.index(f"\n{code_of(module)}") for module in MODULES}
     assert len(set(places.values())) == len(MODULES)
@@ -74,14 +74,14 @@ def test_every_module_is_part_of_the_script_and_stands_behind_what_it_imports() 
         assert all(places[name] < places[module.name] for name in imported(module))
 
 
-def test_a_module_of_some_projects_is_in_no_other_script() -> None:
+def test_modules_for_some_projects_are_not_in_the_script_of_others() -> None:
     joined = scripts.join(GAME / "main.js")
     assert [module.name for module in MODULES if f"\n{code_of(module)}" not in joined] == sorted(
         (*game_modules.MODULES, *game_modules.OWN_WORDS, *game_modules.TOGETHER)
     )
 
 
-def test_modules_that_are_not_imported_stand_before_the_script_and_behind_what_they_import(tmp_path: Path) -> None:
+def test_additional_modules_come_before_the_script_and_behind_their_imports(tmp_path: Path) -> None:
     (tmp_path / "a.js").write_text("export const a = 1;\n")
     (tmp_path / "b.js").write_text('import { a } from "./a.js";\na(2);\n')
     (tmp_path / "c.js").write_text('import { a } from "./a.js";\na(3);\n')
@@ -112,7 +112,7 @@ def test_a_module_that_cannot_be_joined_is_refused(tmp_path: Path, line: str, sa
     assert str(refused.value) == said
 
 
-def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
+def test_a_module_that_two_others_import_is_in_the_script_once(tmp_path: Path) -> None:
     (tmp_path / "a.js").write_text("// A\nexport const a = 1;\n")
     (tmp_path / "b.js").write_text('import { a } from "./a.js";\nexport const b = a;\n')
     (tmp_path / "c.js").write_text('import {\n  a,\n} from "./a.js";\nimport { b } from "./b.js";\nb(a);\n')
@@ -131,14 +131,14 @@ def test_a_module_that_two_others_import_is_there_once(tmp_path: Path) -> None:
         ("f({ a, b: [\n  1,\n] }, /a{2,}/,\n);\n", "f({a,b:[1]},/a{2,}/);"),
     ],
 )
-def test_a_page_carries_a_script_without_comments_spaces_and_line_ends_but_texts_as_they_are(
+def test_a_page_has_its_script_without_comments_spaces_and_line_ends_and_with_unchanged_texts(
     source: str, carried: str
 ) -> None:
     assert frame._plain("a.js", source) == carried
 
 
-def carried(source: str) -> list[str]:
-    """The tokens of a script as a page carries it."""
+def shortened_tokens(source: str) -> list[str]:
+    """The tokens of a script in the shortened form in which a page has it."""
     return tokens(frame._plain("a.js", source))
 
 
@@ -147,9 +147,9 @@ SHEET = re.compile(r"(?:\.replaceSync\(|^const css = )`[^`]*`", re.MULTILINE)
 
 
 @pytest.mark.parametrize("script", [*MODULES, GAME.parent / "step.js"], ids=lambda path: path.stem)
-def test_a_page_carries_the_same_script(script: Path) -> None:
+def test_the_shortened_script_of_a_page_has_the_same_tokens(script: Path) -> None:
     source = SHEET.sub(lambda sheet: re.sub(r"\n +", "\n", sheet[0]), script.read_text())
-    assert carried(source) == tokens(source)
+    assert shortened_tokens(source) == tokens(source)
     assert source.endswith("\n"), "the next module would stand on its last line"
 
 
@@ -169,9 +169,9 @@ def test_a_page_carries_the_same_script(script: Path) -> None:
         'say("</script>" + /</script/);\n',
     ],
 )
-def test_a_script_that_would_be_another_one_on_the_page_is_noticed(source: str) -> None:
+def test_the_comparison_notices_a_script_that_shortening_would_change(source: str) -> None:
     with contextlib.suppress(ValueError):
-        assert carried(source) != tokens(source)
+        assert shortened_tokens(source) != tokens(source)
 
 
 @pytest.mark.parametrize(
@@ -191,6 +191,6 @@ def test_tokens_of_a_script(source: str, found: str) -> None:
 
 
 @pytest.mark.parametrize("source", ["a }", "if (a) /b , c/.exec(d);", "`a", "`a ${b`", '"a', "3a", "a <!-- b", "@"])
-def test_what_is_no_script_has_no_tokens(source: str) -> None:
+def test_text_that_is_no_script_raises_value_error(source: str) -> None:
     with pytest.raises(ValueError):
         tokens(source)

@@ -1,4 +1,4 @@
-"""What participants read of ours: one table, and a study's own words in its place."""
+"""The texts that Hippodrome shows to participants: one table, and a study's own words instead of it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NO_WORDS = {
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda path: path.name)
-def test_whatever_scripts_and_templates_name_is_in_the_table(file: Path) -> None:
+def test_each_text_that_scripts_and_templates_name_is_in_the_table(file: Path) -> None:
     assert set(NAMED.findall(file.read_text())) <= ENGLISH.keys()
 
 
@@ -51,14 +51,14 @@ def test_each_text_is_used() -> None:
 
 
 @pytest.mark.parametrize("file", sorted(WEB.rglob("*.js")), ids=lambda path: path.name)
-def test_scripts_have_no_text_of_their_own(file: Path) -> None:
+def test_scripts_show_only_texts_of_the_table(file: Path) -> None:
     code = re.sub(r"(?m)^\s*//.*|\s// .*", "", file.read_text())
     literals = [found["text"] for found in frame._CODE_OR_TEXT.finditer(NO_TEXTS.sub("", code)) if found["text"]]
     words = {word for text in literals for word in WORD.findall(re.sub(r"\$\{[^}]*\}", "", text))}
     assert words - NO_WORDS == set()
 
 
-def test_templates_have_no_text_of_their_own() -> None:
+def test_templates_show_only_texts_of_the_table() -> None:
     templates = [(WEB / name).read_text() for name in ("frame.html", "game.html", "lobby.html")]
     for template in [*templates, *(part for name, part in frame._PARTS.items() if name != "data")]:
         read = " ".join([re.sub(r"<[^>]*>", " ", template), *re.findall(r'aria-label="([^"]*)"', template)])
@@ -66,11 +66,13 @@ def test_templates_have_no_text_of_their_own() -> None:
 
 
 @pytest.mark.parametrize(("name", "also"), [("game/main.js", ALL_MODULES), ("step.js", ())])
-def test_each_text_is_given_what_it_leaves_open(name: str, also: tuple[str, ...]) -> None:
-    assert not NAMED.search(in_script(scripts.join(WEB / name, also), IN_ENGLISH))  # ValueError if it is not
+def test_each_text_gets_values_for_its_placeholders(name: str, also: tuple[str, ...]) -> None:
+    assert not NAMED.search(
+        in_script(scripts.join(WEB / name, also), IN_ENGLISH)
+    )  # raises ValueError if a value is missing
 
 
-def test_what_servers_say_is_in_the_table() -> None:
+def test_messages_of_servers_are_in_the_table() -> None:
     said = {
         *(getattr(session, name) for name in ("PARTNER_LEFT", "PARTNER_STOPPED", "PARTNER_MISSING", "LEFT", "PING")),
         *(getattr(trial, name) for name in ("EPISODE_FAILED", "EPISODE_BEGINS_AGAIN", "TRIAL_FAILED")),
@@ -84,7 +86,7 @@ def test_the_page_for_researchers_lists_all_texts() -> None:
     assert listed == {group: list(texts.items()) for group, texts in GROUPS.items()}
 
 
-def test_the_english_texts_can_be_copied_and_lack_the_language_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_english_texts_can_be_copied_and_lack_only_the_language(capsys: pytest.CaptureFixture[str]) -> None:
     file = (ROOT / "docs" / "texts.en.yml").read_text(encoding="utf-8")
     assert yaml.safe_load(file)["project"]["texts"] == {**ENGLISH, "language": None}
     assert command(["texts"]) == 0
@@ -103,7 +105,7 @@ def test_the_german_texts_are_complete() -> None:
 # A study's own words
 
 
-def test_a_study_has_its_own_words_and_english_ones_where_it_has_none() -> None:
+def test_a_study_has_its_own_texts_and_otherwise_the_english_ones() -> None:
     texts = Texts({"start": "Los", "seconds": "{seconds} Sekunden", "unknown": "x"})
     assert texts["start"] == "Los"
     assert texts["pause"] == "Pause"
@@ -115,7 +117,7 @@ def test_a_study_has_its_own_words_and_english_ones_where_it_has_none() -> None:
     assert hash(texts) == hash(Texts({"seconds": "{seconds} Sekunden", "start": "Los"}))
 
 
-def test_the_page_gets_the_words_for_what_servers_say_only_if_they_are_others() -> None:
+def test_the_page_gets_texts_for_messages_of_servers_only_if_the_study_has_its_own() -> None:
     assert IN_ENGLISH.of_server() == Texts({"start": "Los"}).of_server() == {}
     assert Texts({"saidPing": "Zu langsam."}).of_server() == {ENGLISH["saidPing"]: "Zu langsam."}
 
@@ -137,7 +139,7 @@ def test_texts_stand_where_a_script_names_them(code: str, own: dict[str, str], f
     assert in_script(code, Texts(own)) == filled
 
 
-def test_numbers_are_written_as_the_language_does_with_the_digits_of_all_other_numbers() -> None:
+def test_numbers_are_written_as_in_the_language_with_western_digits() -> None:
     code = "n.toLocaleString(TEXT.language)"
     assert in_script(code, IN_ENGLISH) == 'n.toLocaleString("en")'
     assert in_script(code, Texts({"language": "fa"})) == 'n.toLocaleString("fa-u-nu-latn")'
@@ -147,7 +149,7 @@ def test_numbers_are_written_as_the_language_does_with_the_digits_of_all_other_n
 EVIL = "\"`\\ ${alert(1)} </script><!-- \u2028 {game} // '$game"
 
 
-def test_no_text_is_code() -> None:
+def test_texts_cannot_become_code() -> None:
     script = in_script(
         "say(TEXT.start); say(TEXT.gameOf(a, b)); say(`x${TEXT.start}`);", Texts({"start": EVIL, "gameOf": EVIL})
     )
@@ -158,7 +160,7 @@ def test_no_text_is_code() -> None:
     assert "\u2028" not in script
 
 
-def test_no_text_is_html() -> None:
+def test_texts_cannot_become_html() -> None:
     own = Texts({"tell": '<b title="x">&$user ${x} {step}', "step": "{step} $user {x}"})
     assert in_template("TEXT.tell", own) == "&lt;b title=&quot;x&quot;&gt;&amp;$$user $${x} {step}"
     assert in_template("TEXT.step", own) == "${step} $$user {x}"
@@ -167,5 +169,5 @@ def test_no_text_is_html() -> None:
     )
 
 
-def test_a_text_names_what_it_leaves_open_once() -> None:
+def test_each_placeholder_of_a_text_is_listed_once() -> None:
     assert places("{a} {b} {a} {} {C} {b") == ("a", "b")
