@@ -1,4 +1,4 @@
-"""Messages and events of a platform in memory reach the functions that start and stop servers."""
+"""Deliver messages and events of a platform in memory to the functions that start and stop servers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from testing.servers import Servers
 
 
 def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskChanged]:
-    """One for each task that runs."""
+    """The event of this status for each task that runs."""
     given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
     return [
         TaskChanged(task=task, cluster=request.cluster, name=request.name, status=status, **given)  # type: ignore[arg-type]
@@ -21,7 +21,7 @@ def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskC
 
 
 def deliver(platform: FakePlatform, servers: Servers) -> None:
-    """Every message there is, and what comes of it, each once; tasks run and are named."""
+    """Deliver each message once, and each that follows from it; tasks run and get their names."""
     servers.tasks_changed(events(platform, "RUNNING"))
     while platform.bus.sent or platform.bus.delayed:
         sent, platform.bus.sent = platform.bus.sent, []

@@ -14,7 +14,7 @@ def _halve(number: int) -> int | None:
     return None if number == 0 else number // 2
 
 
-def test_the_others_go_on_and_the_log_names_the_one_that_failed(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_item_is_logged_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
     made, failed = for_each(FakePlatform(), [0, 2, 3, 4], _halve, "not halved yet", lambda number: f"s{number}-1")
     assert made == [(2, 1), (4, 2)]
     assert failed == [3]

@@ -1,4 +1,4 @@
-"""Why servers fail, in the words in which AWS says it."""
+"""The causes for which servers fail are read from AWS's messages."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ FAILED = "TaskFailedToStart"
         ("AWordOfNextYear", "something new", "unknown"),
     ],
 )
-def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, cause: str) -> None:
+def test_the_stopped_reason_of_a_task_gives_the_cause(code: str | None, words: str, cause: str) -> None:
     assert causes.cause_of_task(TaskStopped(code, None, words), was_ready=False) == cause
 
 
@@ -91,14 +91,14 @@ def test_what_ecs_says_of_a_task_names_the_cause(code: str | None, words: str, c
         (None, True, Cause.UNKNOWN),
     ],
 )
-def test_of_a_program_that_ended_its_exit_code_says_the_rest(
+def test_the_exit_code_gives_the_cause_if_the_program_ended(
     exit_code: int | None, was_ready: bool, cause: Cause
 ) -> None:
     stopped = TaskStopped(EXITED, exit_code, "Essential container in task exited")
     assert causes.cause_of_task(stopped, was_ready=was_ready) is cause
 
 
-def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None:
+def test_a_server_that_spot_killed_after_its_warning_has_the_cause_spot() -> None:
     assert causes.cause_of_task(TaskStopped("SpotInterruption", 137, ""), was_ready=True) is Cause.SPOT
 
 
@@ -118,15 +118,15 @@ def test_a_spot_server_that_did_not_go_in_time_was_still_taken_by_spot() -> None
         (Refused("UnsupportedFeatureException: not in this region"), Cause.REFUSED),
     ],
 )
-def test_what_run_task_refuses_names_the_cause(error: NoCapacity | Refused, cause: Cause) -> None:
+def test_a_refusal_of_run_task_gives_the_cause(error: NoCapacity | Refused, cause: Cause) -> None:
     assert causes.cause_of_refusal(error) is cause
 
 
-def test_a_cause_of_a_later_version_is_none_that_we_know() -> None:
+def test_a_cause_of_a_later_version_is_unknown() -> None:
     assert causes.parse_cause("image") is Cause.IMAGE
     assert causes.parse_cause("") is causes.parse_cause("of a later version") is None
 
 
-def test_only_what_nobody_here_can_change_is_left_to_aws() -> None:
+def test_only_these_causes_are_the_responsibility_of_aws() -> None:
     aws = {cause for cause in Cause if cause.category is FailureCategory.AWS}
     assert aws == {Cause.CAPACITY, Cause.SPOT, Cause.MACHINE, Cause.VANISHED, Cause.UNKNOWN}

@@ -24,7 +24,7 @@ PEOPLE = ("alice", "bob")
 
 @pytest.fixture
 def platform() -> FakePlatform:
-    """Where servers of two people run, each named by a change of its own that is on its way."""
+    """An installation with the running servers of two participants, each with a pending DNS change of its own."""
     platform = FakePlatform()
     platform.dns.slow = True
     project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
@@ -53,7 +53,9 @@ def follow_ups(platform: FakePlatform) -> list[DnsChanged]:
     return [message for message in found if message]
 
 
-def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(platform: FakePlatform) -> None:
+def test_a_server_is_ready_when_its_change_is_in_sync_and_other_changes_are_checked_again(
+    platform: FakePlatform,
+) -> None:
     assert [seconds for seconds, _ in platform.bus.delayed] == [PAUSES[0]] * 2
     first, second = follow_ups(platform)
     platform.dns.pending.remove(first.change)
@@ -63,7 +65,7 @@ def test_whose_change_is_everywhere_is_ready_and_the_others_are_looked_at_again(
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
 
 
-def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> None:
+def test_all_changes_are_checked_at_the_same_time(platform: FakePlatform) -> None:
     batches: list[int] = []
     together = platform.run_all
 
@@ -78,7 +80,7 @@ def test_all_changes_are_looked_at_at_the_same_time(platform: FakePlatform) -> N
     assert states(platform) == [ServerState.READY, ServerState.READY]
 
 
-def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
+def test_only_the_message_of_a_failed_check_comes_again(platform: FakePlatform) -> None:
     first, second = follow_ups(platform)
     platform.dns.settle()
     in_sync = platform.dns.in_sync
@@ -93,7 +95,7 @@ def test_a_look_that_fails_comes_again_alone(platform: FakePlatform) -> None:
     assert states(platform) == [ServerState.NAMING, ServerState.READY]
 
 
-def test_a_change_that_waits_is_not_looked_at_twice_because_another_one_had_trouble(platform: FakePlatform) -> None:
+def test_a_pending_change_is_not_checked_twice_because_another_failed(platform: FakePlatform) -> None:
     first, second = follow_ups(platform)
     platform.dns.pending.remove(first.change)
     Servers(platform).stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
@@ -113,7 +115,7 @@ def busy(add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str
     raise ServiceBusy
 
 
-def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platform: FakePlatform) -> None:
+def test_names_that_a_busy_zone_did_not_take_are_made_soon_with_one_change(platform: FakePlatform) -> None:
     servers, change = Servers(platform), platform.dns.change
     for record in (platform.dns.records, platform.bus.delayed):
         record.clear()
@@ -136,7 +138,7 @@ def test_names_for_which_the_zone_is_too_busy_are_made_soon_and_together(platfor
     assert states(platform) == [ServerState.READY, ServerState.READY]
 
 
-def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatform) -> None:
+def test_the_name_of_a_stopped_server_is_not_made(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
     servers = Servers(platform)
     servers.stop([StopServer("maze", PEOPLE[0], 1, Reason.STOPPED)])
@@ -146,7 +148,7 @@ def test_a_name_that_nobody_waits_for_any_more_is_not_made(platform: FakePlatfor
     assert list(platform.dns.records) == [f"{name(PEOPLE[1])}.servers.example.org"]
 
 
-def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platform: FakePlatform) -> None:
+def test_after_the_last_check_the_message_for_a_busy_zone_goes_back_to_the_queue(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
     platform.dns.change = busy  # type: ignore[method-assign]
     last = DnsChanged("", [ServerAttempt(ids.server_label("maze", PEOPLE[0]), 1)], MAX_CHECKS, unmade=True)
@@ -154,7 +156,7 @@ def test_a_zone_that_is_busy_for_ever_is_left_to_the_queue_and_its_alarm(platfor
     assert not platform.bus.delayed
 
 
-def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platform: FakePlatform) -> None:
+def test_a_throttled_check_is_repeated_soon(platform: FakePlatform) -> None:
     first, second = follow_ups(platform)
 
     def throttled(change: str) -> bool:
@@ -165,7 +167,7 @@ def test_a_look_for_which_the_account_has_no_calls_left_comes_again_soon(platfor
     assert [message.looked for message in follow_ups(platform)] == [2, 2]
 
 
-def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platform: FakePlatform) -> None:
+def test_a_function_with_a_lost_attempt_in_its_cache_makes_the_next_one_ready(platform: FakePlatform) -> None:
     platform.bus.delayed.clear()
     user, one, other = "carol", Servers(platform), Servers(platform)
 
@@ -187,7 +189,7 @@ def test_a_function_that_remembers_a_lost_attempt_makes_the_next_one_ready(platf
     assert from_json(kept[0], Server).state is ServerState.READY
 
 
-def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -> None:
+def test_a_message_about_a_missing_server_is_dropped(platform: FakePlatform) -> None:
     gone = DnsChanged("", [ServerAttempt(ids.server_label("maze", "carol"), 1)])
     assert Servers(platform).dns_changed(gone) == []
 
@@ -195,10 +197,10 @@ def test_a_server_that_is_not_there_is_nobodys_trouble(platform: FakePlatform) -
 # Slow names
 
 
-CHAIN = 16  # invocations after which Lambda, by default, drops the next one of a chain (Lambda Developer Guide)
+CHAIN = 16  # after so many invocations of a chain Lambda, by default, drops the next one (Lambda Developer Guide)
 
 
-def test_lambda_would_take_two_slow_minutes_for_a_loop_if_the_template_did_not_allow_it() -> None:
+def test_two_slow_minutes_are_a_chain_that_lambda_would_stop_without_the_templates_permission() -> None:
     usual = next(looks for looks in range(MAX_CHECKS) if sum(map(pause, range(looks))) >= 60)
     slow = next(looks for looks in range(MAX_CHECKS) if sum(map(pause, range(looks))) >= 120)
     assert usual < CHAIN < slow
@@ -208,11 +210,11 @@ def test_lambda_would_take_two_slow_minutes_for_a_loop_if_the_template_did_not_a
     assert function["RecursiveLoop"] == "Allow"
 
 
-def test_the_looks_end_after_ten_minutes_or_so() -> None:
+def test_the_checks_of_a_change_end_after_about_ten_minutes() -> None:
     assert 600 <= sum(pause(looked) for looked in range(MAX_CHECKS)) <= 720
 
 
-def test_nobody_waits_much_longer_for_a_look_than_for_the_name() -> None:
+def test_the_pause_before_a_check_is_short_compared_with_the_time_waited() -> None:
     waited = 0
     for looked in range(len(PAUSES)):
         assert pause(looked) <= max(PAUSES[0] if not looked else 3, waited / 5), looked
@@ -220,7 +222,7 @@ def test_nobody_waits_much_longer_for_a_look_than_for_the_name() -> None:
 
 
 def looks(platform: FakePlatform) -> list[int]:
-    """Deliver the messages that the function sends itself until there are none; the pauses before each delivery."""
+    """Deliver the messages that the function sends itself until there are none. Returns the pause before each delivery."""
     pauses = []
     while platform.bus.delayed:
         pauses += [seconds for seconds, _ in platform.bus.delayed]
@@ -229,14 +231,14 @@ def looks(platform: FakePlatform) -> list[int]:
     return pauses
 
 
-def test_a_name_that_is_never_known_is_left_to_the_sweep(platform: FakePlatform) -> None:
+def test_a_change_that_stays_pending_is_left_to_the_sweep(platform: FakePlatform) -> None:
     platform.bus.delayed.pop()
     assert len(looks(platform)) == MAX_CHECKS
     assert states(platform) == [ServerState.NAMING] * 2
 
 
-def test_a_server_that_cannot_be_made_ready_is_not_tried_for_ever(platform: FakePlatform) -> None:
-    """Lambda is allowed this function's loop, so that nothing else would end it."""
+def test_a_server_that_cannot_be_made_ready_is_tried_a_limited_number_of_times(platform: FakePlatform) -> None:
+    """The template allows this function's loop, so Lambda would not end it."""
     platform.documents.put(server.key(ids.server_label("maze", PEOPLE[0])), b"{")
     platform.dns.settle()
     assert len(looks(platform)) <= MAX_CHECKS + 1
@@ -248,7 +250,7 @@ def running(platform: FakePlatform, user: str, interface: str) -> TaskChanged:
     return TaskChanged(task, "hippodrome", name(user), "RUNNING", interface, None, "", None)
 
 
-def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_for_ever() -> None:
+def test_an_unknown_address_is_asked_for_a_limited_number_of_times() -> None:
     platform = FakePlatform()
     project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
     platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
@@ -275,7 +277,7 @@ def test_an_address_that_is_not_known_yet_is_asked_for_in_a_moment_though_not_fo
 
 @pytest.fixture
 def by_id() -> FakePlatform:
-    """Two servers that are called after their participants, and whose tasks run."""
+    """An installation with two running servers whose names are their participants' ids."""
     platform = FakePlatform()
     platform.settings = replace(platform.settings, user_id_names=True)
     steps = [Step(key="1", page="game"), Step(key="2", page="end")]
@@ -303,21 +305,21 @@ def both(platform: FakePlatform) -> list[TaskChanged]:
     return [running(platform, user, f"eni-{number}") for number, user in enumerate(PEOPLE)]
 
 
-def test_a_name_that_the_zone_refuses_is_replaced_by_the_usual_one(by_id: FakePlatform) -> None:
+def test_a_refused_name_is_replaced_by_the_default_name(by_id: FakePlatform) -> None:
     refuse(by_id, lambda wanted: wanted.startswith("alice."))
     assert Servers(by_id).tasks_changed(both(by_id)) == []
     assert states(by_id) == [ServerState.READY, ServerState.READY]
     assert sorted(by_id.dns.records) == ["bob.servers.example.org", f"{name('alice')}.servers.example.org"]
 
 
-def test_a_server_that_can_have_no_name_comes_again_alone(by_id: FakePlatform) -> None:
+def test_only_the_event_of_a_server_whose_names_are_refused_comes_again(by_id: FakePlatform) -> None:
     refuse(by_id, lambda wanted: wanted.startswith(("alice.", name("alice"))))
     events = both(by_id)
     assert Servers(by_id).tasks_changed(events) == events[:1]
     assert states(by_id) == [ServerState.NAMING, ServerState.READY]
 
 
-def test_a_refused_name_comes_again_alone_when_it_is_made_later_too(by_id: FakePlatform) -> None:
+def test_only_the_follow_up_of_a_refused_name_comes_again(by_id: FakePlatform) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(by_id.dns, "change", busy)
         assert Servers(by_id).tasks_changed(both(by_id)) == []

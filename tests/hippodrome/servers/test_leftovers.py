@@ -100,17 +100,17 @@ TABLE: list[tuple[str, str, Server | None, bool, dict[str, LeftoverReason | None
 
 @pytest.mark.parametrize("scope", ["SWEEP", "EARLY", "STOP", "STOP_MAZE", "STOP_OTHER", "ERASE"])
 @pytest.mark.parametrize(("name", "owner", "ours", "whys"), [row[1:] for row in TABLE], ids=[row[0] for row in TABLE])
-def test_why_a_resource_is_left_over(
+def test_the_reason_for_which_a_resource_is_left_over(
     name: str, owner: Server | None, ours: bool, whys: dict[str, LeftoverReason | None], scope: str
 ) -> None:
     assert why_left_over(name, owner, globals()[scope], ours=ours) is whys.get(scope)
 
 
-def test_a_resource_may_be_another_installations_unless_it_is_said_to_be_ours() -> None:
+def test_without_ours_a_resource_may_be_another_installations() -> None:
     assert why_left_over(FIRST, None, STOP) is None
 
 
-def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None:
+def test_only_stop_removes_leftovers_of_a_record_without_the_time_of_closing() -> None:
     undated = msgspec.structs.replace(CLOSED, closed=None)
     assert why_left_over(SECOND, undated, SWEEP) is None
     assert why_left_over(SECOND, undated, STOP) is LeftoverReason.CLOSED
@@ -128,12 +128,14 @@ def test_a_record_that_does_not_say_when_it_was_closed_is_left_to_stop() -> None
         ("www", None, timedelta(days=1), None),
     ],
 )
-def test_why_a_slot_is_left_over(name: str, owner: Server | None, after: timedelta, why: LeftoverReason | None) -> None:
+def test_the_reason_for_which_a_slot_is_left_over(
+    name: str, owner: Server | None, after: timedelta, why: LeftoverReason | None
+) -> None:
     assert why_slot_left_over(name, owner, LATER + after) is why
 
 
-def test_of_each_kind_what_is_left_over_is_found() -> None:
-    """Tasks in the installation's cluster and timers can only be its own; names and other clusters may be another's."""
+def test_leftovers_of_every_kind_are_found() -> None:
+    """Tasks in the installation's cluster and timers can only be its own; names and other clusters may be another installation's."""
     named = server.naming(CLOSED, "task/2", Address("203.0.113.2", 443), NOW)
     closed = server.close(named, Reason.STOPPED, LATER)
     strange = ids.server_name(ids.server_label("maze", "bob"), 1)

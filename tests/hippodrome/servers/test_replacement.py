@@ -51,7 +51,7 @@ LOST = server.close(new_record(), Reason.LOST, LATER)
         (TWO_GAMES, ["1"], [2]),
         (TWO_GAMES, ["1", "2"], []),
         (NO_GAME, [], [2]),
-        (study(live=False), ["3"], [2]),  # start_server drops the message, unless the study is live again by then
+        (study(live=False), ["3"], [2]),  # start_server drops the message unless the study is live again
     ],
 )
 def test_a_lost_server_is_replaced_unless_all_its_games_are_answered(

@@ -1,4 +1,4 @@
-"""What exists of the servers: all kinds are listed, or nothing; and what belongs to which server."""
+"""The servers' resources: all kinds are listed or none, and each belongs to one server."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_all_kinds_are_listed() -> None:
     assert found.cluster == platform.settings.cluster
 
 
-def test_a_listing_that_fails_is_no_empty_listing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_listing_raises_and_is_not_empty(monkeypatch: pytest.MonkeyPatch) -> None:
     platform = FakePlatform()
 
     def refused() -> None:
@@ -42,18 +42,18 @@ def test_a_listing_that_fails_is_no_empty_listing(monkeypatch: pytest.MonkeyPatc
         resources.list_resources(platform)
 
 
-def test_both_timers_of_a_server_are_its() -> None:
+def test_both_timers_belong_to_their_server() -> None:
     assert FOUND.only(lambda name: name == ALICE).timers == [ALICE, f"{ALICE}-delay"]
 
 
-def test_what_only_this_installation_can_have_made_is_judged_by_itself() -> None:
-    """Tasks in its cluster and timers are its own; the zone and the account's other clusters may hold another's."""
+def test_resources_that_only_this_installation_can_have_made_have_a_condition_of_their_own() -> None:
+    """Tasks in its cluster and timers are its own; the zone and the account's other clusters may hold another installation's."""
     kept = FOUND.only(lambda _: False, ours=lambda _: True)
     assert [task.task for task in kept.tasks] == ["task/1"]
     assert kept.timers == FOUND.timers
     assert (kept.dns_records, kept.clusters) == ([], [])
 
 
-def test_nothing_is_false() -> None:
+def test_empty_resources_are_false() -> None:
     assert FOUND
     assert not FOUND.only(lambda _: False)

@@ -76,13 +76,13 @@ def test_a_start_schedules_the_shutdown_and_runs_one_task_on_spot(platform: Fake
     assert record(platform).state is ServerState.STARTING
 
 
-def test_the_installations_limit_is_stronger_than_the_projects() -> None:
+def test_the_installations_max_runtime_limits_the_projects() -> None:
     platform = installed(study(max_runtime=600))
     Servers(platform).start(START)
     assert (record(platform).deadline - platform.now()).total_seconds() == 120 * 60
 
 
-def test_a_start_message_that_comes_often_starts_one_server(platform: FakePlatform, servers: Servers) -> None:
+def test_repeated_start_messages_start_one_server(platform: FakePlatform, servers: Servers) -> None:
     for _ in range(3):
         servers.start(START)
     assert len(platform.tasks.by_name) == 1
@@ -94,7 +94,9 @@ def test_two_functions_with_the_same_message_start_one_server(platform: FakePlat
     assert len(platform.tasks.running) == 1
 
 
-def test_the_trial_is_told_what_it_needs_and_where_it_writes(platform: FakePlatform, servers: Servers) -> None:
+def test_the_trial_gets_its_settings_and_the_address_for_its_documents(
+    platform: FakePlatform, servers: Servers
+) -> None:
     servers.start(START)
     (request,) = platform.tasks.running.values()
     env = request.environment
@@ -111,7 +113,7 @@ def test_without_spot_capacity_the_server_runs_on_demand(platform: FakePlatform,
     assert not request.spot
 
 
-def test_what_aws_refuses_is_closed_with_its_reason_and_leaves_nothing(
+def test_a_server_that_aws_refuses_is_closed_with_the_reason_and_leaves_nothing(
     platform: FakePlatform, servers: Servers
 ) -> None:
     platform.tasks.fail = [Refused("no such task definition")]
@@ -139,7 +141,7 @@ def test_a_start_for_a_closed_study_starts_nothing() -> None:
     assert nothing_left(platform)
 
 
-def test_a_server_stopped_while_it_starts_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
+def test_a_server_that_is_stopped_while_it_starts_leaves_nothing(platform: FakePlatform, servers: Servers) -> None:
     run = platform.tasks.run
 
     def be_stopped_and_run(request: object) -> str:
@@ -193,14 +195,14 @@ def test_of_two_tasks_for_one_server_the_end_of_the_second_changes_nothing(
     assert platform.timers.due
 
 
-def test_a_start_that_comes_after_the_stop_starts_nothing(platform: FakePlatform, servers: Servers) -> None:
+def test_a_start_message_after_the_stop_starts_nothing(platform: FakePlatform, servers: Servers) -> None:
     servers.stop([STOP])
     servers.start(START)
     assert nothing_left(platform)
     assert not platform.tasks.by_name
 
 
-def test_a_cluster_of_ones_own_comes_and_goes_with_the_server() -> None:
+def test_a_participants_own_cluster_is_made_and_removed_with_the_server() -> None:
     platform = installed(study(cluster="participant"))
     servers = Servers(platform)
     servers.start(START)
@@ -212,7 +214,7 @@ def test_a_cluster_of_ones_own_comes_and_goes_with_the_server() -> None:
 # Names
 
 
-def test_a_running_server_is_named_and_ready_once_the_name_is_known_everywhere(
+def test_a_running_server_is_named_and_then_ready_when_the_change_is_in_sync(
     platform: FakePlatform, servers: Servers
 ) -> None:
     platform.dns.slow = True
@@ -252,14 +254,14 @@ def test_events_that_come_twice_or_late_change_nothing(platform: FakePlatform, s
     assert nothing_left(platform)
 
 
-def test_a_server_without_an_address_yet_is_looked_at_again(platform: FakePlatform, servers: Servers) -> None:
+def test_a_server_without_an_address_is_checked_again_later(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     early = event(platform, "RUNNING", interface="eni-bare")
     assert servers.tasks_changed([early]) == []
     assert len(platform.bus.delayed) == 1
 
 
-def test_a_name_made_while_the_server_was_stopped_does_not_stay(platform: FakePlatform, servers: Servers) -> None:
+def test_a_name_that_was_made_while_the_server_was_stopped_is_removed(platform: FakePlatform, servers: Servers) -> None:
     platform.dns.slow = True
     servers.start(START)
     change = platform.dns.change
@@ -277,7 +279,7 @@ def test_a_name_made_while_the_server_was_stopped_does_not_stay(platform: FakePl
     assert nothing_left(platform)
 
 
-def test_hippos_names_are_the_participants_ids() -> None:
+def test_with_subdomain_userid_a_servers_name_is_the_participants_id() -> None:
     platform = installed(study(subdomain="userId"))
     servers = Servers(platform)
     servers.start(StartServer("maze", "Alice"))
@@ -289,7 +291,7 @@ def test_hippos_names_are_the_participants_ids() -> None:
 
 
 @pytest.mark.parametrize("allowed", [True, False])
-def test_an_id_becomes_a_name_on_the_servers_level_only_and_only_where_that_is_allowed(allowed: bool) -> None:
+def test_an_id_becomes_a_name_only_on_the_servers_level_and_only_where_allowed(allowed: bool) -> None:
     platform = installed(study(subdomain="userId"))
     platform.settings = replace(platform.settings, user_id_names=allowed)
     servers = Servers(platform)
@@ -313,7 +315,7 @@ FRONT_END = ["https://play.example.org", "http://localhost:3000"]
         (False, {"plain_clients": True, "front_end": FRONT_END}, "alice", None),
     ],
 )
-def test_a_server_lets_a_front_end_in_without_a_token_only_where_project_and_installation_say_so(
+def test_a_server_accepts_front_ends_without_tokens_only_if_project_and_installation_allow_it(
     allowed: bool, project: dict[str, object], user: str, told: str | None
 ) -> None:
     platform = installed(study(subdomain="userId", **project))
@@ -323,7 +325,7 @@ def test_a_server_lets_a_front_end_in_without_a_token_only_where_project_and_ins
     assert request.environment.get("PLAIN_ORIGINS") == told
 
 
-def test_a_warm_server_lets_no_front_end_in_without_a_token() -> None:
+def test_a_warm_server_accepts_no_front_end_without_a_token() -> None:
     platform = installed(study(warm_servers=1, plain_clients=True, front_end=FRONT_END))
     platform.settings = replace(platform.settings, plain_clients=True)
     Servers(platform).start(StartServer("maze", ids.warm_id("maze", platform.now(), 1)))
@@ -335,7 +337,7 @@ def test_a_warm_server_lets_no_front_end_in_without_a_token() -> None:
 # Stop
 
 
-def test_a_stop_leaves_nothing_and_works_as_often_as_it_comes(platform: FakePlatform, servers: Servers) -> None:
+def test_a_stop_leaves_nothing_and_may_be_repeated(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "RUNNING")])
     for _ in range(3):
@@ -344,9 +346,7 @@ def test_a_stop_leaves_nothing_and_works_as_often_as_it_comes(platform: FakePlat
     assert record(platform).reason is Reason.STOPPED
 
 
-def test_a_late_deadline_of_an_earlier_server_does_not_stop_its_successor(
-    platform: FakePlatform, servers: Servers
-) -> None:
+def test_a_late_deadline_of_an_earlier_attempt_does_not_stop_the_next(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
     servers.start(StartServer("maze", "alice", 2))
@@ -355,9 +355,7 @@ def test_a_late_deadline_of_an_earlier_server_does_not_stop_its_successor(
     assert not record(platform).is_closed
 
 
-def test_a_stop_finds_a_task_whose_start_was_cut_off_before_it_was_recorded(
-    platform: FakePlatform, servers: Servers
-) -> None:
+def test_a_stop_finds_a_task_that_was_started_and_not_recorded(platform: FakePlatform, servers: Servers) -> None:
     run = platform.tasks.run
 
     def run_and_crash(request: object) -> str:
@@ -385,7 +383,7 @@ def test_two_stops_at_the_same_moment_are_both_done(platform: FakePlatform, serv
     assert nothing_left(platform)
 
 
-def test_one_server_that_cannot_be_stopped_does_not_keep_the_others(platform: FakePlatform, servers: Servers) -> None:
+def test_a_server_that_cannot_be_stopped_does_not_prevent_the_others(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.start(StartServer("maze", "bob"))
     stop = platform.tasks.stop
@@ -400,7 +398,7 @@ def test_one_server_that_cannot_be_stopped_does_not_keep_the_others(platform: Fa
     assert len(platform.tasks.running) == 1
 
 
-# Ends nobody asked for
+# Servers that end without a stop message
 
 
 def test_a_trial_that_ended_by_itself_is_cleaned_up_and_not_replaced(platform: FakePlatform, servers: Servers) -> None:
@@ -436,7 +434,7 @@ def test_a_lost_server_is_replaced_up_to_three_times(
     assert requestable_attempt(record(platform)) is not None
 
 
-def test_a_replacement_has_a_token_of_its_own(platform: FakePlatform, servers: Servers) -> None:
+def test_a_replacement_has_its_own_token(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     first = token(platform)
     servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
@@ -444,7 +442,7 @@ def test_a_replacement_has_a_token_of_its_own(platform: FakePlatform, servers: S
     assert token(platform) != first
 
 
-def test_a_replacement_whose_message_was_lost_is_asked_for_again(platform: FakePlatform, servers: Servers) -> None:
+def test_a_lost_message_for_a_replacement_is_sent_again(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     publish = platform.bus.publish
     platform.bus.publish = None  # type: ignore[assignment,method-assign] # the function dies right here
@@ -470,7 +468,7 @@ def test_a_server_taken_by_spot_is_replaced_as_soon_as_its_container_has_ended(
 
 
 @pytest.mark.parametrize("late", ["RUNNING", "DEPROVISIONING", "STOPPED"])
-def test_what_is_told_late_of_a_replaced_server_does_not_touch_its_successor(
+def test_a_late_event_of_a_replaced_server_does_not_change_its_successor(
     platform: FakePlatform, servers: Servers, late: str
 ) -> None:
     servers.start(START)
@@ -482,7 +480,9 @@ def test_what_is_told_late_of_a_replaced_server_does_not_touch_its_successor(
     assert len(platform.bus.sent) == 1
 
 
-def test_a_server_that_never_ran_is_replaced_as_soon_as_that_is_told(platform: FakePlatform, servers: Servers) -> None:
+def test_a_server_that_never_ran_is_replaced_at_the_first_event_that_says_so(
+    platform: FakePlatform, servers: Servers
+) -> None:
     servers.start(START)
     told = event(platform, "DEPROVISIONING", stop_code="TaskFailedToStart")
     servers.tasks_changed([told._replace(stopped_reason="CannotPullContainerError: not found")])
@@ -490,7 +490,7 @@ def test_a_server_that_never_ran_is_replaced_as_soon_as_that_is_told(platform: F
     assert [message["attempt"] for _, message in platform.bus.sent] == [2]
 
 
-def test_a_trial_that_ended_by_itself_is_over_at_once(platform: FakePlatform, servers: Servers) -> None:
+def test_a_trial_that_ended_by_itself_is_closed_at_its_first_event(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "DEPROVISIONING", stop_code="EssentialContainerExited", exit_code=0)])
     assert (record(platform).reason, record(platform).cause) == (Reason.ENDED, "")
@@ -506,7 +506,7 @@ def own(platform: FakePlatform, status: str, code: str = "SpotInterruption") -> 
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-def test_a_cluster_that_its_task_has_not_left_yet_keeps_nobody_waiting_and_goes_with_the_last_event(
+def test_a_cluster_that_still_has_its_task_delays_no_replacement_and_is_removed_at_the_last_event(
     replaced: bool,
 ) -> None:
     platform = installed(study(cluster="participant"))
@@ -521,21 +521,21 @@ def test_a_cluster_that_its_task_has_not_left_yet_keeps_nobody_waiting_and_goes_
     assert platform.tasks.own_clusters == ({f"{LABEL}-2"} if replaced else set())
 
 
-def test_a_cluster_whose_last_event_was_lost_is_swept() -> None:
+def test_the_sweep_removes_a_cluster_whose_last_event_was_lost() -> None:
     platform = installed(study(cluster="participant"))
     servers = Servers(platform)
     servers.start(START)
     servers.tasks_changed([own(platform, "DEPROVISIONING", "EssentialContainerExited")._replace(exit_code=0)])
-    own(platform, "STOPPED")  # which nobody hears of
+    own(platform, "STOPPED")  # the event is not delivered
     Sweep(platform).run()
     assert nothing_left(platform)
 
 
-# Why it failed
+# Causes
 
 
 @pytest.mark.parametrize(("state", "cause"), [("starting", Cause.ENDED_AT_ONCE), ("ready", Cause.CRASHED)])
-def test_whether_anybody_could_play_makes_a_difference(
+def test_the_cause_depends_on_whether_the_server_was_ready(
     platform: FakePlatform, servers: Servers, state: str, cause: Cause
 ) -> None:
     servers.start(START)
@@ -547,7 +547,7 @@ def test_whether_anybody_could_play_makes_a_difference(
     assert servers.failures() == []
 
 
-def test_the_causes_of_earlier_attempts_are_remembered(platform: FakePlatform, servers: Servers) -> None:
+def test_the_record_keeps_the_causes_of_earlier_attempts(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "STOPPED", stop_code="SpotInterruption")])
     servers.start(StartServer("maze", "alice", 2))
@@ -559,7 +559,7 @@ def test_the_causes_of_earlier_attempts_are_remembered(platform: FakePlatform, s
     ("error", "cause"),
     [(Refused("ClientException: TaskDefinition not found."), Cause.DEFINITION), (NoCapacity("full"), Cause.CAPACITY)],
 )
-def test_what_aws_refuses_stands_in_the_record(
+def test_the_record_holds_the_cause_of_a_refusal_by_aws(
     platform: FakePlatform, servers: Servers, error: Exception, cause: Cause
 ) -> None:
     platform.tasks.fail = [error, error]
@@ -575,14 +575,16 @@ def test_a_server_that_was_stopped_has_not_failed(platform: FakePlatform, server
     assert servers.failures() == []
 
 
-def test_a_task_of_another_installation_is_left_alone(platform: FakePlatform, servers: Servers) -> None:
+def test_events_of_another_installations_tasks_change_nothing(platform: FakePlatform, servers: Servers) -> None:
     name = ids.server_name(ids.server_label("other", "bob"), 1)
     servers.tasks_changed([TaskChanged("arn:x", "c", name, s, "eni-1", None, "", None) for s in ("RUNNING", "STOPPED")])
     assert platform.dns.changes == 0
     assert not platform.tasks.stopped
 
 
-def test_a_record_that_keeps_changing_is_left_to_the_queue(platform: FakePlatform, servers: Servers) -> None:
+def test_the_event_for_a_record_that_keeps_changing_goes_back_to_the_queue(
+    platform: FakePlatform, servers: Servers
+) -> None:
     servers.start(START)
     key = server.key(LABEL)
 
@@ -597,7 +599,7 @@ def test_a_record_that_keeps_changing_is_left_to_the_queue(platform: FakePlatfor
     assert record(platform).state is ServerState.READY
 
 
-def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatform, servers: Servers) -> None:
+def test_servers_of_a_closed_project_can_still_be_stopped(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     platform.documents.put(MASTER_LIST, to_json(MasterList([study(live=False)])))
     platform.wait(seconds=60)
@@ -605,9 +607,7 @@ def test_a_project_taken_offline_still_lets_its_servers_go(platform: FakePlatfor
     assert nothing_left(platform)
 
 
-def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
-    platform: FakePlatform, servers: Servers
-) -> None:
+def test_a_crashed_start_is_ended_if_the_study_was_closed_meanwhile(platform: FakePlatform, servers: Servers) -> None:
     platform.tasks.fail = [ConnectionError()]
     with pytest.raises(ConnectionError):
         servers.start(START)
@@ -622,12 +622,10 @@ def test_a_start_that_crashed_in_a_study_that_was_closed_meanwhile_is_ended(
     assert nothing_left(platform)
 
 
-# What it cost
+# Earlier attempts, for the costs
 
 
-def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
-    platform: FakePlatform, servers: Servers
-) -> None:
+def test_the_record_keeps_the_earlier_attempts_with_times_and_sizes(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "RUNNING")])
     platform.wait(minutes=5)
@@ -648,9 +646,7 @@ def test_the_record_remembers_the_attempts_before_and_what_they_ran_on(
 # Messages that come again
 
 
-def test_a_start_message_that_comes_again_stops_no_game_of_a_study_that_was_closed(
-    platform: FakePlatform, servers: Servers
-) -> None:
+def test_a_repeated_start_message_stops_no_game_of_a_closed_study(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     servers.tasks_changed([event(platform, "RUNNING")])
     assert record(platform).state is ServerState.READY

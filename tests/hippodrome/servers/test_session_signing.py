@@ -59,7 +59,9 @@ def ask(world: World, *wishes: dict[str, Any], record: Server | None = None, nam
     ],
     ids=str,
 )  # fmt: skip
-def test_it_gets_requests_for_the_session_and_for_the_answer_of_each_member(world: World, wish: dict[str, Any]) -> None:
+def test_a_sessions_server_gets_requests_for_the_session_and_each_members_answer(
+    world: World, wish: dict[str, Any]
+) -> None:
     form(world, "alice", "bob")
     assert ask(world, wish) == 200
 
@@ -76,19 +78,19 @@ def test_it_gets_requests_for_the_session_and_for_the_answer_of_each_member(worl
     ],
     ids=str,
 )  # fmt: skip
-def test_it_gets_no_request_for_anything_else(world: World, wish: dict[str, Any]) -> None:
+def test_a_sessions_server_gets_no_request_for_anything_else(world: World, wish: dict[str, Any]) -> None:
     form(world, "alice", "bob")
     assert ask(world, wish) == 403
 
 
-def test_before_the_session_is_formed_it_may_look_for_its_document_alone(world: World) -> None:
+def test_before_the_session_is_formed_its_server_may_read_only_its_document_and_certificate(world: World) -> None:
     assert ask(world, get(DOCUMENT), get(PRIVKEY)) == 200
     for wish in (put(answer("alice")), get(answer("alice")), put(answer(""))):
         assert ask(world, wish) == 403
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b'{"id": "s.1"}'])
-def test_a_document_that_cannot_be_read_names_no_member(world: World, body: bytes) -> None:
+def test_an_unreadable_session_document_allows_no_members_answer(world: World, body: bytes) -> None:
     world.documents.keep(DOCUMENT, body)
     assert ask(world, put(answer("alice"))) == 403
     assert ask(world, put(RECORDING)) == 200, "the recording is kept"
@@ -108,7 +110,7 @@ def test_the_next_server_of_the_session_reads_what_the_earlier_ones_recorded(wor
     assert ask(world, put(RECORDING), record=second) == 403
 
 
-def test_who_is_told_to_stop_may_still_store_the_answers_of_all(world: World) -> None:
+def test_a_stopped_server_may_still_store_the_answers_of_all_members(world: World) -> None:
     form(world, "alice", "bob")
     world.keep(server.close(claim(world), Reason.STOPPED, world.now()))
     world.wait(seconds=STORE_AFTER_CLOSE.total_seconds() - 1)
@@ -118,7 +120,7 @@ def test_who_is_told_to_stop_may_still_store_the_answers_of_all(world: World) ->
     assert ask(world, put(answer("alice"))) == 403
 
 
-def test_a_warm_server_that_was_given_to_a_session_is_the_sessions(world: World) -> None:
+def test_a_warm_server_that_was_assigned_to_a_session_has_the_sessions_rights(world: World) -> None:
     form(world, "alice", "bob")
     warm = world.keep(world.claim(WARM_ID, project=PAIRS, state=server.ServerState.READY))
     world.keep(server.handed_over(warm, claim(world).label, world.now()))
@@ -134,7 +136,7 @@ def test_a_server_of_one_participant_reads_no_session(world: World) -> None:
         assert ask(world, wish, record=alice) == 403
 
 
-def test_it_costs_one_read_more_than_for_one_participant(world: World) -> None:
+def test_requests_of_a_sessions_server_cost_one_read_more(world: World) -> None:
     form(world, "alice", "bob")
     ask(world, get(DOCUMENT))  # the secret is read once
     for wish, calls in ((get(DOCUMENT), ["get", "get"]), (put(RECORDING), ["get", "get", "list"])):
@@ -153,7 +155,7 @@ def matching(world: World) -> Server:
 
 
 @pytest.mark.parametrize("wish", MATCHING, ids=str)
-def test_only_without_members_it_may_say_who_plays_with_whom(
+def test_only_a_server_without_members_may_answer_questions_of_match(
     world: World, matching: Server, wish: dict[str, Any]
 ) -> None:
     assert ask(world, wish, record=matching) == 200
@@ -162,7 +164,7 @@ def test_only_without_members_it_may_say_who_plays_with_whom(
 
 
 @pytest.mark.parametrize("wish", MATCHING, ids=str)
-def test_servers_of_other_projects_are_not_asked_who_plays_with_whom(world: World, wish: dict[str, Any]) -> None:
+def test_servers_of_projects_without_match_may_not_answer_its_questions(world: World, wish: dict[str, Any]) -> None:
     assert ask(world, wish) == 403
 
 
@@ -175,7 +177,7 @@ def test_servers_of_other_projects_are_not_asked_who_plays_with_whom(world: Worl
     ],
     ids=str,
 )  # fmt: skip
-def test_without_members_it_gets_nothing_else_of_the_lobby(
+def test_a_server_without_members_gets_nothing_else_of_the_lobby(
     world: World, matching: Server, wish: dict[str, Any]
 ) -> None:
     assert ask(world, wish, record=matching) == 403

@@ -73,7 +73,7 @@ def record(platform: FakePlatform, session: str = SESSION) -> Server:
 
 
 def runs(platform: FakePlatform, servers: Servers) -> None:
-    """Every task that was started runs, has its name, and is ready."""
+    """Let all started tasks run, get their names, and become ready."""
     servers.tasks_changed(events(platform, "RUNNING"))
     for _, message in platform.bus.delayed:
         changed = messages.parse_dns_changed(json.loads(json.dumps(message)))
@@ -96,7 +96,7 @@ def nothing_left(platform: FakePlatform) -> bool:
 # Start
 
 
-def test_a_session_gets_a_server_of_its_own_once(platform: FakePlatform, servers: Servers) -> None:
+def test_a_session_gets_one_server_of_its_own(platform: FakePlatform, servers: Servers) -> None:
     for _ in range(3):
         servers.start(START)
     (request,) = platform.tasks.running.values()
@@ -107,7 +107,7 @@ def test_a_session_gets_a_server_of_its_own_once(platform: FakePlatform, servers
     }  # fmt: skip
 
 
-def test_its_server_is_told_the_session_and_no_participant(platform: FakePlatform, servers: Servers) -> None:
+def test_a_sessions_server_gets_the_session_and_no_participant(platform: FakePlatform, servers: Servers) -> None:
     servers.start(START)
     (request,) = platform.tasks.running.values()
     env = request.environment
@@ -116,7 +116,7 @@ def test_its_server_is_told_the_session_and_no_participant(platform: FakePlatfor
     assert env["DEADLINE"] == str(int(record(platform).deadline.timestamp()))
 
 
-def test_no_server_of_a_project_without_sessions_is_told_one() -> None:
+def test_servers_of_a_project_without_sessions_get_none() -> None:
     platform = installed()
     Servers(platform).start(StartServer("maze", "alice"))
     (request,) = platform.tasks.running.values()
@@ -126,7 +126,9 @@ def test_no_server_of_a_project_without_sessions_is_told_one() -> None:
 @pytest.mark.parametrize(("limit", "waits", "lives"), [
     (24 * 60, 30, 90), (90, 30, 90), (75, 15, 75), (65, 10, 65), (60, 10, 60), (45, 10, 45),
 ])  # fmt: skip
-def test_its_deadline_leaves_those_who_are_matched_last_their_time(limit: int, waits: int, lives: int) -> None:
+def test_the_deadline_of_a_sessions_server_includes_the_wait_for_its_members(
+    limit: int, waits: int, lives: int
+) -> None:
     platform = installed(pairs())
     platform.settings = Settings(root_domain="example.org", max_runtime=limit)
     Servers(platform).start(START)
@@ -155,7 +157,7 @@ def test_a_start_message_of_a_participant_starts_no_server_of_their_own(
     assert server.key(ids.server_label("maze", "alice")) not in platform.documents.kept
 
 
-def test_no_session_is_started_in_a_project_that_has_none_any_more(platform: FakePlatform) -> None:
+def test_no_sessions_server_starts_in_a_project_that_has_no_sessions_any_more(platform: FakePlatform) -> None:
     servers = Servers(platform)
     servers.start(START)
     platform.documents.keep(MASTER_LIST, to_json(MasterList([study()])))
@@ -167,7 +169,7 @@ def test_no_session_is_started_in_a_project_that_has_none_any_more(platform: Fak
     assert nothing_left(platform)
 
 
-def test_a_message_that_names_no_session_is_dropped() -> None:
+def test_a_message_with_a_malformed_session_id_is_dropped() -> None:
     for forged in ("s.", "s.xyz", "s." + "0" * 19, "s." + "0" * 21, "s." + "A" * 20, SESSION + "/..", " " + SESSION):
         body = {"projectId": "maze", "userId": forged}
         assert messages.parse_start_server(body) is None, forged
@@ -194,7 +196,7 @@ def test_a_warm_server_is_handed_over_to_a_session() -> None:
     assert (record(platform).deadline - platform.now()) == timedelta(minutes=90)
 
 
-def test_a_warm_server_that_is_taken_at_the_last_moment_leaves_a_session_all_its_time() -> None:
+def test_a_session_has_its_whole_time_on_a_warm_server_that_was_taken_at_the_last_moment() -> None:
     platform = installed(pairs(warm_servers=1, version="v1"))
     platform.settings = Settings(root_domain="example.org", max_runtime=150)
     servers = Servers(platform)
@@ -225,7 +227,7 @@ def test_a_lost_server_is_replaced_for_all_members(platform: FakePlatform, serve
 
 
 @pytest.mark.parametrize(("played", "replaced"), [((), True), (("alice",), True), (MEMBERS, False)])
-def test_it_is_replaced_until_all_have_finished_their_games(
+def test_a_sessions_server_is_replaced_until_all_members_have_finished_their_games(
     platform: FakePlatform, servers: Servers, played: tuple[str, ...], replaced: bool
 ) -> None:
     form(platform)
@@ -242,7 +244,9 @@ def test_a_server_that_was_started_ahead_is_replaced_too(platform: FakePlatform,
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 2})]
 
 
-def test_a_member_whose_data_were_erased_is_waited_for_no_longer(platform: FakePlatform, servers: Servers) -> None:
+def test_the_game_of_an_erased_member_is_no_reason_to_replace_the_server(
+    platform: FakePlatform, servers: Servers
+) -> None:
     form(platform)
     one = SessionDocument(SESSION, 2, (Member("", None, 0), Member("bob", None, 1)))
     platform.documents.put(session_key("maze", SESSION), one.to_json())
@@ -271,10 +275,10 @@ def test_a_stop_that_overtakes_the_start_leaves_no_server(platform: FakePlatform
 
 
 @pytest.mark.parametrize("first", MEMBERS)
-def test_it_is_stopped_when_the_last_member_reaches_the_stop_step(
+def test_a_sessions_server_is_stopped_when_the_last_member_reaches_the_stop_step(
     platform: FakePlatform, servers: Servers, first: str
 ) -> None:
-    """The message of the last member comes before their answer is stored."""
+    """The stop message of the last member comes before their answer is stored."""
     last = next(user for user in MEMBERS if user != first)
     form(platform)
     servers.start(START)
@@ -288,7 +292,7 @@ def test_it_is_stopped_when_the_last_member_reaches_the_stop_step(
     assert nothing_left(platform)
 
 
-def test_the_messages_of_both_members_in_one_batch_stop_it_once(platform: FakePlatform) -> None:
+def test_the_stop_messages_of_both_members_in_one_batch_stop_the_server_once(platform: FakePlatform) -> None:
     platform = installed(pairs(max_servers=3, max_server_hours=10))
     servers = Servers(platform)
     form(platform)
@@ -305,8 +309,8 @@ def test_the_messages_of_both_members_in_one_batch_stop_it_once(platform: FakePl
     assert slots.used == 10 * 60
 
 
-def test_a_participants_stop_leaves_no_record_of_theirs(platform: FakePlatform, servers: Servers) -> None:
-    """Neither a tombstone for a member, nor for one who was never matched."""
+def test_a_members_stop_message_leaves_no_record_of_their_own(platform: FakePlatform, servers: Servers) -> None:
+    """There is no record of a stopped server for a member, nor for a participant who was never matched."""
     form(platform)
     before = {key for key in platform.documents.kept if key.startswith(server.RECORDS)}
     for user in ("alice", "carol"):
@@ -314,7 +318,9 @@ def test_a_participants_stop_leaves_no_record_of_theirs(platform: FakePlatform, 
     assert {key for key in platform.documents.kept if key.startswith(server.RECORDS)} == before
 
 
-def test_a_stop_in_all_projects_ends_no_session_that_another_plays(platform: FakePlatform, servers: Servers) -> None:
+def test_a_stop_in_all_projects_ends_no_session_that_another_member_plays(
+    platform: FakePlatform, servers: Servers
+) -> None:
     form(platform)
     servers.start(START)
     answer(platform, "alice", "1", "2", "3")
@@ -325,7 +331,7 @@ def test_a_stop_in_all_projects_ends_no_session_that_another_plays(platform: Fak
     assert record(platform).reason is Reason.STOPPED
 
 
-def test_a_server_from_before_the_project_had_sessions_is_stopped_as_ever() -> None:
+def test_a_server_from_before_the_project_had_sessions_is_stopped_as_usual() -> None:
     platform = installed(study())
     Servers(platform).start(StartServer("maze", "alice"))
     platform.documents.put(MASTER_LIST, to_json(MasterList([pairs()])))
@@ -367,7 +373,7 @@ def test_a_member_cannot_stop_the_server_of_the_others(relays: FakePlatform, ser
     assert record(relays).state is ServerState.STARTING
 
 
-def test_a_members_token_is_their_own(relays: FakePlatform, servers: Servers) -> None:
+def test_each_member_has_their_own_token(relays: FakePlatform, servers: Servers) -> None:
     form(relays)
     servers.start(START)
     for user in MEMBERS:
@@ -387,7 +393,7 @@ def test_the_relays_do_not_take_a_sessions_id_for_a_participant(relays: FakePlat
     assert relays.bus.sent == []
 
 
-def test_a_members_delayed_stop_does_not_replace_anothers(relays: FakePlatform, servers: Servers) -> None:
+def test_a_members_delayed_stop_does_not_replace_another_members(relays: FakePlatform, servers: Servers) -> None:
     form(relays)
     servers.start(START)
     for user in MEMBERS:
@@ -406,7 +412,7 @@ def test_a_member_asks_for_the_next_server_of_their_session(relays: FakePlatform
     assert relays.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 4})]
 
 
-def test_one_who_waits_in_the_lobby_may_leave_it_by_the_relay(relays: FakePlatform) -> None:
+def test_a_participant_in_the_lobby_may_leave_it_by_the_relay(relays: FakePlatform) -> None:
     answer(relays, "carol", "1", "2")
     assert ask(send_stop_server_message, "carol", **proof("carol")) == 202
     assert relays.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "carol"})]
@@ -415,10 +421,10 @@ def test_one_who_waits_in_the_lobby_may_leave_it_by_the_relay(relays: FakePlatfo
 # The sweep
 
 
-def test_a_server_that_no_lobby_lists_and_no_session_was_formed_for_is_stopped(
+def test_the_sweep_stops_a_server_that_no_lobby_lists_and_no_formed_session_has(
     platform: FakePlatform, servers: Servers
 ) -> None:
-    """Started ahead and not needed, by a forged or late message, or its lobby's document was lost."""
+    """It was started ahead and is not needed, a forged or late message started it, or the lobby's document was lost."""
     servers.start(START)
     runs(platform, servers)
     swept = Sweep(platform).run()
@@ -429,7 +435,7 @@ def test_a_server_that_no_lobby_lists_and_no_session_was_formed_for_is_stopped(
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"open": 3}'])
-def test_it_is_stopped_too_if_the_lobbys_document_cannot_be_read(
+def test_the_sweep_stops_a_server_that_no_session_has_if_the_lobbys_document_cannot_be_read(
     platform: FakePlatform, servers: Servers, body: bytes
 ) -> None:
     servers.start(START)
@@ -440,7 +446,7 @@ def test_it_is_stopped_too_if_the_lobbys_document_cannot_be_read(
     assert record(platform).reason is Reason.STOPPED
 
 
-def test_a_session_that_was_formed_goes_on(platform: FakePlatform, servers: Servers) -> None:
+def test_the_sweep_does_not_stop_the_server_of_a_formed_session(platform: FakePlatform, servers: Servers) -> None:
     form(platform)
     servers.start(START)
     runs(platform, servers)
@@ -450,7 +456,7 @@ def test_a_session_that_was_formed_goes_on(platform: FakePlatform, servers: Serv
     assert platform.bus.sent == []
 
 
-def test_it_goes_on_also_if_its_document_cannot_be_read_or_its_project_is_gone(
+def test_the_sweep_does_not_stop_a_formed_session_if_its_document_or_project_cannot_be_read(
     platform: FakePlatform, servers: Servers
 ) -> None:
     form(platform)
@@ -464,8 +470,8 @@ def test_it_goes_on_also_if_its_document_cannot_be_read_or_its_project_is_gone(
     assert platform.bus.sent == []
 
 
-def test_one_that_all_members_have_left_is_stopped(platform: FakePlatform, servers: Servers) -> None:
-    """Their stop messages crossed: each was handled before the other's answer was stored."""
+def test_the_sweep_stops_a_server_whose_members_have_all_left(platform: FakePlatform, servers: Servers) -> None:
+    """Their stop messages came at once: each was handled before the other's answer was stored."""
     form(platform)
     servers.start(START)
     for user in MEMBERS:
@@ -480,7 +486,7 @@ def test_one_that_all_members_have_left_is_stopped(platform: FakePlatform, serve
 
 
 @pytest.mark.parametrize("listed", [[pairs(live=False)], []], ids=["closed", "gone"])
-def test_it_is_stopped_also_when_its_project_is_closed_or_gone(
+def test_the_sweep_stops_an_unneeded_server_even_if_its_project_is_closed_or_gone(
     platform: FakePlatform, servers: Servers, listed: list[Project]
 ) -> None:
     servers.start(START)
@@ -490,7 +496,7 @@ def test_it_is_stopped_also_when_its_project_is_closed_or_gone(
     assert record(platform).reason is Reason.STOPPED
 
 
-def test_a_lobby_that_cannot_be_repaired_takes_no_server_away(
+def test_the_sweep_stops_no_server_if_the_lobby_cannot_be_repaired(
     platform: FakePlatform, servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     servers.start(START)
@@ -507,7 +513,7 @@ def deliver_stops(platform: FakePlatform, servers: Servers) -> None:
     assert servers.stop([stop for stop in stops if stop]) == []
 
 
-# With the lobby
+# Servers ahead and the lobby
 
 
 def open_sessions(platform: FakePlatform) -> list[Server]:
@@ -516,7 +522,7 @@ def open_sessions(platform: FakePlatform) -> list[Server]:
 
 
 @pytest.mark.parametrize(("people", "wanted"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
-def test_one_server_is_started_ahead_for_every_two_who_are_under_way(
+def test_one_server_is_started_ahead_for_every_two_participants_who_are_under_way(
     platform: FakePlatform, servers: Servers, people: int, wanted: int
 ) -> None:
     for _ in range(2):
@@ -529,7 +535,7 @@ def test_one_server_is_started_ahead_for_every_two_who_are_under_way(
     assert Sweep(platform).run().sessions == 0
 
 
-def test_servers_ahead_are_stopped_when_those_they_were_for_go_away(platform: FakePlatform, servers: Servers) -> None:
+def test_servers_ahead_are_stopped_when_their_participants_leave(platform: FakePlatform, servers: Servers) -> None:
     for user in ("alice", "bob", "carol"):
         servers.start(StartServer("maze", user))
     deliver(platform, servers)
@@ -544,7 +550,9 @@ def test_servers_ahead_are_stopped_when_those_they_were_for_go_away(platform: Fa
     assert nothing_left(platform)
 
 
-def test_nothing_is_left_when_those_who_are_under_way_never_arrive(platform: FakePlatform, servers: Servers) -> None:
+def test_nothing_is_left_when_participants_who_are_under_way_never_arrive(
+    platform: FakePlatform, servers: Servers
+) -> None:
     servers.start(StartServer("maze", "alice"))
     deliver(platform, servers)
     started = set()
@@ -594,10 +602,8 @@ def test_a_project_that_is_gone_keeps_no_server_ahead(platform: FakePlatform, se
     assert nothing_left(platform)
 
 
-def test_a_start_message_that_comes_an_hour_late_starts_no_server_that_stays(
-    platform: FakePlatform, servers: Servers
-) -> None:
-    """Of a participant who has played, of one who is unmatched, and of a session that is over."""
+def test_a_start_message_that_comes_an_hour_late_leaves_no_server(platform: FakePlatform, servers: Servers) -> None:
+    """The messages are of a participant who has played, of an unmatched one, and of a session that is over."""
     form(platform)
     servers.start(START)
     runs(platform, servers)
@@ -630,7 +636,7 @@ def register_as_well(platform: FakePlatform, project: Project) -> None:
 
 
 def task(platform: FakePlatform) -> tuple[str, str | None, int]:
-    """What the only task runs: the game of its trial, its definition, and its port."""
+    """What the only task runs: the game of its trial, its task definition, and its port."""
     (request,) = platform.tasks.running.values()
     return json.loads(request.environment["TRIAL"])["game"], request.definition, request.port
 
@@ -651,7 +657,7 @@ def test_a_lost_server_is_replaced_for_the_sessions_own_number_of_players(formed
     assert (record(platform).attempt, record(platform).players) == (2, 2)
 
 
-def test_a_number_that_is_registered_again_counts_as_it_is_registered_last() -> None:
+def test_the_last_registration_for_a_number_of_players_counts() -> None:
     platform = installed(pairs(**TWO))
     servers = Servers(platform)
     servers.start(StartServer("maze", SESSION, players=2))
@@ -662,7 +668,7 @@ def test_a_number_that_is_registered_again_counts_as_it_is_registered_last() -> 
     assert task(platform)[0] == "two, mended"
 
 
-def test_a_first_start_that_comes_late_is_for_the_number_it_was_asked_for() -> None:
+def test_a_late_first_start_message_starts_a_server_for_its_own_number_of_players() -> None:
     platform = installed(pairs(**TWO))
     servers = Servers(platform)
     register_as_well(platform, pairs(**THREE))
@@ -670,7 +676,7 @@ def test_a_first_start_that_comes_late_is_for_the_number_it_was_asked_for() -> N
     assert task(platform)[0] == "two"
 
 
-def test_a_function_that_has_not_read_the_new_registration_yet_reads_it_for_a_session_of_its_number() -> None:
+def test_a_function_with_an_old_registration_reads_the_new_one_for_a_session_of_its_number() -> None:
     platform = installed(pairs(**TWO))
     servers = Servers(platform)
     servers.start(StartServer("maze", OTHER, players=2))
@@ -701,7 +707,7 @@ def test_a_session_of_another_number_gets_no_warm_server() -> None:
     assert record(platform, OTHER).warm_server_name == warm.name
 
 
-def test_who_plays_alone_gets_the_next_server_of_their_own_if_several_players_are_registered_meanwhile() -> None:
+def test_a_participant_who_plays_alone_gets_the_next_own_server_when_several_players_are_registered() -> None:
     platform = installed(study(trial={"game": "alone"}))
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
@@ -716,7 +722,7 @@ def test_who_plays_alone_gets_the_next_server_of_their_own_if_several_players_ar
     assert [each.label for each in open_sessions(platform)], "whoever comes now is on the way to a game of two"
 
 
-def test_who_plays_alone_gets_what_is_registered_now() -> None:
+def test_a_participant_who_plays_alone_gets_the_present_registration_for_one_player() -> None:
     platform = installed(study(trial={"game": "alone"}))
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
@@ -736,7 +742,7 @@ def alone(user: str = "alice") -> tuple[FakePlatform, Servers]:
     return platform, servers
 
 
-def test_a_start_that_is_told_again_while_the_next_server_is_on_its_way_is_no_way_to_a_game_of_two() -> None:
+def test_a_repeated_start_message_while_the_next_own_server_is_asked_for_leads_to_no_lobby() -> None:
     platform, servers = alone()
     lose(platform, servers)
     servers.start(StartServer("maze", "alice"))
@@ -744,7 +750,7 @@ def test_a_start_that_is_told_again_while_the_next_server_is_on_its_way_is_no_wa
     assert task(platform)[0] == "alone"
 
 
-def test_who_asked_for_another_server_of_their_own_before_is_on_the_way_to_a_game_of_two() -> None:
+def test_a_participant_whose_own_server_was_stopped_is_on_the_way_to_a_game_of_two() -> None:
     platform, servers = alone()
     assert servers.stop([StopServer("maze", "alice")]) == []
     servers.start(StartServer("maze", "alice", 2))
@@ -752,7 +758,7 @@ def test_who_asked_for_another_server_of_their_own_before_is_on_the_way_to_a_gam
     assert task(platform)[0] == "two"
 
 
-def test_who_has_become_a_member_gets_no_next_server_of_their_own() -> None:
+def test_a_member_gets_no_next_server_of_their_own() -> None:
     platform, servers = alone()
     form(platform)
     lose(platform, servers)
@@ -761,7 +767,7 @@ def test_who_has_become_a_member_gets_no_next_server_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("stop", [StopServer("maze", "alice"), StopUser("alice")], ids=["theirs", "everywhere"])
-def test_a_server_of_their_own_that_has_ended_does_not_keep_a_members_stop_from_their_session(stop: Any) -> None:
+def test_a_members_stop_message_reaches_the_session_even_after_an_own_server(stop: Any) -> None:
     platform, servers = alone()
     assert servers.stop([StopServer("maze", "alice")]) == []
     form(platform)
@@ -774,7 +780,7 @@ def test_a_server_of_their_own_that_has_ended_does_not_keep_a_members_stop_from_
     assert nothing_left(platform)
 
 
-def test_who_waits_in_the_lobby_may_leave_it_by_the_relay_also_after_a_server_of_their_own() -> None:
+def test_a_participant_in_the_lobby_may_leave_it_by_the_relay_even_after_an_own_server() -> None:
     platform, servers = alone()
     assert servers.stop([StopServer("maze", "alice")]) == []
     answer(platform, "alice", "1", "2")
@@ -787,7 +793,7 @@ def test_who_waits_in_the_lobby_may_leave_it_by_the_relay_also_after_a_server_of
     assert platform.bus.sent == [(Topic.STOP, {"projectId": "maze", "userId": "alice"})]
 
 
-def test_a_function_that_has_not_read_yet_that_several_play_reads_it_for_a_session() -> None:
+def test_a_function_with_a_registration_for_one_player_reads_the_new_one_for_a_session() -> None:
     platform = installed(study())
     servers = Servers(platform)
     servers.start(StartServer("maze", "bob"))

@@ -39,7 +39,7 @@ ANSWER = f"{FOLDER}/answers/3.json"
 
 
 class FakeSigner:
-    """Says what it was asked to sign."""
+    """A signer that returns what it was asked to sign."""
 
     def presign_get(self, key: str, seconds: int) -> Presigned:
         return Presigned("GET", f"signed:{key}", {"for": str(seconds)})
@@ -150,18 +150,18 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
     ],
     ids=str,
 )  # fmt: skip
-def test_a_server_gets_no_request_for_anything_else(world: World, wish: dict[str, Any]) -> None:
+def test_a_server_gets_no_request_for_any_other_document(world: World, wish: dict[str, Any]) -> None:
     status, found = world.ask(wish)
     assert status == 403
     assert "requests" not in found
     assert not any(part in json.dumps(found) for part in (ALICE, BOB, PROJECT, NAME)), "the sentence names nothing"
 
 
-def test_one_wish_too_many_spoils_all(world: World) -> None:
+def test_one_document_that_is_not_allowed_refuses_the_whole_request(world: World) -> None:
     assert world.ask(put(ANSWER), put(f"{FOLDER}/answers/1.json"))[0] == 403
 
 
-def test_a_credential_is_no_token_and_no_other_servers(world: World) -> None:
+def test_a_token_or_another_servers_credential_is_refused(world: World) -> None:
     bob = world.keep(world.claim(BOB))
     for wrong in ("the-token", "", world.credential(bob), world.credential(world.claim())[:-1], "ü", "0" * 64):
         assert world.ask(get(ANSWER), credential=wrong)[0] == 403, wrong
@@ -170,7 +170,7 @@ def test_a_credential_is_no_token_and_no_other_servers(world: World) -> None:
     assert world.ask(get(ANSWER), server=f"{NAME[:-1]}2")[0] == 403
 
 
-def test_all_strangers_get_the_same_answer(world: World) -> None:
+def test_all_unknown_servers_get_the_same_answer(world: World) -> None:
     world.documents.put(server.key(ids.server_label(PROJECT, "gone")), to_json(world.claim("gone", nonce="")))
     gone = ids.server_name(ids.server_label(PROJECT, "gone"), 1)
     answers = [
@@ -182,7 +182,7 @@ def test_all_strangers_get_the_same_answer(world: World) -> None:
     assert all(answer == answers[0] for answer in answers)
 
 
-def test_without_a_secret_nobody_is_known(world: World) -> None:
+def test_without_a_secret_every_server_is_refused(world: World) -> None:
     world.documents.delete(KEY)
     assert world.ask(get(ANSWER))[0] == 403
     assert KEY not in world.documents.kept, "and none is made"
@@ -201,7 +201,7 @@ def test_without_a_secret_nobody_is_known(world: World) -> None:
     ],
     ids=lambda body: str(body)[:60],
 )  # fmt: skip
-def test_what_cannot_be_read_is_refused_with_a_sentence(world: World, body: bytes | None) -> None:
+def test_an_unreadable_body_is_refused_with_a_sentence(world: World, body: bytes | None) -> None:
     reads = len(world.documents.calls)
     status, found = world.send(body)
     assert status in (400, 413)
@@ -209,16 +209,16 @@ def test_what_cannot_be_read_is_refused_with_a_sentence(world: World, body: byte
     assert len(world.documents.calls) == reads, "and costs nothing"
 
 
-def test_only_so_many_requests_at_once(world: World) -> None:
+def test_the_number_of_requests_at_once_is_limited(world: World) -> None:
     assert world.ask(*[get(ANSWER)] * MAX_REQUESTS)[0] == 200
     assert world.ask(*[get(ANSWER)] * (MAX_REQUESTS + 1))[0] == 400
 
 
-def test_it_is_asked_by_post(world: World) -> None:
+def test_other_methods_than_post_are_refused(world: World) -> None:
     assert world.send(b"", "GET")[0] == 405
 
 
-def test_a_server_may_not_fill_the_bucket(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_a_servers_documents_is_limited(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     key = f"{TRIALS}/3-episode-0002.jsonl.gz"
     world.documents.put(f"{TRIALS}/3-episode-0001.jsonl.gz", b"12345")
     assert world.ask(put(key, 9))[0] == 200
@@ -231,21 +231,21 @@ def test_a_server_may_not_fill_the_bucket(world: World, monkeypatch: pytest.Monk
     assert world.ask(put(ANSWER))[0] == 200, "its answer has room in any case"
 
 
-def test_the_bounds_are_those_of_a_task(world: World) -> None:
+def test_a_server_may_store_2000_recordings_of_20_gib_in_all(world: World) -> None:
     assert (MAX_RECORDED, MAX_RECORDINGS) == (20 * 1024**3, 2_000)
 
 
 # When
 
 
-def test_a_server_may_ask_from_its_start_on(world: World) -> None:
-    """Its certificate comes before anybody is told that it runs."""
+def test_a_server_may_ask_as_soon_as_it_starts(world: World) -> None:
+    """It fetches its certificate before the control plane knows that it runs."""
     assert from_json(world.documents.kept[server.key(NAME[:-2])][0], Server).state is server.ServerState.STARTING
     assert world.ask(get(PRIVKEY), get(ANSWER))[0] == 200
 
 
 @pytest.mark.parametrize("reason", [Reason.STOPPED, Reason.DEADLINE, Reason.LOST, Reason.ENDED])
-def test_who_is_told_to_stop_may_still_store_what_was_earned(world: World, reason: Reason) -> None:
+def test_a_stopped_server_may_still_store_answers_and_recordings(world: World, reason: Reason) -> None:
     world.keep(server.close(world.claim(), reason, world.now()))
     world.wait(seconds=STORE_AFTER_CLOSE.total_seconds() - 1)
     assert world.ask(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 200
@@ -261,8 +261,8 @@ def test_the_time_to_store_is_longer_than_a_task_may_take_to_end() -> None:
     assert timedelta(seconds=2 * STOP_TIMEOUT) <= STORE_AFTER_CLOSE
 
 
-def test_a_server_that_was_lost_and_replaced_may_store_what_it_has(world: World) -> None:
-    """Its participant may have the next server when the last recording of this one arrives."""
+def test_a_lost_and_replaced_server_may_still_store_its_recordings(world: World) -> None:
+    """The last recording of this server may arrive when its participant has the next one already."""
     lost = server.close(world.claim(), Reason.LOST, world.now())
     world.wait(seconds=60)
     world.keep(server.replacing(lost, world.claim(attempt=2)))
@@ -280,7 +280,7 @@ def test_the_next_server_reads_what_the_earlier_ones_recorded(world: World) -> N
     assert world.ask(put(f"{FOLDER}/trials/{second.name}/3-trial.jsonl.gz"), **theirs)[0] == 200
 
 
-def test_who_comes_back_after_being_erased_has_another_credential(world: World) -> None:
+def test_after_an_erasure_a_server_has_another_credential(world: World) -> None:
     before = world.credential(world.claim())
     world.keep(world.claim(nonce="another"))
     assert world.ask(put(ANSWER), credential=before)[0] == 403
@@ -311,7 +311,7 @@ def asks(world: World, warm_server: Server) -> Callable[..., int]:
     return lambda *wishes: world.ask(*wishes, server=warm_server.name, credential=credential)[0]
 
 
-def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(
+def test_a_warm_server_may_read_only_its_certificate_and_its_handover(
     warm_server: Server, asks: Callable[..., int]
 ) -> None:
     assert asks(get(PRIVKEY), get(handover_key(PROJECT, warm_server.name))) == 200
@@ -321,16 +321,16 @@ def test_a_server_that_waits_reads_its_certificate_and_whose_it_is(
         assert asks(wish) == 403, wish
 
 
-def given(world: World, warm_server: Server) -> Server:
-    """Alice has it now."""
+def assign_to_alice(world: World, warm_server: Server) -> Server:
+    """Assign the warm server to alice; her server's record."""
     world.keep(server.handed_over(warm_server, ids.server_label(PROJECT, ALICE), world.now()))
     return world.keep(server.assigned(server.reserving(world.claim(), warm_server), warm_server, world.now()))
 
 
-def test_a_server_that_was_given_away_is_its_participants(
+def test_an_assigned_warm_server_has_the_rights_of_its_participants_server(
     world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
-    record = given(world, warm_server)
+    record = assign_to_alice(world, warm_server)
     assert asks(get(handover_key(PROJECT, warm_server.name)), get(PRIVKEY), get(ANSWER)) == 200
     assert asks(put(ANSWER), put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{PROJECT}/users/{BOB}/answers/3.json")) == 403
@@ -344,24 +344,24 @@ def test_a_server_that_was_given_away_is_its_participants(
     assert asks(put(ANSWER)) == 403
 
 
-def test_a_server_that_was_given_away_and_lost_is_still_known(
+def test_an_assigned_warm_server_that_was_lost_may_still_store_its_recordings(
     world: World, warm_server: Server, asks: Callable[..., int]
 ) -> None:
-    lost = server.close(given(world, warm_server), Reason.LOST, world.now())
+    lost = server.close(assign_to_alice(world, warm_server), Reason.LOST, world.now())
     world.keep(server.replacing(lost, world.claim(attempt=2)))
     assert asks(put(f"{TRIALS}/3-trial.jsonl.gz")) == 200
     assert asks(put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz")) == 403
 
 
 @pytest.mark.parametrize("end", [server.draining, lambda s: server.close(s, Reason.STOPPED, s.requested)])
-def test_a_server_that_waits_and_is_told_to_go_gets_nothing(
+def test_a_drained_or_closed_warm_server_gets_nothing(
     world: World, warm_server: Server, asks: Callable[..., int], end: Callable[[Server], Server]
 ) -> None:
     world.keep(end(warm_server))
     assert asks(get(PRIVKEY)) == 403
 
 
-def test_what_is_asked_costs_one_read_and_a_listing_for_recordings(world: World) -> None:
+def test_a_request_costs_one_read_and_for_recordings_a_listing(world: World) -> None:
     world.ask(get(ANSWER))  # the secret is read once
     for wish, calls in (
         (get(ANSWER), ["get"]),

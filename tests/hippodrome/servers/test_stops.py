@@ -53,14 +53,16 @@ def name(project: str, user: str) -> str:
     return ids.server_name(ids.server_label(project, user), 1)
 
 
-def test_it_stops_the_participants_servers_of_all_projects_and_no_others(platform: FakePlatform) -> None:
+def test_a_stop_without_a_project_stops_the_participants_servers_of_all_projects_and_no_others(
+    platform: FakePlatform,
+) -> None:
     servers = started(platform, ("maze", "alice"), ("atari", "alice"), ("maze", "bob"))
     assert servers.stop([StopUser("alice")]) == []
     assert running(platform) == {name("maze", "bob")}
     assert list(platform.timers.due) == [name("maze", "bob")]
 
 
-def test_it_stops_servers_of_projects_that_are_closed_or_cannot_be_read(platform: FakePlatform) -> None:
+def test_a_stop_without_a_project_stops_servers_of_closed_and_unreadable_projects(platform: FakePlatform) -> None:
     servers = started(platform, ("maze", "alice"), ("gone", "alice"))
     body = write_list(MasterList([study(live=False)]))
     platform.documents.put(MASTER_LIST, body.replace(b'"projects": [', b'"projects": [{"id": "gone", "steps": []},'))
@@ -69,20 +71,20 @@ def test_it_stops_servers_of_projects_that_are_closed_or_cannot_be_read(platform
     assert servers
 
 
-def test_it_writes_nothing_about_projects_where_the_participant_has_no_server(platform: FakePlatform) -> None:
-    """The message of one project leaves a tombstone, since its start message may be late. This one says less."""
+def test_a_stop_without_a_project_writes_nothing_where_the_participant_has_no_server(platform: FakePlatform) -> None:
+    """A message that names its project leaves a record, since the start message may be late; this one does not."""
     before = dict(platform.documents.kept)
     assert Servers(platform).stop([StopUser("alice")]) == []
     assert platform.documents.kept == before
 
 
-def test_it_costs_one_read_of_each_project_and_of_the_list(platform: FakePlatform) -> None:
+def test_a_stop_without_a_project_reads_the_list_and_one_record_per_project(platform: FakePlatform) -> None:
     before = len(platform.documents.calls)
     Servers(platform).stop([StopUser("alice")])
     assert platform.documents.calls[before:] == ["get"] * (1 + len(PROJECTS))
 
 
-def test_a_message_of_a_single_server_reads_no_list(platform: FakePlatform) -> None:
+def test_a_stop_of_a_single_server_reads_no_list(platform: FakePlatform) -> None:
     servers = started(platform, ("maze", "alice"))
     asked: list[str] = []
     get = platform.documents.get
@@ -91,7 +93,7 @@ def test_a_message_of_a_single_server_reads_no_list(platform: FakePlatform) -> N
     assert asked == [server.key(ids.server_label("maze", "alice"))]
 
 
-def test_a_closed_server_is_left_as_it_is(platform: FakePlatform) -> None:
+def test_a_closed_server_is_not_changed(platform: FakePlatform) -> None:
     servers = started(platform, ("maze", "alice"))
     servers.stop([StopServer("maze", "alice")])
     before = dict(platform.documents.kept)
@@ -131,7 +133,7 @@ def state(platform: FakePlatform) -> str:
 
 
 def test_a_record_that_changes_while_its_server_is_stopped_is_closed_at_once(platform: FakePlatform) -> None:
-    """The queue would deliver the message again after 90 seconds, in which the participant waits."""
+    """Otherwise the queue would deliver the message again after 90 seconds, for which the participant would wait."""
     servers = started(platform, ("maze", "alice"))
     changes_before(platform, 1)
     assert servers.stop([StopServer("maze", "alice")]) == []
@@ -139,7 +141,7 @@ def test_a_record_that_changes_while_its_server_is_stopped_is_closed_at_once(pla
     assert running(platform) == set()
 
 
-def test_a_task_that_starts_while_its_server_is_stopped_is_stopped_too(platform: FakePlatform) -> None:
+def test_a_task_that_starts_while_its_server_is_stopped_is_also_stopped(platform: FakePlatform) -> None:
     servers = started(platform, ("maze", "alice"))
     late = "late"
     (task,) = platform.tasks.running
@@ -175,7 +177,7 @@ def test_the_next_attempts_server_is_not_stopped_by_a_stop_that_came_before_it(p
     assert running(platform) == {ids.server_name(ids.server_label("maze", "alice"), 2)}
 
 
-def test_the_messages_of_single_servers_do_not_wait_for_the_list(platform: FakePlatform) -> None:
+def test_an_unreadable_list_does_not_affect_stops_of_single_servers(platform: FakePlatform) -> None:
     started(platform, ("maze", "alice"))
     platform.documents.put(MASTER_LIST, b"{")
     stops = [StopUser("alice"), StopServer("maze", "alice")]

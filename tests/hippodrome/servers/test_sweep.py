@@ -1,4 +1,4 @@
-"""sweep removes what no live record owns, and nothing else."""
+"""The sweep removes resources that no open record owns, and nothing else."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def ready(platform: FakePlatform, user: str = "alice") -> None:
 
 
 def leftovers(platform: FakePlatform) -> None:
-    """A closed server of which everything stayed behind."""
+    """A closed server all of whose resources are still there."""
     ready(platform)
     request = next(iter(platform.tasks.running.values()))
     name = DnsRecord(f"{NAME}.example.org", "203.0.113.1")
@@ -52,7 +52,7 @@ def leftovers(platform: FakePlatform) -> None:
     platform.tasks.create_cluster(NAME)
 
 
-def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> None:
+def test_leftovers_of_a_closed_server_are_removed(platform: FakePlatform) -> None:
     leftovers(platform)
     swept = sweep.handler({}, None)
     assert (swept["tasks"], swept["names"], swept["timers"], swept["failed"]) == (1, 1, 2, 0)
@@ -62,7 +62,9 @@ def test_what_a_closed_server_left_behind_is_removed(platform: FakePlatform) -> 
     assert not platform.tasks.own_clusters
 
 
-def test_what_is_closed_while_the_sweep_looks_is_left_to_whoever_closed_it(platform: FakePlatform) -> None:
+def test_resources_of_a_server_that_is_closed_during_the_sweep_are_left_to_the_function_that_closed_it(
+    platform: FakePlatform,
+) -> None:
     leftovers(platform)
     listed = platform.timers.list
 
@@ -81,8 +83,8 @@ def test_what_is_closed_while_the_sweep_looks_is_left_to_whoever_closed_it(platf
     assert (swept["tasks"], swept["names"], swept["timers"], swept["clusters"]) == (1, 1, 2, 1), "the next sweep knows"
 
 
-def test_without_a_full_view_nothing_is_touched(platform: FakePlatform) -> None:
-    """Who does not see the tasks would take every server for lost."""
+def test_if_a_listing_fails_the_sweep_changes_nothing(platform: FakePlatform) -> None:
+    """Without the list of tasks, every server would count as lost."""
     leftovers(platform)
     ready(platform, "bob")
     platform.wait(minutes=11)
@@ -93,7 +95,7 @@ def test_without_a_full_view_nothing_is_touched(platform: FakePlatform) -> None:
     assert not Repository(platform.documents).server(ids.server_label("maze", "bob")).server.is_closed  # type: ignore[union-attr]
 
 
-def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
+def test_resources_of_open_servers_are_not_touched(platform: FakePlatform) -> None:
     for user in ("alice", "bob"):
         ready(platform, user)
     platform.wait(minutes=18)
@@ -105,7 +107,7 @@ def test_what_lives_is_not_touched(platform: FakePlatform) -> None:
     assert (platform.tasks.running, platform.dns.records, platform.timers.due) == before
 
 
-def test_strangers_things_are_not_touched(platform: FakePlatform) -> None:
+def test_resources_of_others_are_not_touched(platform: FakePlatform) -> None:
     other = ids.server_name(ids.server_label("maze", "somebody-elses"), 1)
     platform.tasks.run(TaskRequest(other, "d", "hippodrome", 1, 2, {}))
     platform.dns.change(add=[DnsRecord(f"{other}.example.org", "192.0.2.1"), DnsRecord("www.example.org", "1.1.1.1")])
@@ -116,7 +118,7 @@ def test_strangers_things_are_not_touched(platform: FakePlatform) -> None:
     assert len(platform.tasks.running) == 1
 
 
-def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: FakePlatform) -> None:
+def test_a_server_whose_end_was_not_reported_is_cleaned_up_and_replaced(platform: FakePlatform) -> None:
     ready(platform)
     platform.tasks.running.clear()
     assert sweep.handler({}, None)["lost"] == 0  # it may be starting
@@ -127,7 +129,7 @@ def test_a_server_whose_end_nobody_noticed_is_cleaned_up_and_replaced(platform: 
 
 
 @pytest.mark.parametrize("port", ["documents.replace", "bus.publish", "timers.cancel"])
-def test_what_one_sweep_could_not_finish_the_next_one_does(
+def test_the_next_sweep_finishes_what_a_failed_one_has_begun(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, port: str
 ) -> None:
     ready(platform)
@@ -149,7 +151,7 @@ def test_what_one_sweep_could_not_finish_the_next_one_does(
     assert (platform.dns.records, platform.timers.due) == ({}, {})
 
 
-def test_a_server_whose_task_no_list_shows_yet_keeps_all_it_has_in_a_cluster_of_its_own(
+def test_a_new_server_in_its_own_cluster_keeps_its_resources_before_its_task_is_listed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     platform = installed(study(cluster="participant"))
@@ -190,7 +192,7 @@ def test_the_task_of_an_earlier_attempt_is_removed_and_the_present_one_stays(pla
     assert [r.name for r in platform.tasks.running.values()] == [ids.server_name(stored.label, 2)]
 
 
-def test_one_thing_that_cannot_be_removed_does_not_keep_the_others(platform: FakePlatform) -> None:
+def test_a_resource_that_cannot_be_removed_does_not_prevent_the_others(platform: FakePlatform) -> None:
     leftovers(platform)
     platform.tasks.stop = None  # type: ignore[assignment,method-assign]
     swept = sweep.handler({}, None)
@@ -205,7 +207,7 @@ def test_a_server_may_take_five_minutes_to_end_after_its_deadline(platform: Fake
     assert sweep.handler({}, None)["overdue"] == 1
 
 
-def test_a_server_whose_task_no_list_shows_is_lost_after_ten_minutes(platform: FakePlatform) -> None:
+def test_a_server_whose_task_is_not_listed_is_lost_after_ten_minutes(platform: FakePlatform) -> None:
     ready(platform)
     platform.tasks.running.clear()
     platform.wait(minutes=10)
@@ -214,7 +216,7 @@ def test_a_server_whose_task_no_list_shows_is_lost_after_ten_minutes(platform: F
     assert sweep.handler({}, None)["lost"] == 1
 
 
-def test_what_cannot_be_read_or_removed_is_counted_as_failed(platform: FakePlatform) -> None:
+def test_a_record_that_cannot_be_read_is_counted_as_failed_and_its_resources_stay(platform: FakePlatform) -> None:
     leftovers(platform)
     platform.documents.kept[server.key(LABEL)] = (b"{", "1", platform.now())
     swept = sweep.handler({}, None)
@@ -228,7 +230,7 @@ def test_a_pool_that_cannot_be_read_is_one_failure_and_the_rest_is_swept(platfor
     assert (swept["failed"], swept["warm_servers"], swept["tasks"], swept["names"]) == (1, 0, 1, 1)
 
 
-def test_a_sweep_that_finds_nothing_has_done_nothing(platform: FakePlatform) -> None:
+def test_a_sweep_without_findings_counts_nothing(platform: FakePlatform) -> None:
     assert set(sweep.handler({}, None).values()) == {0}
 
 
@@ -240,7 +242,7 @@ def record_of(platform: FakePlatform, user: str = "alice") -> Server:
 
 
 def deliver(platform: FakePlatform) -> None:
-    """Everything that was sent, and what that leads to."""
+    """Deliver all messages, and all that follow from them."""
     while platform.bus.sent or platform.bus.delayed:
         sent = [(topic, dict(message)) for topic, message in platform.bus.sent]
         later = [dict(message) for _, message in platform.bus.delayed]
@@ -259,7 +261,7 @@ def deliver(platform: FakePlatform) -> None:
 
 
 def sweeps(platform: FakePlatform, minutes: int) -> None:
-    """The sweeps of so many minutes, and what they lead to."""
+    """Run the sweeps of so many minutes, and deliver the messages that follow."""
     for _ in range(minutes // 5):
         platform.wait(minutes=5)
         assert sweep.handler({}, None)["failed"] == 0
@@ -267,7 +269,7 @@ def sweeps(platform: FakePlatform, minutes: int) -> None:
 
 
 def start_is_cut_off(platform: FakePlatform) -> None:
-    """Its message ends as a dead letter before anything but the record is there."""
+    """The start message becomes a dead letter when only the record is written."""
     platform.timers.set = None  # type: ignore[method-assign,assignment]
     with pytest.raises(TypeError):
         Servers(platform).start(StartServer("maze", "alice"))
@@ -280,7 +282,7 @@ def running_is_not_told(platform: FakePlatform) -> None:
 
 
 def looks_are_lost(platform: FakePlatform) -> None:
-    """The message of the function to itself ends as a dead letter."""
+    """The message that the function sends itself becomes a dead letter."""
     platform.dns.slow = True
     ready(platform)
     platform.bus.delayed.clear()
@@ -319,7 +321,7 @@ STAYS = {
     ServerState.DRAINING: (stop_of_a_warm_server_is_lost,),
     ServerState.CLOSED: (replacement_is_lost, leftovers),
 }
-UNRECORDED = {ServerState.QUEUED}  # no record says so, and so no sweep can find it: who waits asks again by their page
+UNRECORDED = {ServerState.QUEUED}  # there is no record, so no sweep can find it; the participant's page asks again
 
 
 def test_there_is_a_test_for_every_state_in_which_a_server_may_stay() -> None:
@@ -330,7 +332,7 @@ def test_there_is_a_test_for_every_state_in_which_a_server_may_stay() -> None:
 @pytest.mark.parametrize(
     ("state", "trouble"), [(state, trouble) for state, troubles in STAYS.items() for trouble in troubles]
 )
-def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
+def test_the_sweep_repairs_a_server_that_stays_in_a_state_for_too_long(
     platform: FakePlatform, state: ServerState, trouble: Callable[[FakePlatform], None]
 ) -> None:
     trouble(platform)
@@ -353,7 +355,7 @@ def test_a_server_that_stays_in_a_state_for_too_long_is_looked_after(
 
 
 @pytest.mark.parametrize("trouble", [looks_are_lost, running_is_not_told])
-def test_nothing_is_asked_for_again_before_three_minutes(
+def test_no_message_is_sent_again_within_three_minutes(
     platform: FakePlatform, trouble: Callable[[FakePlatform], None]
 ) -> None:
     trouble(platform)
@@ -376,7 +378,7 @@ def test_a_task_that_has_not_run_after_twenty_minutes_is_given_up_and_replaced(p
     assert [request.name for request in platform.tasks.running.values()] == [ids.server_name(LABEL, 2)]
 
 
-def test_a_server_whose_things_are_gone_but_not_its_record_is_closed_when_its_time_is_over(
+def test_the_record_of_a_server_without_resources_is_closed_after_its_deadline(
     platform: FakePlatform,
 ) -> None:
     ready(platform)
@@ -392,7 +394,7 @@ def test_a_lost_server_of_hours_ago_is_not_replaced_any_more(platform: FakePlatf
     assert sum(sweep.handler({}, None).values()) == 0
 
 
-def test_a_record_is_read_by_few_sweeps_though_there_may_be_very_many(platform: FakePlatform) -> None:
+def test_only_a_few_sweeps_read_each_record(platform: FakePlatform) -> None:
     ready(platform)
     Servers(platform).stop([StopServer("maze", "alice")])
     reads = []
@@ -405,7 +407,7 @@ def test_a_record_is_read_by_few_sweeps_though_there_may_be_very_many(platform: 
     assert sum(count - quiet for count in reads) <= 8
 
 
-def test_a_record_that_cannot_be_read_does_not_keep_the_sweep_from_others(platform: FakePlatform) -> None:
+def test_a_record_that_cannot_be_read_does_not_keep_the_sweep_from_other_records(platform: FakePlatform) -> None:
     running_is_not_told(platform)
     Servers(platform).start(StartServer("maze", "bob"))
     platform.documents.put(server.key(ids.server_label("maze", "bob")), b"{")

@@ -1,4 +1,4 @@
-"""sweep in a bucket where something else has written: it reads what registered projects may have, and nothing more."""
+"""The sweep in a bucket with documents of others: it reads only keys that registered projects may have."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GARBAGE = [
     b'{"held": {"x": {}}}',
     b"[" * 100_000,
 ]
-PLACES = limits.server_slots_key("maze")
+SLOTS = limits.server_slots_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 
 
@@ -44,7 +44,7 @@ def platform() -> FakePlatform:
 
 
 def calls(platform: FakePlatform) -> Counter[str]:
-    """What a sweep asks of the documents."""
+    """The calls to the documents that a sweep makes."""
     platform.documents.calls.clear()
     assert sweep.handler({}, None)["failed"] == 0
     return Counter(platform.documents.calls)
@@ -55,16 +55,16 @@ FOLDERS = ["_places/", "_places/users/{0}/answers/", "_spares/", "_spares/users/
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_names_of_no_project_are_never_read(platform: FakePlatform, folder: str) -> None:
+def test_keys_of_no_registered_project_are_never_read(platform: FakePlatform, folder: str) -> None:
     before = calls(platform)
     for number in range(MANY // 2):
         platform.documents.put(f"{folder.format(number)}{number:x}.json", b"{}")
-        name = ids.server_name(ids.server_label("maze", f"u{number % 50}"), 1)  # servers that there never were
+        name = ids.server_name(ids.server_label("maze", f"u{number % 50}"), 1)  # servers that never existed
         platform.documents.put(f"{folder.format(number)}x{name}.json", b"{}")
     assert calls(platform) == before
 
 
-def test_what_looks_like_a_handover_in_a_deeper_folder_is_none(platform: FakePlatform) -> None:
+def test_a_document_in_a_deeper_folder_is_no_handover(platform: FakePlatform) -> None:
     for number in range(200):
         name = ids.server_name(ids.server_label("maze", f"u{number}"), 1)
         platform.documents.put(f"maze/spares/users/x/answers/{name}.json", b"{}")
@@ -75,7 +75,7 @@ def test_what_looks_like_a_handover_in_a_deeper_folder_is_none(platform: FakePla
 
 
 @pytest.mark.parametrize("body", GARBAGE)
-def test_places_that_are_garbage_keep_no_other_project_from_being_swept(platform: FakePlatform, body: bytes) -> None:
+def test_unreadable_slots_of_a_project_do_not_keep_the_sweep_from_others(platform: FakePlatform, body: bytes) -> None:
     other = study(id="other", max_servers=1)
     platform.documents.put(MASTER_LIST, to_json(MasterList([STUDY, other])))
     gone = ids.server_label("other", "alice")
@@ -86,7 +86,7 @@ def test_places_that_are_garbage_keep_no_other_project_from_being_swept(platform
 
 
 @pytest.mark.parametrize("body", GARBAGE)
-def test_a_pool_that_is_garbage_keeps_no_other_from_being_looked_after(platform: FakePlatform, body: bytes) -> None:
+def test_an_unreadable_pool_does_not_keep_the_sweep_from_others(platform: FakePlatform, body: bytes) -> None:
     other = study(id="other", warm_servers=1, version="1")
     platform.documents.put(MASTER_LIST, to_json(MasterList([STUDY, other])))
     platform.documents.put(warm_pool.pool_key("maze"), body)
@@ -94,7 +94,7 @@ def test_a_pool_that_is_garbage_keeps_no_other_from_being_looked_after(platform:
     assert (Topic.START, {"keepWarm": "other"}) in platform.bus.sent
 
 
-def test_a_pool_with_ids_that_are_none_starts_no_server(platform: FakePlatform) -> None:
+def test_a_pool_with_invalid_ids_starts_no_server(platform: FakePlatform) -> None:
     asked = platform.now()
     platform.wait(minutes=30)
     pool = Pool({"alice": WarmServer("1", asked), "../x": WarmServer("1", asked), "": WarmServer("1", asked)})
@@ -104,7 +104,7 @@ def test_a_pool_with_ids_that_are_none_starts_no_server(platform: FakePlatform) 
 
 
 @pytest.mark.parametrize("body", GARBAGE)
-def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platform: FakePlatform, body: bytes) -> None:
+def test_an_unreadable_record_does_not_keep_the_sweep_from_others(platform: FakePlatform, body: bytes) -> None:
     servers = Servers(platform)
     for user in ("alice", "bob"):
         servers.start(StartServer("maze", user))
@@ -113,7 +113,7 @@ def test_a_servers_record_that_is_garbage_keeps_no_other_from_being_swept(platfo
     assert sweep.handler({}, None)["overdue"] == 1
 
 
-def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(platform: FakePlatform) -> None:
+def test_thousands_of_forgotten_slots_are_given_back_with_one_write(platform: FakePlatform) -> None:
     held = {ids.server_label("maze", str(number)): ServerSlot(1, 60) for number in range(2_000)}
     platform.documents.keep(
         limits.server_slots_key("maze"), to_json(ServerSlots({**held, "no label": ServerSlot(1, 60)}, 5))
@@ -125,27 +125,27 @@ def test_thousands_of_places_that_were_forgotten_are_given_back_by_one_write(pla
 
 
 @pytest.mark.parametrize("body", GARBAGE)
-def test_a_pool_that_cannot_be_read_keeps_nobody_from_a_server(platform: FakePlatform, body: bytes) -> None:
-    """It is a list of offers only: it begins anew, and the sweep fills it."""
+def test_an_unreadable_pool_does_not_keep_participants_from_a_server(platform: FakePlatform, body: bytes) -> None:
+    """The pool lists only warm servers that may be assigned: it is made anew, and the sweep fills it."""
     platform.documents.put(warm_pool.pool_key("maze"), body)
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
-    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[PLACES][0], ServerSlots).slots
+    assert ids.server_label("maze", "alice") in from_json(platform.documents.kept[SLOTS][0], ServerSlots).slots
     servers.start(KeepWarm("maze"))
     assert len(from_json(platform.documents.kept[warm_pool.pool_key("maze")][0], Pool).warm_servers) == 1
 
 
-def test_the_sweep_has_a_pool_that_cannot_be_read_filled_anew(platform: FakePlatform) -> None:
+def test_the_sweep_has_an_unreadable_pool_filled_anew(platform: FakePlatform) -> None:
     platform.documents.put(warm_pool.pool_key("maze"), b"{")
     sweep.handler({}, None)
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
 
 
 @pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
-def test_places_that_cannot_be_read_start_no_server_and_stay_as_they_are(platform: FakePlatform, body: bytes) -> None:
-    """Nobody knows how many servers run, so none more may: `maxServers` would be exceeded."""
-    platform.documents.put(PLACES, body)
+def test_with_unreadable_slots_no_server_starts_and_the_document_stays(platform: FakePlatform, body: bytes) -> None:
+    """The number of running servers is not known, so no other may start: `maxServers` could be exceeded."""
+    platform.documents.put(SLOTS, body)
     with pytest.raises((ValueError, RecursionError)):
         Servers(platform).start(StartServer("maze", "alice"))
     assert list(platform.tasks.list()) == []
-    assert platform.documents.kept[PLACES][0] == body
+    assert platform.documents.kept[SLOTS][0] == body

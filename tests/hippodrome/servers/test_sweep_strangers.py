@@ -1,7 +1,7 @@
-"""The sweep on moto, beside thousands of resources of others: our leftovers go, and nothing else changes by a byte.
+"""The sweep on moto, beside thousands of resources of others: it removes our leftovers, and changes no byte of anything else.
 
-Everything is compared before and after: both hosted zones, every cluster and task, every group of schedules, every
-document with its ETag and time, every message. `Place` stocks moto directly where its API would take minutes.
+Everything is compared before and after: both hosted zones, every cluster and task, every group of schedules, every document
+with its ETag and time, every message. `Place` writes directly into moto where its API would take minutes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Place(MotoWorld):
         super().__init__(enforce=enforce)
         self.unlisted: set[str] = set()  # tasks
         self.leftovers: dict[str, list[str]] = {thing: [] for thing in THINGS}  # what a sweep must remove
-        self.asked: list[str] = []  # participants whose servers are asked for once more
+        self.asked: list[str] = []  # participants for whose servers the start message is sent again
         self.meanwhile: Callable[[str], None] = lambda operation: None  # what happens after each listing
         self._numbers = iter(range(10**9))
 
@@ -145,7 +145,7 @@ class Place(MotoWorld):
 
         self._patch(Route53Backend, "change_resource_record_sets", exactly)
 
-    # Stocking
+    # Making resources
 
     @property
     def number(self) -> int:
@@ -190,7 +190,7 @@ class Place(MotoWorld):
     # Ours
 
     def claimed(self, attempt: int = 1, ago: timedelta = timedelta(minutes=1), own_cluster: bool = False) -> Server:
-        """The record of a server of ours that was just asked for."""
+        """A new record of one of our servers."""
         project = msgspec.structs.replace(STUDY, cluster="participant" if own_cluster else "shared")
         now = datetime.now(UTC) - ago
         user = f"R_{self.number}"
@@ -200,7 +200,7 @@ class Place(MotoWorld):
         self.put(server.key(record.label), to_json(record))
 
     def things(self, record: Server, name: str | None = None, *, leftover: bool = False, delay: bool = False) -> str:
-        """All that a server has: its task, name, timers and cluster; `leftover` if a sweep must remove them."""
+        """Make all resources of a server: its task, name, timers and cluster; `leftover` if a sweep must remove them."""
         name = name or record.name
         if record.has_own_cluster:
             self.cluster(name)
@@ -228,7 +228,7 @@ class Place(MotoWorld):
         self.unlisted.add(self.run(record.name))
 
     def long_starting_unlisted(self) -> None:
-        """Just short of the time after which a server without a task counts as lost: it is asked for once more."""
+        """A server without a task, just before it counts as lost: its start message is sent again."""
         record = self.claimed(ago=timedelta(minutes=9))
         self.asked.append(record.user_id)
         self.save(record)
@@ -250,7 +250,7 @@ class Place(MotoWorld):
         self.things(self._ready(own_cluster=True))
 
     def ready_after_leftovers(self) -> None:
-        """The second attempt, with everything of the first left behind."""
+        """A second attempt that is ready, with all leftovers of the first."""
         record = self._ready(attempt=2)
         self.things(record)
         self.things(record, ids.server_name(record.label, 1), leftover=True, delay=True)
@@ -275,17 +275,17 @@ class Place(MotoWorld):
         self.save(record)
         return record
 
-    # Strangers
+    # Resources of others
 
     def similar_name(self) -> str:
-        """A name as of a server, of another installation: its record is not in our bucket."""
+        """A name like that of a server, without a record in our bucket: it is another installation's."""
         return ids.server_name(ids.server_label("somebody-elses", f"P{self.number}"), 1)
 
     def their_site(self) -> None:
         self.record(f"host-{self.number}.{DOMAIN}")
 
     def their_server(self) -> None:
-        """All of a server of another installation in the same zone, cluster and group."""
+        """All resources of a server of another installation in the same zone, cluster and group."""
         name = self.similar_name()
         self.record(f"{name}.{DOMAIN}")
         self.timer(name)
@@ -298,7 +298,7 @@ class Place(MotoWorld):
         self.run(name, name)
 
     def their_names(self) -> None:
-        """Of every kind that looks like ours, under names that are not, and of other kinds under ours."""
+        """Resources of our kinds under other names, and of other kinds under names like ours."""
         name, label, host = self.similar_name(), self.similar_name().partition("-")[0], self.host()
         alias = {"HostedZoneId": "Z1", "DNSName": "lb.example.com.", "EvaluateTargetHealth": False}
         self.record(f"{name}.{DOMAIN}", "AAAA", ("2001:db8::1",))
@@ -315,7 +315,7 @@ class Place(MotoWorld):
         self.record(f"\\052.team-{self.number}.{DOMAIN}")
 
     def under_our_names(self) -> None:
-        """What strangers keep under the very names of servers of ours that are closed."""
+        """Resources of others under the names of closed servers of ours."""
         name = self._closed().name
         alias = {"HostedZoneId": "Z1", "DNSName": "lb.example.com.", "EvaluateTargetHealth": False}
         self.record(f"{name}.{DOMAIN}", "AAAA", ("2001:db8::1",))
@@ -354,7 +354,7 @@ class Place(MotoWorld):
         self.timer(f"nightly-{self.number}", "payroll")
 
     def unreadable_record(self) -> None:
-        """A document where a server's record should be, and all that it might be about."""
+        """An unreadable document in the place of a server's record, and all resources that this server may have."""
         name = self.similar_name()
         label = name.partition("-")[0]
         what = (b"", b"\x00\xff not json", b"[]", b'{"state": "closed"}', b'{"userId": 7, "state": "closed"}')
@@ -368,10 +368,10 @@ class Place(MotoWorld):
         self.put(f"_servers/README-{number}.txt", b"what is this?")
         self.put(f"_servers/{self.similar_name().partition('-')[0]}.json", b'{"of": "nobody who runs"}')
 
-    # All of it
+    # Comparison
 
     def photograph(self) -> dict[str, dict[str, str]]:
-        """Everything there is, by kind and name, as text. A kind has nothing twice."""
+        """Everything that exists, by kind and name, as text. No name comes twice within a kind."""
         ecs, schedules = ecs_backends[ACCOUNT][self.region], scheduler_backends[ACCOUNT][self.region]
         zones = route53_backends[ACCOUNT]["aws"]
         records = [(key, r) for key in ("zone", "other_zone") for r in zones.get_hosted_zone(self.ids[key]).rrsets]
@@ -400,7 +400,7 @@ class Place(MotoWorld):
         return sweep.handler({}, None)
 
     def assert_only_our_leftovers_went(self, before: dict[str, dict[str, str]]) -> None:
-        """What changed since the photograph is what a sweep must have removed, and nothing else."""
+        """Check that exactly those resources have changed since the photograph that a sweep must remove."""
         after = self.photograph()
         left = self.leftovers
         gone = {kind: before[kind].keys() - after[kind].keys() for kind in before}
@@ -463,7 +463,7 @@ def stock(place: Place, *what: Callable[[Place], None]) -> None:
         one(place)
 
 
-def test_our_leftovers_go_and_nothing_else_changes(place: Place) -> None:
+def test_the_sweep_removes_our_leftovers_and_changes_nothing_else(place: Place) -> None:
     stock(place, *OURS, *THEIRS)
     before = place.photograph()
     swept = place.sweep()
@@ -477,7 +477,7 @@ def test_our_leftovers_go_and_nothing_else_changes(place: Place) -> None:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sample(range(4 * max(1, TIMES)), 4))
-def test_any_mixture_of_ours_and_theirs_in_any_order(place: Place, seed: int) -> None:
+def test_the_sweep_changes_nothing_else_for_any_resources_in_any_order(place: Place, seed: int) -> None:
     chance = random.Random(seed)
     stock(place, *chance.choices((*OURS, *THEIRS), k=60))
     before = place.photograph()
@@ -487,7 +487,7 @@ def test_any_mixture_of_ours_and_theirs_in_any_order(place: Place, seed: int) ->
 
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sample(range(4 * max(1, TIMES)), 4))
-def test_what_begins_while_a_sweep_looks_around_stays(place: Place, seed: int) -> None:
+def test_resources_that_are_made_during_a_sweep_stay(place: Place, seed: int) -> None:
     """After each listing, servers of ours start, and others create resources."""
     chance = random.Random(seed)
     living = [Place.starting, Place.starting_unlisted, Place.naming, Place.ready, Place.ready_in_its_cluster]
@@ -514,7 +514,7 @@ def test_what_begins_while_a_sweep_looks_around_stays(place: Place, seed: int) -
     place.assert_only_our_leftovers_went(before)
 
 
-def test_a_cluster_goes_once_its_task_has_left_it(place: Place) -> None:
+def test_a_cluster_is_removed_when_its_task_has_left_it(place: Place) -> None:
     record = place._closed(own_cluster=True)
     place.cluster(record.name)
     task = place.run(record.name, record.name)
@@ -525,8 +525,8 @@ def test_a_cluster_goes_once_its_task_has_left_it(place: Place) -> None:
     assert list(place.platform.tasks.clusters()) == []
 
 
-def test_a_record_that_cannot_be_had_is_nobodys(place: Place) -> None:
-    """Whatever is wrong with a document, what it might be about stays for this time."""
+def test_resources_of_an_unreadable_record_stay(place: Place) -> None:
+    """Resources whose record cannot be read stay until a later sweep."""
     stock(place, *[Place.unreadable_record] * 5, Place.closed_with_leftovers)
     before = place.photograph()
     assert place.sweep()["failed"] == 5
@@ -534,10 +534,10 @@ def test_a_record_that_cannot_be_had_is_nobodys(place: Place) -> None:
 
 
 @pytest.mark.hunt
-def test_calls_grow_by_pages_and_not_with_strangers(place: Place) -> None:
-    """Ten times as many strangers: only listings become longer. Names like ours cost a read each: whose are they?"""
+def test_the_number_of_calls_grows_only_by_pages_of_listings(place: Place) -> None:
+    """Ten times as many resources of others only make listings longer. Each name like ours costs one read, of the record that may own it."""
     stock(place, *OURS, *THEIRS)
-    place.sweep()  # what must go is gone
+    place.sweep()  # the leftovers are removed
     few = calls(place)
     for _ in range(300):
         place.their_timers()
@@ -564,7 +564,7 @@ def calls(place: Place) -> Counter[str]:
 
 
 @pytest.mark.hunt
-def test_five_hundred_servers_among_five_thousand_strangers(place: Place) -> None:
+def test_the_sweep_works_with_five_hundred_servers_among_five_thousand_resources_of_others(place: Place) -> None:
     for one in itertools.islice(itertools.cycle(OURS), 500):
         one(place)
     ours = count(place)

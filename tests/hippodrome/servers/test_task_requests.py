@@ -1,4 +1,4 @@
-"""What ECS is asked to run, and what the trial server is told, value by value."""
+"""The request to ECS and the environment of the trial server, value by value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LABEL = ids.server_label("maze", "alice")
 
 
 def started(project: Project, user: str = "alice") -> tuple[FakePlatform, TaskRequest, Server]:
-    """A platform with one server, what was asked of ECS for it, and its record."""
+    """A platform with one server, the request to ECS for it, and its record."""
     platform = installed(project)
     Servers(platform).start(StartServer("maze", user))
     (request,) = platform.tasks.running.values()
@@ -28,7 +28,7 @@ def started(project: Project, user: str = "alice") -> tuple[FakePlatform, TaskRe
     return platform, request, record
 
 
-def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> None:
+def test_the_request_for_a_task_has_all_values_of_project_and_record() -> None:
     project = study(task_definition="maze:7", aws_setup=AwsSetup(cpu=4, memory=8), trial={"game": "G", "x": [1]})
     platform, request, record = started(project)
     assert request == TaskRequest(
@@ -58,7 +58,7 @@ def test_a_task_is_asked_for_with_all_that_the_project_and_the_record_say() -> N
     assert (len(request.environment["TOKEN"]), record.token) == (48, "")
 
 
-def test_a_server_listens_where_its_project_was_registered_to() -> None:
+def test_a_server_listens_on_the_registered_port() -> None:
     _, request, record = started(study(server_port=443))
     assert (request.port, record.port) == (443, 443)
 
@@ -66,13 +66,13 @@ def test_a_server_listens_where_its_project_was_registered_to() -> None:
 OWN = ["SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey.pem"]
 
 
-def told(request: TaskRequest) -> list[str]:
-    """Where the certificate is that a server is to fetch."""
+def certificate_of(request: TaskRequest) -> list[str]:
+    """The keys of the certificate that the request tells the server to fetch."""
     return [request.environment[f"SSL_{name}"] for name in ("FULLCHAIN", "PRIVKEY")]
 
 
-def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_its_own_name() -> None:
-    """It was claimed before the installation moved, and is run after it: the message came again."""
+def test_a_server_that_an_earlier_version_has_named_gets_the_certificate_of_its_own_name() -> None:
+    """Its record was written before the installation got another domain; its task runs after that, since the message came again."""
     platform = installed(study())
     settings = replace(platform.settings, servers_host="")
     before = server.new_attempt(study(), "alice", 1, token="t", settings=settings, now=platform.now())
@@ -80,16 +80,16 @@ def test_a_server_that_an_earlier_version_has_named_is_told_the_certificate_of_i
     Repository(platform.documents).create(before)
     Servers(platform).start(StartServer("maze", "alice"))
     (request,) = platform.tasks.running.values()
-    assert told(request) == ["SSL/fullchain.pem", "SSL/privkey.pem"]
+    assert certificate_of(request) == ["SSL/fullchain.pem", "SSL/privkey.pem"]
 
 
-def test_a_project_without_an_image_of_its_own_runs_the_installations() -> None:
+def test_a_project_without_its_own_image_runs_the_installations() -> None:
     platform, request, _ = started(study())
     assert request.definition == platform.settings.task_definition
 
 
-def test_a_server_is_told_the_installations_certificate_and_no_other() -> None:
-    """Nobody would sign requests for another one."""
+def test_a_server_gets_the_installations_certificate_and_no_other() -> None:
+    """No request for another certificate would be signed."""
     _, request, _ = started(study(ssl=Ssl("mine", "chain", "key")))
     told = {name: value for name, value in request.environment.items() if name.startswith("SSL_")}
     assert told == {"SSL_FULLCHAIN": OWN[0], "SSL_PRIVKEY": OWN[1]}
@@ -105,19 +105,19 @@ def test_a_repeated_request_is_the_same_request() -> None:
     assert record.nonce
 
 
-def test_a_trial_is_told_all_steps_at_which_it_plays() -> None:
+def test_a_trial_gets_all_its_game_steps() -> None:
     steps = study().steps
     _, request, _ = started(study(steps=[*steps[:3], Step("5", "game"), *steps[3:]]))
     assert request.environment["GAME_STEPS"] == "3,5"
 
 
-def test_without_groups_the_agent_is_told_none() -> None:
+def test_without_groups_the_agent_gets_none() -> None:
     steps = [step for step in study().steps if not step.variants]
     _, request, _ = started(study(steps=steps))
     assert request.environment["GROUP"] == ""
 
 
-def test_a_warm_server_is_told_nobodys_name_and_when_it_must_have_ended() -> None:
+def test_a_warm_server_gets_its_deadline_and_no_participant() -> None:
     platform = FakePlatform()
     warm_server = ids.warm_id("maze", platform.now(), 0)
     _, request, record = started(study(warm_servers=1), warm_server)

@@ -1,4 +1,4 @@
-"""Warm servers (`warmServers`), where two functions meet, a reply is lost, or a cache is old."""
+"""Warm servers (`warmServers`) when two functions run at once, a reply is lost, or a cache is old."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.hippodrome.servers.warm.test_warm_servers import (
 
 
 def before_write(platform: FakePlatform, number: int, act: Callable[[], object]) -> None:
-    """Somebody does this just before the write of this number, once."""
+    """Do this once, just before the write of this number."""
 
     def once() -> None:
         platform.documents.before_write = []
@@ -50,7 +50,7 @@ def before_write(platform: FakePlatform, number: int, act: Callable[[], object])
 
 
 def cold_start_and_a_warm_server() -> FakePlatform:
-    """Alice's own server has been started, and then one is ready that waits."""
+    """Alice's own server is started; then a warm server becomes ready."""
     platform = installed(warm(1))
     Servers(platform).start(START)
     own = dict(platform.tasks.running)
@@ -70,12 +70,12 @@ def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
     return mine.state is ServerState.READY and request is not None and request.environment["TOKEN"] == told and named
 
 
-def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one_that_goes() -> None:
+def test_an_own_server_that_runs_while_a_warm_server_is_assigned_is_removed() -> None:
     platform = cold_start_and_a_warm_server()
     own = [e for e in events(platform, "RUNNING", interface="eni-9") if e.name == f"{LABEL}-1"]
 
     def given_in_part() -> None:
-        crash_at_write(platform, 4)  # before the warm server is asked
+        crash_at_write(platform, 4)  # before the warm server is reserved
         with pytest.raises(ConnectionError):
             Servers(platform).start(START)
 
@@ -88,7 +88,7 @@ def test_a_server_of_ones_own_that_runs_while_one_that_waits_is_given_is_the_one
     assert f"{LABEL}-1" not in [request.name for request in platform.tasks.running.values()]
 
 
-def test_who_was_given_one_meanwhile_keeps_it_though_their_own_cannot_be_started() -> None:
+def test_a_participant_keeps_an_assigned_warm_server_even_if_their_own_cannot_be_started() -> None:
     platform = warmed(1)
     entry = platform.documents.kept.pop(warm_pool.pool_key("maze"))
     real = platform.tasks.run
@@ -107,7 +107,7 @@ def test_who_was_given_one_meanwhile_keeps_it_though_their_own_cannot_be_started
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_warm_server_that_ends_while_it_is_given_is_replaced_for_who_was_given_it() -> None:
+def test_a_warm_server_that_ends_while_it_is_assigned_is_replaced_for_its_participant() -> None:
     platform = warmed(1)
     (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
     platform.tasks.running.clear()
@@ -120,7 +120,7 @@ def test_a_warm_server_that_ends_while_it_is_given_is_replaced_for_who_was_given
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_lost_warm_server_holds_no_place() -> None:
+def test_a_lost_warm_server_holds_no_slot() -> None:
     platform = warmed(1, max_servers=1)
     (gone,) = events(platform, "STOPPED", stop_code="SpotInterruption")
     platform.tasks.running.clear()
@@ -128,7 +128,7 @@ def test_a_lost_warm_server_holds_no_place() -> None:
     assert not running(platform).slots
 
 
-def test_what_a_record_names_is_offered_to_nobody_though_the_reply_to_its_writing_was_lost() -> None:
+def test_a_warm_server_that_a_record_names_is_assigned_to_no_other_even_after_a_lost_reply() -> None:
     platform = warmed(1)
 
     def written() -> None:
@@ -137,16 +137,16 @@ def test_what_a_record_names_is_offered_to_nobody_though_the_reply_to_its_writin
         assert stored
         Repository(platform.documents).save(server.reserving(stored.server, warm_server), stored.etag)
 
-    before_write(platform, 3, written)  # after the record and the pool
+    before_write(platform, 3, written)  # after the writes of the record and the pool
     Servers(platform).start(START)
     assert not pool(platform).warm_servers
     assert plays_on_what_the_record_says(platform)
 
 
-def test_a_warm_server_is_started_as_its_project_was_registered_last() -> None:
+def test_a_warm_server_is_started_by_the_last_registration() -> None:
     platform = installed(warm(1, task_definition="old:1"))
     one, other = Servers(platform), Servers(platform)
-    one.start(StartServer("maze", "bob"))  # and so it has just read the list of projects
+    one.start(StartServer("maze", "bob"))  # so it has just read the list of projects
     anew = msgspec.structs.replace(warm(1, task_definition="new:2"), version="v2")
     platform.documents.put(MASTER_LIST, to_json(MasterList([anew])))
     other.start(KEEP)
@@ -159,7 +159,7 @@ def test_a_warm_server_is_started_as_its_project_was_registered_last() -> None:
     assert request.definition == "new:2"
 
 
-def test_hours_that_are_used_up_start_nothing_however_often_it_is_swept() -> None:
+def test_with_all_hours_used_up_no_sweep_starts_a_warm_server() -> None:
     platform = warmed(3, max_server_hours=2)
     before = len(warm_server_records(platform))
     for _ in range(4):
@@ -169,7 +169,7 @@ def test_hours_that_are_used_up_start_nothing_however_often_it_is_swept() -> Non
     assert len(warm_server_records(platform)) == before == 2
 
 
-def test_a_name_that_is_made_while_its_warm_server_leaves_goes_too() -> None:
+def test_a_name_that_is_made_while_its_warm_server_is_drained_is_removed() -> None:
     platform = installed(warm(1))
     platform.dns.slow = True
     servers = Servers(platform)
@@ -190,7 +190,7 @@ def test_a_name_that_is_made_while_its_warm_server_leaves_goes_too() -> None:
     assert not platform.dns.records
 
 
-def test_a_warm_server_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep() -> None:
+def test_the_sweep_replaces_a_warm_server_whose_start_was_never_finished() -> None:
     platform = installed(warm(1))
     servers = Servers(platform)
     servers.start(KEEP)
@@ -213,7 +213,7 @@ def test_a_warm_server_whose_start_was_cut_off_for_good_is_replaced_by_the_sweep
     assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True]
 
 
-def test_a_program_that_fails_after_it_was_ready_is_not_started_again_and_again() -> None:
+def test_a_warm_server_whose_program_fails_after_it_was_ready_is_not_restarted_endlessly() -> None:
     platform = warmed(1)
     servers = Servers(platform)
     (gone,) = events(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=4)
@@ -223,15 +223,15 @@ def test_a_program_that_fails_after_it_was_ready_is_not_started_again_and_again(
     assert not platform.tasks.running
 
 
-def test_none_waits_where_the_installation_allows_no_time_for_it_any_more() -> None:
+def test_there_are_no_warm_servers_if_the_installation_allows_no_time_for_them() -> None:
     platform = installed(warm(1))
-    platform.settings = replace(platform.settings, max_runtime=30)  # lowered, to the project's own
+    platform.settings = replace(platform.settings, max_runtime=30)  # lowered to the project's own limit
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
     assert not platform.tasks.running
 
 
-def test_stopped_before_the_warm_server_was_asked_its_place_is_given_back() -> None:
+def test_a_stop_before_the_warm_server_is_assigned_gives_its_slot_back() -> None:
     platform = warmed(1, max_servers=1)
     crash_at_write(platform, 5)
     with pytest.raises(ConnectionError):
@@ -241,18 +241,18 @@ def test_stopped_before_the_warm_server_was_asked_its_place_is_given_back() -> N
     assert not running(platform).slots
 
 
-def test_who_was_given_none_after_all_gets_in_where_their_own_was_started_before() -> None:
+def test_a_participant_whose_warm_server_is_refused_plays_on_their_own_started_server() -> None:
     platform = cold_start_and_a_warm_server()
     (warm_server,) = warm_server_records(platform)
     go = StopServer("maze", warm_server.user_id, 1)
-    before_write(platform, 4, lambda: Servers(platform).stop([go]))  # it is named, and not asked yet
+    before_write(platform, 4, lambda: Servers(platform).stop([go]))  # the record names it, and it is not assigned yet
     Servers(platform).start(START)
     assert record(platform).warm_server_name is None
     deliver(platform)
     assert plays_on_what_the_record_says(platform)
 
 
-def test_of_too_many_the_one_that_is_ready_stays() -> None:
+def test_of_too_many_warm_servers_the_ready_one_stays() -> None:
     project, noon = warm(2), datetime(2026, 11, 21, 12, tzinfo=UTC)
     both = Pool().with_new(project, 1, noon)
     both = both.with_ready(list(both.warm_servers)).with_new(project, 1, noon + timedelta(minutes=1))

@@ -47,12 +47,12 @@ def register(platform: FakePlatform, project: Project) -> None:
 
 
 def deliver(platform: FakePlatform) -> None:
-    """Every message there is, and what comes of it."""
+    """Deliver all messages, and all that follow from them."""
     delivery.deliver(platform, Servers(platform))
 
 
 def warmed(number: int = 2, **changes: object) -> FakePlatform:
-    """An installation where so many servers wait."""
+    """An installation with so many warm servers that are ready."""
     platform = installed(warm(number, **changes))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
@@ -65,7 +65,7 @@ def pool(platform: FakePlatform) -> Pool:
 
 
 def token(platform: FakePlatform, server: Server) -> str:
-    """What the page of this server's participant is told."""
+    """The token that the page of this server's participant gets."""
     return SecretCache(platform.documents).token(server)
 
 
@@ -88,16 +88,16 @@ def nothing_left(platform: FakePlatform) -> bool:
     return not (things or handovers(platform) or pool(platform).warm_servers)
 
 
-# Waiting
+# Warm servers that wait
 
 
-def test_as_many_servers_as_wanted_are_started_named_and_wait() -> None:
+def test_as_many_warm_servers_as_wanted_are_started_and_named() -> None:
     platform = warmed(3)
     assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True, True, True]
     assert len(platform.tasks.running) == len(platform.dns.records) == len(platform.timers.due) == 3
 
 
-def test_a_warm_server_is_told_nobodys_id_and_may_play_all_of_max_runtime_after_its_waiting() -> None:
+def test_a_warm_server_gets_no_participants_id_and_has_max_runtime_after_its_wait() -> None:
     platform = warmed(1)
     ((_, request),) = platform.tasks.running.items()
     ((at, message),) = platform.timers.due.values()
@@ -112,7 +112,7 @@ def test_a_warm_server_is_told_nobodys_id_and_may_play_all_of_max_runtime_after_
     assert message["userId"] == warm_server.user_id
 
 
-def test_to_be_told_twice_starts_no_more_than_wanted() -> None:
+def test_a_repeated_message_starts_no_more_warm_servers_than_wanted() -> None:
     platform = warmed(2)
     for _ in range(3):
         platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -120,7 +120,7 @@ def test_to_be_told_twice_starts_no_more_than_wanted() -> None:
     assert len(platform.tasks.by_name) == 2
 
 
-def test_a_project_without_warm_servers_pays_nothing_for_them() -> None:
+def test_a_project_without_warm_servers_makes_no_calls_for_them() -> None:
     platform = installed()
     Servers(platform).start(START)
     platform.documents.calls.clear()
@@ -136,10 +136,10 @@ def test_no_link_can_name_a_warm_server() -> None:
     assert not ids.is_user_id(warm_server)
 
 
-# Taking
+# A warm server is assigned
 
 
-def test_a_participant_takes_a_waiting_server_and_is_ready_at_once() -> None:
+def test_a_participant_gets_a_warm_server_and_is_ready_at_once() -> None:
     platform = warmed(2)
     tasks = dict(platform.tasks.running)
     Servers(platform).start(START)
@@ -156,7 +156,7 @@ def test_a_participant_takes_a_waiting_server_and_is_ready_at_once() -> None:
     assert (mine.deadline - platform.now()).total_seconds() == 30 * 60
 
 
-def test_the_trial_is_told_whose_it_is_before_the_page_gets_the_address() -> None:
+def test_the_handover_is_written_before_the_page_gets_the_address() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
     (key,) = handovers(platform)
@@ -166,7 +166,7 @@ def test_the_trial_is_told_whose_it_is_before_the_page_gets_the_address() -> Non
     assert versions[key] < versions[server.key(LABEL)]
 
 
-def test_who_takes_a_server_has_another_one_started_in_its_place() -> None:
+def test_an_assigned_warm_server_is_replaced_in_the_pool() -> None:
     platform = warmed(2)
     Servers(platform).start(START)
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
@@ -175,7 +175,7 @@ def test_who_takes_a_server_has_another_one_started_in_its_place() -> None:
     assert len(platform.tasks.running) == 3
 
 
-def test_the_one_that_has_waited_longest_goes_first() -> None:
+def test_the_warm_server_that_has_waited_longest_is_assigned_first() -> None:
     platform = warmed(1)
     first = record(platform, next(iter(warm_server_records(platform))).label).name
     platform.wait(minutes=5)
@@ -186,7 +186,7 @@ def test_the_one_that_has_waited_longest_goes_first() -> None:
     assert record(platform).name == first
 
 
-def test_when_none_is_ready_a_server_is_started_as_always() -> None:
+def test_without_a_ready_warm_server_an_own_server_is_started() -> None:
     platform = installed(warm(2))
     Servers(platform).start(START)
     assert record(platform).state is ServerState.STARTING
@@ -194,7 +194,7 @@ def test_when_none_is_ready_a_server_is_started_as_always() -> None:
     assert request.environment["USER_ID"] == "alice"
 
 
-def test_the_same_message_takes_one_server_however_often_it_comes() -> None:
+def test_a_repeated_start_message_takes_one_warm_server() -> None:
     platform = warmed(2)
     for _ in range(3):
         Servers(platform).start(START)
@@ -202,7 +202,7 @@ def test_the_same_message_takes_one_server_however_often_it_comes() -> None:
     assert len(pool(platform).warm_servers) == 1
 
 
-def test_a_crowd_takes_each_server_once() -> None:
+def test_a_crowd_takes_each_warm_server_once() -> None:
     platform = warmed(3)
     users = [f"user{n}" for n in range(5)]
     platform.documents.before_write = [lambda: Servers(platform).start(StartServer("maze", users[1]))]
@@ -213,7 +213,7 @@ def test_a_crowd_takes_each_server_once() -> None:
     assert sum(found.warm_server_name is not None for found in records) == 3
 
 
-def test_a_warm_server_of_an_older_registration_is_given_to_nobody_and_replaced() -> None:
+def test_a_warm_server_of_an_older_registration_is_never_assigned_and_is_replaced() -> None:
     platform = warmed(1)
     (old,) = warm_server_records(platform)
     register(platform, msgspec.structs.replace(warm(1), version="v2"))
@@ -225,7 +225,7 @@ def test_a_warm_server_of_an_older_registration_is_given_to_nobody_and_replaced(
     assert [warm_server.version for warm_server in pool(platform).warm_servers.values()] == ["v2"]
 
 
-def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -> None:
+def test_after_two_lost_spot_servers_a_participant_gets_one_on_demand_and_no_warm_server() -> None:
     platform = warmed(1)
     servers = Servers(platform)
     for attempt in (1, 2):
@@ -244,11 +244,11 @@ def test_who_has_lost_two_spot_servers_gets_one_on_demand_though_others_wait() -
     assert not record(platform).spot
 
 
-# Crashes in the midst
+# Crashes during the assignment
 
 
 def crash_at_write(platform: FakePlatform, number: int) -> None:
-    """The write of this number fails, and what follows is not reached."""
+    """The function crashes at the write of this number."""
 
     def crash() -> None:
         raise ConnectionError
@@ -260,7 +260,7 @@ WRITES = 6  # record, pool, record, warm server, handover, record
 
 
 @pytest.mark.parametrize("number", range(1, WRITES + 1))
-def test_cut_off_at_any_write_the_next_delivery_finishes(number: int) -> None:
+def test_after_a_crash_at_any_write_the_next_delivery_finishes_the_assignment(number: int) -> None:
     platform = warmed(2)
     crash_at_write(platform, number)
     with pytest.raises(ConnectionError):
@@ -282,7 +282,7 @@ def test_cut_off_at_any_write_the_next_delivery_finishes(number: int) -> None:
 
 
 @pytest.mark.parametrize("number", range(1, WRITES + 1))
-def test_stopped_at_any_write_of_the_handing_over_nothing_stays(number: int) -> None:
+def test_a_stop_at_any_write_of_the_assignment_leaves_nothing(number: int) -> None:
     platform = warmed(1)
 
     def stop() -> None:
@@ -304,7 +304,7 @@ def test_stopped_at_any_write_of_the_handing_over_nothing_stays(number: int) -> 
     assert all(found.is_closed for found in warm_server_records(platform))
 
 
-def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
+def test_a_warm_server_that_is_drained_while_it_is_assigned_is_not_assigned() -> None:
     platform = warmed(1)
     (warm_server,) = warm_server_records(platform)
 
@@ -326,7 +326,7 @@ def test_a_warm_server_that_goes_while_it_is_given_is_not_given() -> None:
 # Ending
 
 
-def test_a_server_that_was_given_ends_like_every_other() -> None:
+def test_an_assigned_warm_server_ends_like_any_other() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
     (warm_server,) = [found for found in warm_server_records(platform) if found.assigned_to]
@@ -336,7 +336,7 @@ def test_a_server_that_was_given_ends_like_every_other() -> None:
     assert warm_server.reason is Reason.ASSIGNED
 
 
-def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> None:
+def test_a_lost_assigned_server_is_replaced_by_another_warm_server() -> None:
     platform = warmed(2)
     servers = Servers(platform)
     servers.start(START)
@@ -352,7 +352,7 @@ def test_a_lost_server_that_was_given_is_replaced_by_another_that_waits() -> Non
     assert [run.warm_server_name for run in mine.earlier] == [name]
 
 
-def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
+def test_an_assigned_server_whose_trial_ends_closes_the_participants_record() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
     (gone,) = events(platform, "STOPPED", stop_code="EssentialContainerExited", exit_code=0)
@@ -362,7 +362,7 @@ def test_the_trial_that_ends_by_itself_closes_the_participants_record() -> None:
     assert nothing_left(platform)
 
 
-def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() -> None:
+def test_a_repeated_follow_up_does_not_remove_the_name_of_an_assigned_server() -> None:
     platform = warmed(1)
     (warm_server,) = warm_server_records(platform)
     Servers(platform).start(START)
@@ -372,7 +372,7 @@ def test_a_follow_up_that_comes_once_more_does_not_take_the_name_of_who_plays() 
     assert record(platform).state is ServerState.READY
 
 
-def test_a_warm_servers_own_timer_does_not_end_who_plays_there() -> None:
+def test_a_warm_servers_own_timer_does_not_end_the_participants_game() -> None:
     platform = warmed(1)
     ((_, message),) = platform.timers.due.values()
     Servers(platform).start(START)
@@ -394,12 +394,12 @@ def test_a_warm_server_that_has_waited_long_enough_is_replaced() -> None:
     assert [warm_server.ready for warm_server in pool(platform).warm_servers.values()] == [True]
 
 
-def test_those_that_were_started_together_do_not_go_together() -> None:
+def test_warm_servers_that_were_started_together_have_different_deadlines() -> None:
     platform = warmed(4)
     assert len({at for at, _ in platform.timers.due.values()}) == 4
 
 
-def test_a_warm_server_that_can_never_run_is_not_started_again_and_again() -> None:
+def test_a_warm_server_that_can_never_run_is_not_restarted_endlessly() -> None:
     platform = installed(warm(1))
     platform.tasks.fail = [Refused("no such image")]
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -421,7 +421,7 @@ def test_a_warm_server_without_spot_capacity_runs_on_demand() -> None:
     assert not record(platform).spot
 
 
-def test_when_the_study_closes_none_is_left_but_who_plays_goes_on() -> None:
+def test_when_the_study_closes_warm_servers_end_and_games_go_on() -> None:
     platform = warmed(3)
     Servers(platform).start(START)
     deliver(platform)
@@ -432,7 +432,7 @@ def test_when_the_study_closes_none_is_left_but_who_plays_goes_on() -> None:
     assert not pool(platform).warm_servers
 
 
-def test_fewer_are_wanted_and_the_others_go() -> None:
+def test_if_fewer_warm_servers_are_wanted_the_others_end() -> None:
     platform = warmed(3)
     register(platform, warm(1))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -460,7 +460,7 @@ def test_the_sweep_asks_again_for_a_warm_server_whose_start_was_lost() -> None:
     assert len(platform.tasks.running) == len(pool(platform).warm_servers) == 1
 
 
-def test_the_sweep_makes_known_what_is_ready_and_forgets_what_is_closed() -> None:
+def test_the_sweep_corrects_the_pool_about_ready_and_closed_servers() -> None:
     platform = warmed(2)
     first, second = warm_server_records(platform)
     entries = {
@@ -473,7 +473,7 @@ def test_the_sweep_makes_known_what_is_ready_and_forgets_what_is_closed() -> Non
     assert {id: warm_server.ready for id, warm_server in pool(platform).warm_servers.items()} == {second.user_id: True}
 
 
-def test_the_sweep_ends_a_warm_server_that_no_pool_knows_and_leaves_alone_who_plays() -> None:
+def test_the_sweep_ends_a_warm_server_that_no_pool_lists_and_no_game() -> None:
     platform = warmed(2)
     Servers(platform).start(START)
     deliver(platform)
@@ -486,7 +486,7 @@ def test_the_sweep_ends_a_warm_server_that_no_pool_knows_and_leaves_alone_who_pl
     assert record(platform).state is ServerState.READY
 
 
-def test_the_sweep_removes_what_a_given_server_left_behind() -> None:
+def test_the_sweep_removes_leftovers_of_an_assigned_server() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
     register(platform, warm(1, live=False))
@@ -501,7 +501,7 @@ def test_the_sweep_removes_what_a_given_server_left_behind() -> None:
 # Registering
 
 
-def test_registering_starts_them_and_registering_anew_replaces_them() -> None:
+def test_registering_starts_warm_servers_and_registering_again_replaces_them() -> None:
     platform = installed()
     steps = [{"key": step.key, "page": step.page, "variants": step.variants} for step in study().steps]
     known = {"startServerStep": "2", "stopServerStep": "4"}
@@ -531,12 +531,12 @@ def running(platform: FakePlatform) -> ServerSlots:
     return from_json(platform.documents.kept[limits.server_slots_key("maze")][0], ServerSlots)
 
 
-def test_no_more_wait_than_find_a_place() -> None:
+def test_there_are_no_more_warm_servers_than_slots() -> None:
     platform = warmed(5, max_servers=2)
     assert len(platform.tasks.running) == len(running(platform).slots) == 2
 
 
-def test_a_participant_takes_a_servers_place_with_it() -> None:
+def test_a_participant_takes_over_the_slot_of_the_warm_server() -> None:
     platform = warmed(1, max_servers=1)
     Servers(platform).start(START)
     assert list(running(platform).slots) == [LABEL]
@@ -549,13 +549,13 @@ def test_a_participant_takes_a_servers_place_with_it() -> None:
     assert len(platform.tasks.running) == 1
 
 
-def test_those_that_wait_keep_no_participant_out() -> None:
+def test_warm_servers_keep_no_participant_out() -> None:
     platform = installed(warm(1, max_servers=1))
     Servers(platform).start(KEEP)
     ((_, message),) = platform.bus.sent
     warm_server = messages.parse_start_server(dict(message))
     assert warm_server
-    Servers(platform).start(warm_server)  # it holds the only place, and is not ready
+    Servers(platform).start(warm_server)  # it holds the only slot, and is not ready
     Servers(platform).start(START)
     assert record(platform).state is ServerState.STARTING
     assert len(platform.tasks.running) == 2
@@ -564,7 +564,7 @@ def test_those_that_wait_keep_no_participant_out() -> None:
     assert [request.environment.get("USER_ID") for request in platform.tasks.running.values()] == ["alice"]
 
 
-def test_registered_anew_those_that_wait_leave_their_places_to_their_successors() -> None:
+def test_after_a_new_registration_warm_servers_leave_their_slots_to_their_successors() -> None:
     platform = warmed(2, max_servers=2)
     register(platform, msgspec.structs.replace(warm(2, max_servers=2), version="v2"))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
@@ -575,7 +575,7 @@ def test_registered_anew_those_that_wait_leave_their_places_to_their_successors(
     assert len(platform.tasks.by_name) == 4, "none was started that had to be refused"
 
 
-def test_waiting_counts_in_the_hours() -> None:
+def test_the_wait_of_a_warm_server_counts_in_the_hours() -> None:
     platform = warmed(1, max_server_hours=2)
     (warm_server,) = warm_server_records(platform)
     assert timedelta(minutes=45) <= warm_server.deadline - warm_server.requested <= timedelta(hours=1)
@@ -584,7 +584,7 @@ def test_waiting_counts_in_the_hours() -> None:
     assert running(platform).used == 20 * 60
 
 
-def test_a_warm_server_that_finds_no_place_leaves_the_pool() -> None:
+def test_a_warm_server_that_finds_no_slot_leaves_the_pool() -> None:
     platform = installed(warm(1, max_servers=1))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     keep, platform.bus.sent = platform.bus.sent, []
@@ -604,12 +604,12 @@ def test_a_warm_server_that_finds_no_place_leaves_the_pool() -> None:
 
 
 def waiting_writes(platform: FakePlatform, *acts: object) -> None:
-    """What happens right before the next writes, in their order; None for nothing."""
+    """Do these right before the next writes, in their order; None for nothing."""
     platform.documents.before_write += [act or (lambda: None) for act in acts]
 
 
-def test_a_stop_in_the_midst_of_handing_a_warm_server_over_leaves_nothing_behind() -> None:
-    """The participant's server is stopped before the warm server is told whose it is: what comes after is taken back."""
+def test_a_stop_during_a_handover_leaves_nothing() -> None:
+    """The participant's server is stopped before the handover is written: the function undoes what it has done."""
     platform = warmed(1)
     # The participant's record, the pool, the warm server's name in the record, the warm server's record, what its trial is told.
     waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
@@ -620,7 +620,7 @@ def test_a_stop_in_the_midst_of_handing_a_warm_server_over_leaves_nothing_behind
     assert not platform.tasks.running
 
 
-def test_a_participant_who_is_stopped_while_a_warm_server_is_refused_gets_no_server_of_their_own() -> None:
+def test_a_participant_who_is_stopped_while_a_warm_server_refuses_gets_no_server_of_their_own() -> None:
     platform = warmed(1)
     (warm_id,) = pool(platform).warm_servers
     key = server.key(ids.server_label("maze", warm_id))
