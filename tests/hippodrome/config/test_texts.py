@@ -118,7 +118,7 @@ def test_the_german_texts_are_without_mistakes_and_remarks(folder: Path) -> None
 def test_texts_that_stay_english_get_one_remark(folder: Path) -> None:
     pages = texts_of(has_game=False, has_sessions=False)
     said = remarks(folder, with_lines_of_texts(PAGES, "    language: de\n    step: Schritt\n    continue: Weiter\n"))
-    which = f"the study is in another language (de), and {len(pages) - 3} texts of ours stay English"
+    which = f"the study is in another language (de), and {len(pages) - 3} of Hippodrome's texts stay English"
     assert said == [f"config.yml:2: remark: project.texts: {which}: titleStep, studyBy, send …; see docs/texts.md"]
 
 
@@ -144,7 +144,7 @@ def test_only_one_text_that_stays_english_is_named(folder: Path) -> None:
         f"    {name}: x\n" for name in texts_of(has_game=False, has_sessions=False) if name not in ("send", "language")
     )
     (said,) = remarks(folder, with_lines_of_texts(PAGES, f"    language: de\n{own}"))
-    assert said.endswith("and one text of ours stays English: send; see docs/texts.md")
+    assert said.endswith("and one of Hippodrome's texts stays English: send; see docs/texts.md")
 
 
 @pytest.mark.parametrize("texts", ["    continue: Next page\n", "    language: en-GB\n    continue: Next page\n"])
